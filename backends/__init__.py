@@ -1,0 +1,78 @@
+"""Fusion backends behind one protocol: `create("open3d", voxel_size=0.2, num_classes=7)`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, Protocol, cast
+
+from semstab.errors import ConfigError
+from semstab.frames import Frame
+from semstab.registry import Entry, Registry
+from semstab.results import FrameReport
+from semstab.voxels import Events, VoxelTable
+
+OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
+
+REGISTRY = Registry(
+    "backend",
+    {
+        "numpy": Entry(
+            "semstab.backends.numpy_reference:NumpyReference",
+            "the reference: keeps every observation and computes each metric from its definition",
+        ),
+        "open3d": Entry(
+            "semstab.backends.open3d_blocks:Open3DBlocks",
+            "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",
+            needs=("open3d",),
+            install=f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}",
+        ),
+    },
+)
+
+
+class FusionBackend(Protocol):
+    """Fuses frames into metric voxels. Made with `voxel_size` (metres), `num_classes` (K >= 2) and options of its own.
+
+    A pixel (u, v) with depth d falls into the voxel floor(x_w / r), evaluated in float64 in this order, so that
+    every backend decides alike at a voxel's face:
+
+        x_c = ((u - cx) / fx) * d        y_c = ((v - cy) / fy) * d        z_c = d
+        x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
+
+    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it (paper, Persistent Voxel Evidence).
+    """
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Fuse one frame. Raises DataError, with the map unchanged, where the frame cannot be fused."""
+        ...
+
+    def table(self) -> VoxelTable:
+        """The map so far."""
+        ...
+
+    def events(self) -> Events | None:
+        """The log of observations, or None where the backend keeps none."""
+        ...
+
+
+def create(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> FusionBackend:
+    """A new, empty map.
+
+    voxel_size in metres, num_classes K >= 2; options are the backend's own (open3d: device, block_resolution).
+    Raises ConfigError for an unknown name or option, MissingDependencyError where its engine is not installed.
+    """
+    cls = REGISTRY.load(name)
+    known = _options(cls)
+    if unknown := sorted(set(options) - set(known)):
+        listed = f"it takes {', '.join(known)}" if known else "it takes none"
+        raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
+    return cast(FusionBackend, cls(voxel_size=voxel_size, num_classes=num_classes, **options))
+
+
+def takes_option(name: str, option: str) -> bool:
+    """Whether the backend of that name has such an option, for example 'device'."""
+    return option in _options(REGISTRY.load(name))
+
+
+def _options(cls: Any) -> list[str]:
+    return [name for name in inspect.signature(cls).parameters if name not in ("voxel_size", "num_classes")]

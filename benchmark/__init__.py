@@ -1,0 +1,59 @@
+"""semstab: how stable are a segmentation backbone's predictions at the same physical place?"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from semstab import backends, datasets, metrics
+    from semstab.config import Config
+    from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
+    from semstab.frames import Frame, Intrinsics
+    from semstab.labels import LabelSpace
+    from semstab.pipeline import run
+    from semstab.voxels import Events, VoxelTable
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Config",
+    "ConfigError",
+    "DataError",
+    "Events",
+    "Frame",
+    "Intrinsics",
+    "LabelSpace",
+    "MissingDependencyError",
+    "SemstabError",
+    "VoxelTable",
+    "backends",
+    "datasets",
+    "metrics",
+    "run",
+]
+
+_HOMES = {
+    "Config": "config",
+    "ConfigError": "errors",
+    "DataError": "errors",
+    "Events": "voxels",
+    "Frame": "frames",
+    "Intrinsics": "frames",
+    "LabelSpace": "labels",
+    "MissingDependencyError": "errors",
+    "SemstabError": "errors",
+    "VoxelTable": "voxels",
+    "run": "pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public names when they are first used: `import semstab` stays instant."""
+    if name in ("backends", "datasets", "metrics"):
+        return importlib.import_module(f"semstab.{name}")
+    if name in _HOMES:
+        value = getattr(importlib.import_module(f"semstab.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'semstab' has no attribute '{name}'")

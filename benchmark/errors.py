@@ -1,0 +1,19 @@
+"""The one exception root: what the command line reports in one line, with its exit code."""
+
+
+class SemstabError(Exception):
+    """Something the caller can mend. The message says what is wrong, where, and what to do."""
+
+    exit_code = 2
+
+
+class ConfigError(SemstabError, ValueError):
+    """A setting or an argument that cannot be used."""
+
+
+class DataError(SemstabError, ValueError):
+    """Data that is missing, damaged, or that contradicts itself."""
+
+
+class MissingDependencyError(SemstabError, ImportError):
+    """An optional package that is not installed; the message holds the command that installs it."""

@@ -1,0 +1,72 @@
+"""What can be named on the command line: a table from name to class, imported on first use.
+
+Built-in entries are one line each; other packages add theirs with the entry point groups
+`semstab.backends`, `semstab.datasets` and `semstab.backbones`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from semstab.errors import ConfigError, MissingDependencyError
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One name: where its class is ('module:Class'), what it is, the packages it needs, and how to install them."""
+
+    target: str
+    summary: str
+    needs: tuple[str, ...] = ()
+    install: str = ""
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The needed packages that are not installed; looked up, not imported."""
+        return tuple(name for name in self.needs if importlib.util.find_spec(name) is None)
+
+
+class Registry:
+    """The entries of one kind ('backend', 'dataset', ...), built in and from entry points."""
+
+    def __init__(self, kind: str, builtin: Mapping[str, Entry]) -> None:
+        self.kind = kind
+        self.builtin = builtin
+
+    def entries(self) -> dict[str, Entry]:
+        """Every known entry by name; a built-in name is not replaced by a plug-in's."""
+        plugins = {point.name: _plugin(point) for point in entry_points(group=f"semstab.{self.kind}s")}
+        return plugins | dict(self.builtin)
+
+    def entry(self, name: str) -> Entry:
+        """The entry of that name. Raises ConfigError, with the nearest known name, where there is none."""
+        entries = self.entries()
+        if name not in entries:
+            near = difflib.get_close_matches(name, entries, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(entries))}"
+            raise ConfigError(f"{self.kind} '{name}' is not known; {hint}")
+        return entries[name]
+
+    def load(self, name: str) -> Any:
+        """Import the class behind a name.
+
+        Raises ConfigError where the name is not known, MissingDependencyError where its packages are not installed.
+        """
+        entry = self.entry(name)
+        module, _, attribute = entry.target.partition(":")
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, OSError) as error:  # OSError: a shared library of the engine is missing
+            hint = entry.install or f"install {', '.join(entry.needs) or 'what it needs'}"
+            raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({error}); {hint}") from error
+
+
+def _plugin(point: EntryPoint) -> Entry:
+    package = point.dist.name if point.dist else point.module
+    return Entry(point.value, f"from the package {package}")

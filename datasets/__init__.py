@@ -1,0 +1,91 @@
+"""Datasets behind one protocol: a dataset has scenes, a scene yields frames with the labels of a backbone."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, cast
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from semstab.frames import Frame
+from semstab.labels import LabelSpace
+from semstab.registry import Entry, Registry
+
+GROUND_TRUTH = "gt"
+"""The name under which a scene's ground truth labels are selected like a backbone's."""
+
+REGISTRY = Registry(
+    "dataset",
+    {
+        "city": Entry(
+            "semstab.datasets.city:City",
+            "the built-in scene: a simulated UAV flight over a procedural city, with simulated backbones",
+        ),
+        "posed_folder": Entry(
+            "semstab.datasets.posed_folder:PosedFolder",
+            "folders depth/, pose/, labels/BACKBONE/ and intrinsics.txt, one file a frame",
+        ),
+    },
+)
+
+
+class Scene(Protocol):
+    """One sequence. Opening it reads no image; `frame` decodes one.
+
+    name          the scene's name, usable in a file name
+    backbones     names of the label sources, without the ground truth
+    ground_truth  whether `frame(i, "gt")` works too
+    up            (3,) unit vector of the world's up axis, or None where it is not known
+    """
+
+    name: str
+    backbones: tuple[str, ...]
+    ground_truth: bool
+    up: npt.NDArray[np.float64] | None
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def label_space(self, backbone: str) -> LabelSpace:
+        """The classes of that backbone's label maps or scores."""
+        ...
+
+    def frame(self, index: int, backbone: str) -> Frame:
+        """Frame 0 <= index < len, with that backbone's labels or scores in its own label space.
+
+        Raises DataError that names the file.
+        """
+        ...
+
+    def digest(self, indices: list[int], backbone: str) -> str:
+        """A hash of the content behind those frames: the same digest means the same numbers."""
+        ...
+
+
+class Dataset(Protocol):
+    """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it."""
+
+    Options: type[BaseModel]
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes, in order."""
+        ...
+
+    def scene(self, name: str) -> Scene:
+        """Open one. Raises DataError where its files are missing or contradict each other."""
+        ...
+
+
+def options_model(name: str) -> type[BaseModel]:
+    """The pydantic model of a dataset's options."""
+    return cast("type[BaseModel]", REGISTRY.load(name).Options)
+
+
+def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
+    """Open a dataset by name with its options. Raises ConfigError, DataError or MissingDependencyError."""
+    cls = REGISTRY.load(name)
+    validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
+    return cast(Dataset, cls(validated))
