@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
 from semstab.errors import DataError
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
 
@@ -158,7 +157,9 @@ class Frame:
         if depth.ndim != 2 or depth.size == 0:
             raise DataError(f"{self.where('depth')}: depth must be (H, W), got shape {depth.shape}")
         if not np.issubdtype(depth.dtype, np.floating):
-            raise DataError(f"{self.where('depth')}: depth is {depth.dtype}; convert it to metres (float32) with its depth scale")
+            raise DataError(
+                f"{self.where('depth')}: depth is {depth.dtype}; convert it to metres (float32) with its depth scale"
+            )
         return depth.astype(np.float32, copy=False)
 
     def _checked_pose(self) -> npt.NDArray[np.float64]:
@@ -169,17 +170,25 @@ class Frame:
         if not np.isfinite(T).all():
             raise DataError(f"{where}: the pose is not finite (lost tracking?); leave this frame out")
         if np.abs(T[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
-            raise DataError(f"{where}: the last row of the pose is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?")
+            raise DataError(
+                f"{where}: the last row of the pose is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?"
+            )
         R = T[:3, :3]
         if np.linalg.det(R) < 0:
-            raise DataError(f"{where}: the rotation mirrors (determinant {np.linalg.det(R):.3f}); check camera_axes and the pose format")
+            raise DataError(
+                f"{where}: the rotation mirrors (determinant {np.linalg.det(R):.3f}); check camera_axes and the pose format"
+            )
         if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
-            raise DataError(f"{where}: the rotation is not orthonormal (determinant {np.linalg.det(R):.4g}); does the pose hold a scale?")
+            raise DataError(
+                f"{where}: the rotation is not orthonormal (determinant {np.linalg.det(R):.4g}); does the pose hold a scale?"
+            )
         return T
 
     def _checked_labels(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if labels.dtype not in (np.uint8, np.uint16):
-            raise DataError(f"{self.where('labels')}: labels are {labels.dtype}; use uint8 (ignore 255) or uint16 (ignore 65535)")
+            raise DataError(
+                f"{self.where('labels')}: labels are {labels.dtype}; use uint8 (ignore 255) or uint16 (ignore 65535)"
+            )
         self._same_size("labels", labels.shape)
         return labels
 
@@ -196,7 +205,9 @@ class Frame:
 
     def _checked_color(self, color: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
-            raise DataError(f"{self.where('color')}: colour must be uint8 (H, W, 3), got {color.dtype} of shape {color.shape}")
+            raise DataError(
+                f"{self.where('color')}: colour must be uint8 (H, W, 3), got {color.dtype} of shape {color.shape}"
+            )
         return color
 
     def _same_size(self, name: str, shape: tuple[int, ...]) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import yaml
-
 from semstab.errors import ConfigError, DataError
 
 IGNORE_8BIT = 255
@@ -61,7 +60,9 @@ class LabelSpace:
             if len(getattr(self, what)) != K:
                 raise ConfigError(f"taxonomy {self.name}: {len(getattr(self, what))} {what} for {K} classes")
         if len(set(self.ids)) != K or min(self.ids) < 0 or max(self.ids) >= IGNORE_16BIT:
-            raise ConfigError(f"taxonomy {self.name}: ids must be distinct, 0 to {IGNORE_16BIT - 1}, got {list(self.ids)}")
+            raise ConfigError(
+                f"taxonomy {self.name}: ids must be distinct, 0 to {IGNORE_16BIT - 1}, got {list(self.ids)}"
+            )
         if IGNORE_8BIT in self.ids and max(self.ids) == IGNORE_8BIT:
             raise ConfigError(f"taxonomy {self.name}: id 255 means 'ignore'; give the class another id")
         names = [_key(name) for name in (*self.classes, *(m for ms in self.members for m in ms), *self.ignored)]
@@ -140,7 +141,9 @@ class LabelMapping:
 
     def __post_init__(self) -> None:
         if all(row is None for row in self.rows):
-            raise ConfigError(f"taxonomy {self.target.name}: every class of {self.source.name} is ignored; nothing is left")
+            raise ConfigError(
+                f"taxonomy {self.target.name}: every class of {self.source.name} is ignored; nothing is left"
+            )
 
     def labels(
         self, labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], where: str

@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 RECURRENT = 3
 """A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
 
 
 @dataclass(frozen=True)
+class Unit:
+    """One cell of a run: a backbone's labels on a scene, fused by a backend."""
+
+    scene: str
+    backbone: str
+    backend: str
+
+    @property
+    def slug(self) -> str:
+        """SCENE__BACKBONE__BACKEND, usable as a file name."""
+        return slug(self.scene, self.backbone, self.backend)
+
+
+def slug(*names: str) -> str:
+    """Names joined to a file name: what is not a letter, digit, '.', '_' or '-' becomes '-'."""
+    return "__".join(re.sub(r"[^\w.-]+", "-", name) for name in names)
+
+
+@dataclass(frozen=True)
 class FrameReport:
     """What fusing one frame did. The map's means are those after the frame; NaN where a backend does not keep them.
 
+    frame            the frame's index
     points           valid pixels ('sampled points')
     voxels           voxels the frame touched ('observations')
     new_voxels       of them, voxels seen for the first time
@@ -40,3 +64,111 @@ class FrameReport:
         """Mean drift of the frame's updates, bits a re-observed voxel; NaN where it met none."""
         updated = self.voxels - self.new_voxels
         return self.drift_sum / updated if updated else math.nan
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over a group of voxels: a stratum, a class, the recurrent ones. NaN where undefined.
+
+    share is the group's part of all voxels, 0 to 1; sbd runs over its voxels with OP >= 2 only.
+    """
+
+    name: str
+    share: float
+    voxels: int
+    vss: float
+    sbd: float
+    entropy: float
+
+
+@dataclass(frozen=True)
+class TableSummary:
+    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes."""
+
+    K: int
+    voxel_size: float
+    points: int
+    observations: int
+    voxels: int
+    mean_op: float
+    vss: float
+    sbd: float
+    entropy: float
+    strata: tuple[Means, ...]
+    recurrent: Means
+    classes: tuple[Means, ...]
+
+
+@dataclass(frozen=True)
+class UnitSummary:
+    """One entry of 'runs' in summary.json."""
+
+    unit: Unit
+    taxonomy: str
+    frames: int
+    table: TableSummary
+    flicker_percent: float
+    fuse_ms_per_frame: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object; `from_dict` reads it back."""
+        rest = {name: getattr(self, name) for name in _UNIT_FIELDS}
+        return dataclasses.asdict(self.unit) | rest | dataclasses.asdict(self.table)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> UnitSummary:
+        """Read one entry of 'runs'; null is NaN."""
+        content = {key: math.nan if value is None else value for key, value in content.items()}
+        groups = {
+            "strata": tuple(_means(row) for row in content["strata"]),
+            "classes": tuple(_means(row) for row in content["classes"]),
+            "recurrent": _means(content["recurrent"]),
+        }
+        table = {field.name: content[field.name] for field in dataclasses.fields(TableSummary)}
+        return cls(
+            Unit(content["scene"], content["backbone"], content["backend"]),
+            table=TableSummary(**table | groups),
+            **{name: content[name] for name in _UNIT_FIELDS},
+        )
+
+
+_UNIT_FIELDS = ("taxonomy", "frames", "flicker_percent", "fuse_ms_per_frame")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Largest and mean absolute difference of one quantity over the voxels that two tables share."""
+
+    max: float
+    mean: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json."""
+
+    scene: str
+    backbone: str
+    backends: tuple[str, str]
+    voxels: tuple[int, int]
+    only_in: tuple[int, int]
+    differences: Mapping[str, Difference]
+    agrees: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object; `from_dict` reads it back."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Agreement:
+        """Read one entry of 'agreement'; null is NaN."""
+        differences = {
+            name: Difference(**{key: math.nan if value is None else value for key, value in row.items()})
+            for name, row in content["differences"].items()
+        }
+        pairs = {name: tuple(content[name]) for name in ("backends", "voxels", "only_in")}
+        return cls(**dict(content) | pairs | {"differences": differences})
+
+
+def _means(row: Mapping[str, Any]) -> Means:
+    return Means(**{key: math.nan if value is None else value for key, value in row.items()})

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-
 from semstab.errors import DataError
 from semstab.files import atomic_path
 from semstab.information import entropy_bits, js_divergence, normalise
@@ -272,4 +271,3 @@ def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any]:
         return column.to_numpy()
     values = column.combine_chunks().flatten().to_numpy()
     return values.reshape(-1, column.type.list_size)
-

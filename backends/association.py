@@ -1,0 +1,128 @@
+"""From the pixels of a frame to voxels: back-projection, voxel index, and one evidence vector a voxel.
+
+Paper, Semantic Evidence and World-Space Association, and Persistent Voxel Evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from semstab.errors import ConfigError, DataError
+from semstab.frames import Frame
+
+INDEX_LIMIT = 2**31
+"""Voxel indices are int32."""
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What one frame says of n voxels, sorted by index.
+
+    index   (n, 3) int64 voxel index
+    s_bar   (n, K) float64 mean evidence of the frame's pixels in the voxel
+    pixels  (n,) int64 how many they are
+    """
+
+    index: Int64
+    s_bar: Float64
+    pixels: Int64
+
+
+def check_settings(voxel_size: float, num_classes: int) -> None:
+    """Raise ConfigError where a map cannot be made with these settings."""
+    if not (math.isfinite(voxel_size) and voxel_size > 0):
+        raise ConfigError(f"voxel_size = {voxel_size:g}: it must be positive, in metres")
+    if num_classes < 2:
+        raise ConfigError(f"num_classes = {num_classes}: stability needs at least 2 (entropy divides by log K)")
+
+
+def check_frame(frame: Frame, num_classes: int) -> None:
+    """Raise DataError where the frame's labels or scores do not fit K classes."""
+    if frame.scores is not None:
+        if frame.scores.shape[2] != num_classes:
+            raise DataError(
+                f"{frame.where('scores')}: scores hold {frame.scores.shape[2]} classes, the map {num_classes}"
+            )
+    else:
+        assert frame.labels is not None
+        highest = int(frame.labels.max(initial=0, where=frame.valid))
+        if highest >= num_classes:
+            raise DataError(
+                f"{frame.where('labels')}: label id {highest} is outside 0 to {num_classes - 1}; map it or ignore it"
+            )
+
+
+def back_project(frame: Frame) -> Float64:
+    """World coordinates (3, n), metres, of the frame's valid pixels in row order: x_w = T_wc d ((u-cx)/fx, (v-cy)/fy, 1).
+
+    The order of operations is the protocol's, so that every backend decides alike at a voxel's face.
+    """
+    H, W = frame.shape
+    K, R, t = frame.intrinsics, frame.T_wc[:3, :3], frame.T_wc[:3, 3]
+    d = frame.depth.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        x = ((np.arange(W) - K.cx) / K.fx) * d
+        y = (((np.arange(H) - K.cy) / K.fy)[:, None]) * d
+    valid = frame.valid
+    x, y, z = x[valid], y[valid], d[valid]
+    return np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
+
+
+def voxel_index(points: Float64, voxel_size: float, frame: Frame) -> Int64:
+    """Voxel index (3, n) of world points (3, n): q = floor(x_w / r).
+
+    Raises DataError where an index does not fit 32 bits, with the frame and its extent.
+    """
+    q = np.floor(points / voxel_size)
+    if q.size and not (q.min() >= -INDEX_LIMIT and q.max() < INDEX_LIMIT):
+        low, high = points.min(axis=1), points.max(axis=1)
+        raise DataError(
+            f"{frame.where('pose')}: frame {frame.index} spans {low.round(1).tolist()} to {high.round(1).tolist()} m,"
+            f" beyond 2^31 voxels of {voxel_size:g} m; check depth and pose units, or use larger voxels"
+        )
+    return q.astype(np.int64)
+
+
+def pack(index: Int64, frame: Frame) -> tuple[Int64, Int64, tuple[int, ...]]:
+    """One int64 key for each voxel of a frame, ascending with (ix, iy, iz); its lowest corner and size undo it.
+
+    Raises DataError where the frame's extent holds too many voxels for a key.
+    """
+    low = index.min(axis=1, keepdims=True)
+    size = tuple(int(n) for n in index.max(axis=1) - low[:, 0] + 1)
+    if math.prod(size) >= 2**45:
+        raise DataError(
+            f"{frame.where('depth')}: frame {frame.index} spans {' x '.join(map(str, size))} voxels;"
+            " leave out far depth (sky?), or use larger voxels"
+        )
+    x, y, z = index - low
+    return (x * size[1] + y) * size[2] + z, low[:, 0], size
+
+
+def unpack(key: Int64, low: Int64, size: tuple[int, ...]) -> Int64:
+    """The voxel indices (n, 3) behind keys made by `pack`."""
+    return np.stack([key // (size[1] * size[2]), key // size[2] % size[1], key % size[2]], axis=1) + low
+
+
+def evidence_of(frame: Frame, num_classes: int) -> Float64:
+    """Evidence vectors s (n, K) of the valid pixels in row order: one-hot labels, or scores normalised to sum 1."""
+    if frame.scores is not None:
+        s = frame.scores[frame.valid].astype(np.float64)
+        normalised: Float64 = s / s.sum(axis=1, keepdims=True)
+        return normalised
+    assert frame.labels is not None
+    one_hot: Float64 = np.eye(num_classes)[frame.labels[frame.valid]]
+    return one_hot
+
+
+def no_observations(num_classes: int) -> Observations:
+    """What a frame without a valid pixel says."""
+    empty: npt.NDArray[Any] = np.zeros((0, 3), dtype=np.int64)
+    return Observations(empty, np.zeros((0, num_classes)), np.zeros(0, dtype=np.int64))

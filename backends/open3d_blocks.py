@@ -1,0 +1,229 @@
+"""Backend `open3d`: semantic attributes on the hashed voxel blocks of `open3d.t.geometry.VoxelBlockGrid`.
+
+Pixels become one observation a voxel before the hash is touched, so a frame costs one look-up a block. The hash and the
+attributes live on the device; the logarithms of the update, which Open3D tensors lack, are taken on the host, for the
+touched voxels only.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import open3d.core as o3c
+from open3d.t.geometry import VoxelBlockGrid
+from semstab.backends.association import (
+    Float64,
+    Int64,
+    Observations,
+    back_project,
+    check_frame,
+    check_settings,
+    evidence_of,
+    no_observations,
+    pack,
+    unpack,
+    voxel_index,
+)
+from semstab.backends.means import MapMeans
+from semstab.errors import ConfigError
+from semstab.frames import Frame
+from semstab.information import entropy_bits
+from semstab.results import FrameReport
+from semstab.voxels import VoxelTable
+
+
+class Open3DBlocks:
+    """Incremental fusion on voxel blocks; `grid` is the VoxelBlockGrid, its attributes named as VoxelTable's columns.
+
+    device            'CPU:0', or 'CUDA:0' where Open3D sees such a device
+    block_resolution  voxels along an edge of a block; a block takes memory for all of its voxels
+    """
+
+    def __init__(self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4) -> None:
+        check_settings(voxel_size, num_classes)
+        if not 1 <= block_resolution <= 64:
+            raise ConfigError(f"block_resolution = {block_resolution}: use 1 to 64 (4 suits surfaces)")
+        self.voxel_size = voxel_size
+        self.num_classes = num_classes
+        self.block_resolution = block_resolution
+        self.device = _device(device)
+        self._means = MapMeans()
+        attributes = {
+            "op": (o3c.int32, 1),
+            "evidence": (o3c.float64, num_classes),
+            "drift_sum": (o3c.float64, 1),
+            "pixels": (o3c.int64, 1),
+            "first_frame": (o3c.int32, 1),
+            "last_frame": (o3c.int32, 1),
+            "self_sum": (o3c.float64, 1),
+            "frame_entropy_sum": (o3c.float64, 1),
+        }
+        self.grid = VoxelBlockGrid(
+            attr_names=tuple(attributes),
+            attr_dtypes=tuple(dtype for dtype, _ in attributes.values()),
+            attr_channels=tuple((channels,) for _, channels in attributes.values()),
+            voxel_size=voxel_size,
+            block_resolution=block_resolution,
+            block_count=256,
+            device=self.device,
+        )
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
+        started = time.perf_counter()
+        check_frame(frame, self.num_classes)
+        seen = observe(frame, self.voxel_size, self.num_classes)
+        rows = self._activate(seen.index)
+        op, drift = self._update(rows, seen, frame.index)
+        return self._means.report(frame, seen.pixels, op, drift, time.perf_counter() - started)
+
+    def table(self) -> VoxelTable:
+        """The map so far: the voxels of all active blocks that a frame has seen."""
+        blocks = self.grid.hashmap().active_buf_indices().cpu().numpy().astype(np.int64)
+        voxels_a_block = self.block_resolution**3
+        rows = (blocks[:, None] * voxels_a_block + np.arange(voxels_a_block)).ravel()
+        rows = rows[self._read("op", rows) > 0]
+        index = self._index_of(rows)
+        order = np.lexsort(index.T[::-1])
+        rows = rows[order]
+        columns = (
+            "op",
+            "evidence",
+            "drift_sum",
+            "pixels",
+            "first_frame",
+            "last_frame",
+            "self_sum",
+            "frame_entropy_sum",
+        )
+        return VoxelTable(
+            *index[order].T.astype(np.int32),
+            **{name: self._read(name, rows) for name in columns},
+            voxel_size=self.voxel_size,
+        )
+
+    def events(self) -> None:
+        """None: the grid keeps sums, not the history."""
+
+    def _activate(self, index: Int64) -> Int64:
+        """Rows of voxels (n, 3) in the flattened attributes, their blocks activated; new ones start at 0."""
+        r = self.block_resolution
+        block, local = index // r, index % r
+        blocks, inverse = _unique_rows(block)
+        keys = o3c.Tensor(blocks.astype(np.int32), device=self.device)
+        hashmap = self.grid.hashmap()
+        hashmap.activate(keys)  # gives indices of new blocks only
+        buffer, _ = hashmap.find(keys)
+        offset = (local[:, 2] * r + local[:, 1]) * r + local[:, 0]  # Open3D's order: x runs fastest
+        return buffer.cpu().numpy().astype(np.int64)[inverse] * r**3 + offset
+
+    def _index_of(self, rows: Int64) -> Int64:
+        """Voxel indices (n, 3) of rows: the inverse of `_activate`."""
+        r = self.block_resolution
+        block, offset = np.divmod(rows, r**3)
+        keys: Int64 = self.grid.hashmap().key_tensor().cpu().numpy().astype(np.int64)
+        local = np.stack([offset % r, offset // r % r, offset // r**2], axis=1)
+        return keys[block] * r + local
+
+    def _update(self, rows: Int64, seen: Observations, frame: int) -> tuple[Int64, Float64]:
+        """Add one observation to each row; return the voxels' OP and the drift it caused, bits."""
+        before = self._read("evidence", rows)
+        after = before + seen.s_bar
+        op = self._read("op", rows).astype(np.int64) + 1
+        drift = self._means.update(before, after, op)
+        first, last = self._read("first_frame", rows), self._read("last_frame", rows)
+        self._write("evidence", rows, after)
+        self._write("op", rows, op)
+        self._write("first_frame", rows, np.where(op == 1, frame, np.minimum(first, frame)))
+        self._write("last_frame", rows, np.where(op == 1, frame, np.maximum(last, frame)))
+        self._add("drift_sum", rows, drift)
+        self._add("pixels", rows, seen.pixels)
+        s_bar = np.asfortranarray(seen.s_bar)  # sums over few classes run along n
+        self._add("self_sum", rows, (s_bar**2).sum(axis=1))
+        self._add("frame_entropy_sum", rows, entropy_bits(s_bar))
+        return op, drift
+
+    def _attribute(self, name: str) -> Any:
+        """The attribute as (capacity * voxels of a block, channels); taken anew each time: a rehash moves the buffers."""
+        values = self.grid.attribute(name)
+        return values.reshape((-1, values.shape[-1]))
+
+    def _read(self, name: str, rows: Int64) -> npt.NDArray[Any]:
+        values: npt.NDArray[Any] = self._attribute(name)[self._rows(rows)].cpu().numpy()
+        return values if name == "evidence" else values[:, 0]
+
+    def _write(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
+        attribute = self._attribute(name)
+        tensor = o3c.Tensor(np.ascontiguousarray(values.reshape(len(rows), -1)), device=self.device)
+        attribute[self._rows(rows)] = tensor.to(attribute.dtype)
+
+    def _add(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
+        self._write(name, rows, self._read(name, rows) + values)
+
+    def _rows(self, rows: Int64) -> Any:
+        return o3c.Tensor(rows, device=self.device)
+
+
+def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:
+    """The frame's observations, one a voxel, from one sort of its pixels' keys."""
+    points = back_project(frame)
+    if not points.shape[1]:
+        return no_observations(num_classes)
+    key, low, size = pack(voxel_index(points, voxel_size, frame), frame)
+    if frame.labels is not None:
+        voxels, counts = _count_labels(key * num_classes + frame.labels[frame.valid], num_classes)
+    else:
+        voxels, counts = _sum_scores(key, evidence_of(frame, num_classes))
+    pixels = counts.sum(axis=1).round()
+    return Observations(unpack(voxels, low, size), counts / pixels[:, None], pixels.astype(np.int64))
+
+
+def _count_labels(key: Int64, num_classes: int) -> tuple[Int64, Float64]:
+    """Voxels and their (n, K) label counts, from keys that hold voxel and label; runs of equal pixels are sorted as one."""
+    starts = _starts(key)
+    runs = np.diff(np.append(starts, len(key)))
+    order = np.argsort(key[starts])
+    key, runs = key[starts][order], runs[order]
+    starts = _starts(key)
+    voxel, label = np.divmod(key[starts], num_classes)
+    first = _starts(voxel)
+    counts = np.zeros((len(first), num_classes))
+    row = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(voxel))))
+    counts[row, label] = np.add.reduceat(runs, starts)
+    return voxel[first], counts
+
+
+def _sum_scores(key: Int64, s: Float64) -> tuple[Int64, Float64]:
+    """Voxels and the (n, K) sums of their pixels' evidence."""
+    voxels, inverse = np.unique(key, return_inverse=True)
+    sums = [np.bincount(inverse, weights=s[:, k], minlength=len(voxels)) for k in range(s.shape[1])]
+    return voxels, np.stack(sums, axis=1)
+
+
+def _starts(key: Int64) -> Int64:
+    """First positions of the runs of equal keys."""
+    return np.flatnonzero(np.diff(key, prepend=key[0] - 1))
+
+
+def _unique_rows(index: Int64) -> tuple[Int64, Int64]:
+    """Distinct rows of (n, 3) and where each row went."""
+    if not len(index):
+        return index, np.zeros(0, dtype=np.int64)
+    low = index.min(axis=0)
+    size = index.max(axis=0) - low + 1
+    x, y, z = (index - low).T
+    _, first, inverse = np.unique((x * size[1] + y) * size[2] + z, return_index=True, return_inverse=True)
+    return index[first], inverse
+
+
+def _device(name: str) -> Any:
+    try:
+        device = o3c.Device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"device '{name}' is not one; use CPU:0 or CUDA:0") from error
+    if device.get_type() == o3c.Device.DeviceType.CUDA and device.get_id() >= o3c.cuda.device_count():
+        raise ConfigError(f"device '{name}': Open3D sees {o3c.cuda.device_count()} CUDA devices here; use CPU:0")
+    return device

@@ -1,0 +1,62 @@
+"""Do two fusion implementations leave the same map?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from semstab.metrics.voxelwise import entropy, sbd, vss
+from semstab.results import Agreement, Difference, Unit
+from semstab.voxels import VoxelTable
+
+TOLERANCE = 1e-9
+"""Largest difference allowed between float64 backends in any quantity of any voxel."""
+
+
+def compare(
+    a: VoxelTable, b: VoxelTable, units: tuple[Unit, Unit], *, tolerance: float = TOLERANCE, voxel_share: float = 0.0
+) -> Agreement:
+    """Compare two maps of the same frames, voxel by voxel.
+
+    They agree where no quantity differs by more than `tolerance`, and where at most `voxel_share` of the voxels are in
+    one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
+    """
+    in_a, in_b = _shared_rows(a, b)
+    quantities = {
+        "op": (a.op, b.op),
+        "vss": (vss(a), vss(b)),
+        "sbd": (sbd(a), sbd(b)),
+        "entropy": (entropy(a), entropy(b)),
+        "evidence": (a.evidence, b.evidence),
+    }
+    differences = {name: _difference(x[in_a], y[in_b]) for name, (x, y) in quantities.items()}
+    only_in = (len(a) - len(in_a), len(b) - len(in_b))
+    same_voxels = sum(only_in) <= voxel_share * max(len(a), len(b))
+    same_values = all(not d.max > tolerance for d in differences.values())
+    return Agreement(
+        scene=units[0].scene,
+        backbone=units[0].backbone,
+        backends=(units[0].backend, units[1].backend),
+        voxels=(len(a), len(b)),
+        only_in=only_in,
+        differences=differences,
+        agrees=same_voxels and same_values,
+    )
+
+
+def _shared_rows(a: VoxelTable, b: VoxelTable) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Rows of the voxels that both tables hold."""
+    index = np.concatenate([a.index, b.index])
+    order = np.lexsort(index.T[::-1])  # stable: of two equal voxels a's comes first
+    twin = np.flatnonzero((index[order][1:] == index[order][:-1]).all(axis=1))
+    return order[twin], order[twin + 1] - len(a)
+
+
+def _difference(x: npt.NDArray[np.generic], y: npt.NDArray[np.generic]) -> Difference:
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    difference = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y))
+    difference = np.where(np.isnan(difference), 1.0, difference)
+    if not difference.size:
+        return Difference(math.nan, math.nan)
+    return Difference(float(difference.max()), float(difference.mean()))

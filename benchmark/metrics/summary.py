@@ -1,0 +1,61 @@
+"""The means of a voxel table: over all voxels, by OP stratum, over recurrent voxels, by dominant class."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from semstab.metrics.voxelwise import dominant, entropy, sbd, vss
+from semstab.results import RECURRENT, Means, TableSummary
+from semstab.voxels import VoxelTable
+
+STRATA = (1, 2, 5)
+"""Upper edges of the paper's strata: OP=1, OP=2, 3<=OP<=5, OP>5."""
+
+
+def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
+    """Summarise a table (paper, tables of multi-scene, persistence-stratified and class-wise stability).
+
+    edges are the strata's upper bounds of OP, ascending; a last stratum holds what lies above. Means of SBD run over
+    voxels with OP >= 2; a mean over no voxel is NaN.
+    """
+    measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table)}
+    label = dominant(table)
+    names = table.classes or tuple(str(k) for k in range(table.K))
+
+    def means(name: str, where: npt.NDArray[np.bool_]) -> Means:
+        n = int(np.count_nonzero(where))
+        share = n / len(table) if len(table) else math.nan
+        return Means(name, share, n, **{key: _mean(value[where]) for key, value in measures.items()})
+
+    observations = int(table.op.sum(dtype=np.int64))
+    return TableSummary(
+        K=table.K,
+        voxel_size=table.voxel_size,
+        points=int(table.pixels.sum()),
+        observations=observations,
+        voxels=len(table),
+        mean_op=observations / len(table) if len(table) else math.nan,
+        **{key: _mean(value) for key, value in measures.items()},
+        strata=tuple(means(name, (table.op >= low) & (table.op <= high)) for name, low, high in strata(edges)),
+        recurrent=means(f"OP>={RECURRENT}", table.op >= RECURRENT),
+        classes=tuple(means(name, label == k) for k, name in enumerate(names)),
+    )
+
+
+def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
+    """Name, lowest and highest OP of each stratum.
+
+    >>> strata([1, 2, 5])[2:]
+    [('3<=OP<=5', 3, 5), ('OP>5', 6, 2147483647)]
+    """
+    lows = [1, *(edge + 1 for edge in edges)]
+    rows = [(f"OP={low}" if low == high else f"{low}<=OP<={high}", low, high) for low, high in zip(lows, edges)]  # noqa: B905
+    return [*rows, (f"OP>{edges[-1]}", lows[-1], np.iinfo(np.int32).max)]
+
+
+def _mean(values: npt.NDArray[np.float64]) -> float:
+    defined = values[~np.isnan(values)]
+    return float(defined.mean()) if defined.size else math.nan
