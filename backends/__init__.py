@@ -39,7 +39,7 @@ class FusionBackend(Protocol):
         x_c = ((u - cx) / fx) * d        y_c = ((v - cy) / fy) * d        z_c = d
         x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
 
-    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it (paper, Persistent Voxel Evidence).
+    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it.
     """
 
     def integrate(self, frame: Frame) -> FrameReport:

@@ -60,7 +60,9 @@ def check_frame(frame: Frame, num_classes: int) -> None:
 
 
 def back_project(frame: Frame) -> Float64:
-    """World coordinates (3, n), metres, of the frame's valid pixels in row order: x_w = T_wc d ((u-cx)/fx, (v-cy)/fy, 1).
+    """World coordinates (3, n), metres, of the frame's valid pixels in row order.
+
+    x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1).
 
     The order of operations is the protocol's, so that every backend decides alike at a voxel's face.
     """

@@ -147,7 +147,7 @@ class Open3DBlocks:
         return op, drift
 
     def _attribute(self, name: str) -> Any:
-        """The attribute as (capacity * voxels of a block, channels); taken anew each time: a rehash moves the buffers."""
+        """The attribute, flattened to (voxels, channels); taken anew each time, because a rehash moves the buffers."""
         values = self.grid.attribute(name)
         return values.reshape((-1, values.shape[-1]))
 
@@ -182,7 +182,7 @@ def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:
 
 
 def _count_labels(key: Int64, num_classes: int) -> tuple[Int64, Float64]:
-    """Voxels and their (n, K) label counts, from keys that hold voxel and label; runs of equal pixels are sorted as one."""
+    """Voxels and their (n, K) label counts, from keys that hold voxel and label; runs of equal pixels sort as one."""
     starts = _starts(key)
     runs = np.diff(np.append(starts, len(key)))
     order = np.argsort(key[starts])

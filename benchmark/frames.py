@@ -52,7 +52,7 @@ class Intrinsics:
         return Intrinsics(self.fx / stride, self.fy / stride, self.cx / stride, self.cy / stride)
 
     def resized(self, size: tuple[int, int], to: tuple[int, int]) -> Intrinsics:
-        """Intrinsics after the image is resized from (width, height) `size` to `to`; pixel areas, not centres, align."""
+        """Intrinsics after resizing the image from (width, height) `size` to `to`; pixel areas, not centres, align."""
         sx, sy = to[0] / size[0], to[1] / size[1]
         return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
@@ -180,14 +180,14 @@ class Frame:
             )
         if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
             raise DataError(
-                f"{where}: the rotation is not orthonormal (determinant {np.linalg.det(R):.4g}); does the pose hold a scale?"
+                f"{where}: the rotation is not orthonormal (determinant {np.linalg.det(R):.4g}); is there a scale?"
             )
         return T
 
     def _checked_labels(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if labels.dtype not in (np.uint8, np.uint16):
             raise DataError(
-                f"{self.where('labels')}: labels are {labels.dtype}; use uint8 (ignore 255) or uint16 (ignore 65535)"
+                f"{self.where('labels')}: labels are {labels.dtype}; use uint8 or uint16 (ignore 255 or 65535)"
             )
         self._same_size("labels", labels.shape)
         return labels

@@ -9,7 +9,7 @@ Array = npt.NDArray[np.float64]
 
 
 def normalise(evidence: npt.ArrayLike) -> Array:
-    """Scale non-negative evidence (..., K) to sum to 1 over the last axis: the belief p (paper, Persistent Voxel Evidence)."""
+    """The belief p: non-negative evidence (..., K) scaled to sum to 1 (paper, Persistent Voxel Evidence)."""
     e = np.asarray(evidence, dtype=np.float64)
     belief: Array = e / e.sum(axis=-1, keepdims=True)
     return belief
@@ -28,7 +28,7 @@ def entropy_bits(p: npt.ArrayLike) -> Array:
 
 
 def js_divergence(p: npt.ArrayLike, q: npt.ArrayLike) -> Array:
-    """Jensen-Shannon divergence of distributions (..., K), in bits, so in [0, 1] (Lin 1991, IEEE Trans. Inf. Theory 37).
+    """Jensen-Shannon divergence of distributions (..., K), in bits, so in [0, 1] (Lin 1991, IEEE TIT 37).
 
     D_JS(p, q) = 1/2 sum_k p_k log2(p_k / m_k) + 1/2 sum_k q_k log2(q_k / m_k), with m = (p + q) / 2.
 

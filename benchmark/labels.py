@@ -171,7 +171,7 @@ class LabelMapping:
         """
         if scores.shape[2] != len(self.source):
             raise DataError(
-                f"{where}: scores hold {scores.shape[2]} classes, the taxonomy {self.source.name} has {len(self.source)}"
+                f"{where}: scores hold {scores.shape[2]} classes, {self.source.name} has {len(self.source)}"
             )
         if self.rows == tuple(range(len(self.target))):
             return scores

@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+SCHEMA = 1
+"""Version of summary.json."""
+
 RECURRENT = 3
 """A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
 
@@ -70,7 +73,7 @@ class FrameReport:
 class Means:
     """Means over a group of voxels: a stratum, a class, the recurrent ones. NaN where undefined.
 
-    share is the group's part of all voxels, 0 to 1; sbd runs over its voxels with OP >= 2 only.
+    share is the group's part of all voxels, 0 to 1; sbd runs over its sbd_voxels, those with OP >= 2, only.
     """
 
     name: str
@@ -79,6 +82,7 @@ class Means:
     vss: float
     sbd: float
     entropy: float
+    sbd_voxels: int
 
 
 @dataclass(frozen=True)
@@ -168,6 +172,54 @@ class Agreement:
         }
         pairs = {name: tuple(content[name]) for name in ("backends", "voxels", "only_in")}
         return cls(**dict(content) | pairs | {"differences": differences})
+
+
+@dataclass(frozen=True)
+class GroupResult:
+    """A backbone on a scene, fused by every backend of the run: the units' summaries and how far they agree."""
+
+    runs: tuple[UnitSummary, ...]
+    agreement: tuple[Agreement, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object; `from_dict` reads it back."""
+        return {"runs": [run.to_dict() for run in self.runs], "agreement": [row.to_dict() for row in self.agreement]}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> GroupResult:
+        """Read what `to_dict` wrote."""
+        runs = tuple(UnitSummary.from_dict(row) for row in content["runs"])
+        return cls(runs, tuple(Agreement.from_dict(row) for row in content["agreement"]))
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """All that a run found; `to_dict` is summary.json."""
+
+    groups: tuple[GroupResult, ...]
+
+    @property
+    def runs(self) -> tuple[UnitSummary, ...]:
+        """The summaries of all units."""
+        return tuple(run for group in self.groups for run in group.runs)
+
+    @property
+    def agreement(self) -> tuple[Agreement, ...]:
+        """The agreement of each pair of backends on each group."""
+        return tuple(row for group in self.groups for row in group.agreement)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether every pair of backends agrees everywhere."""
+        return all(row.agrees for row in self.agreement)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        return {
+            "schema": SCHEMA,
+            "runs": [run.to_dict() for run in self.runs],
+            "agreement": [row.to_dict() for row in self.agreement],
+        }
 
 
 def _means(row: Mapping[str, Any]) -> Means:

@@ -134,7 +134,7 @@ class Events:
         return np.searchsorted(self.voxel, np.arange(len(self.ix))).astype(np.int64)
 
     def table(self) -> VoxelTable:
-        """The voxel table, each column from its definition (paper, Persistent Voxel Evidence and Voxel-Level Metrics)."""
+        """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
         starts, s_bar = self.starts, self.evidence
         op = np.diff(np.append(starts, len(self)))
         return VoxelTable(

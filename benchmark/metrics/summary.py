@@ -28,7 +28,9 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     def means(name: str, where: npt.NDArray[np.bool_]) -> Means:
         n = int(np.count_nonzero(where))
         share = n / len(table) if len(table) else math.nan
-        return Means(name, share, n, **{key: _mean(value[where]) for key, value in measures.items()})
+        sbd_voxels = int(np.count_nonzero(where & (table.op >= 2)))
+        means = {key: _mean(value[where]) for key, value in measures.items()}
+        return Means(name, share, n, **means, sbd_voxels=sbd_voxels)
 
     observations = int(table.op.sum(dtype=np.int64))
     return TableSummary(
@@ -54,6 +56,33 @@ def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
     lows = [1, *(edge + 1 for edge in edges)]
     rows = [(f"OP={low}" if low == high else f"{low}<=OP<={high}", low, high) for low, high in zip(lows, edges)]  # noqa: B905
     return [*rows, (f"OP>{edges[-1]}", lows[-1], np.iinfo(np.int32).max)]
+
+
+def pool(groups: Sequence[Means], voxels: int) -> Means:
+    """The means over the voxels of several tables' groups together; `voxels` counts all voxels of these tables.
+
+    Strata and class tables of several scenes pool their voxels; scene tables give macro means instead.
+    """
+    n = sum(group.voxels for group in groups)
+    return Means(
+        name=groups[0].name,
+        share=n / voxels if voxels else math.nan,
+        voxels=n,
+        vss=_weighted([group.vss for group in groups], [group.voxels for group in groups]),
+        sbd=_weighted([group.sbd for group in groups], [group.sbd_voxels for group in groups]),
+        entropy=_weighted([group.entropy for group in groups], [group.voxels for group in groups]),
+        sbd_voxels=sum(group.sbd_voxels for group in groups),
+    )
+
+
+def macro_mean(values: Sequence[float]) -> float:
+    """The mean over scenes, each counting once, of those where the value is defined; NaN where none is."""
+    return _mean(np.array(values, dtype=np.float64))
+
+
+def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
+    total = sum(weights)
+    return sum(v * w for v, w in zip(values, weights, strict=True) if w) / total if total else math.nan
 
 
 def _mean(values: npt.NDArray[np.float64]) -> float:

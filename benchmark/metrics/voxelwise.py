@@ -13,7 +13,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 def vss(table: VoxelTable) -> Float64:
-    """Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; 1 by construction where OP = 1 and pixels agree."""
+    """Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
     concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
     return concentration
 

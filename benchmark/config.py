@@ -1,0 +1,157 @@
+"""Every setting of a run, typed, with its default; unknown keys are refused with the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from semstab.errors import ConfigError
+
+
+class Settings(BaseModel):
+    """A group of settings: frozen, and closed to unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DatasetConfig(Settings):
+    """Which dataset, with the options of its own."""
+
+    name: str = Field("city", description="a name from `semstab-bench list`")
+    options: dict[str, Any] = Field(default_factory=dict, description="options of that dataset")
+
+
+class BackendConfig(Settings):
+    """Which fusion backend, with the options of its own."""
+
+    name: str = Field(description="a name from `semstab-bench list`")
+    options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
+
+
+class FrameSelection(Settings):
+    """Which frames of a sequence: start, start + stride, ... before stop, at most count of them."""
+
+    start: int = Field(0, ge=0)
+    stop: int | None = Field(None, ge=1)
+    stride: int = Field(1, ge=1)
+    count: int | None = Field(None, ge=1)
+
+    def indices(self, length: int) -> list[int]:
+        """The selected indices of a sequence of that length."""
+        return list(range(length))[self.start : self.stop : self.stride][: self.count]
+
+
+class Config(Settings):
+    """What determines a run's numbers."""
+
+    dataset: DatasetConfig = DatasetConfig()
+    scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
+    backbones: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
+    backends: list[BackendConfig] = Field(
+        [BackendConfig(name="open3d")], min_length=1, description="fusion backends, each fuses the same frames"
+    )
+    check: str | None = Field("numpy", description="backend that the others are checked against; null for none")
+    tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
+    taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
+    voxel_size: float = Field(0.2, gt=0, allow_inf_nan=False, description="edge of a voxel, metres")
+    pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
+    frames: FrameSelection = FrameSelection()
+    strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
+    events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
+
+    @field_validator("backends", mode="before")
+    @classmethod
+    def _names_are_backends(cls, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        return [{"name": item} if isinstance(item, str) else item for item in value]
+
+    @field_validator("backends")
+    @classmethod
+    def _each_backend_once(cls, value: list[BackendConfig]) -> list[BackendConfig]:
+        if len({backend.name for backend in value}) < len(value):
+            raise ValueError("each backend can be named once")
+        return value
+
+    @field_validator("strata")
+    @classmethod
+    def _edges_ascend(cls, value: list[int]) -> list[int]:
+        if value[0] < 1 or any(low >= high for low, high in itertools.pairwise(value)):
+            raise ValueError("edges must be ascending whole numbers from 1")
+        return value
+
+    @classmethod
+    def build(cls, content: Mapping[str, Any], where: str = "configuration") -> Self:
+        """Validate settings. Raises ConfigError that names `where`, the setting, the nearest known one."""
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise ConfigError(f"{where}: {explain(error, cls)}") from error
+
+    def fused_by(self) -> list[BackendConfig]:
+        """The backends that fuse: those named, and the one they are checked against."""
+        named = [backend.name for backend in self.backends]
+        extra = [BackendConfig(name=self.check)] if self.check and self.check not in named else []
+        return [*self.backends, *extra]
+
+    def to_yaml(self) -> str:
+        """YAML that `load` reads back to the same settings."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """The mapping in a YAML file. Raises ConfigError in one line where there is none."""
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected settings ('key: value' lines), found a {type(content).__name__}")
+    return content
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of `over` on top of `base`, group by group."""
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = merge(merged[key], value) if both else value
+    return merged
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first problem of a pydantic error as one line: the setting, what is wrong, the nearest known key."""
+    problem = error.errors()[0]
+    name = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        unknown = str(problem["loc"][-1])
+        known = sorted(_keys_at(model, problem["loc"][:-1]))
+        near = difflib.get_close_matches(unknown, known, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+        return f"unknown setting '{name}'; {hint}"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{name}: {message[0].lower()}{message[1:]} (got {problem['input']!r})"
+
+
+def _keys_at(model: type[BaseModel], path: tuple[int | str, ...]) -> Iterator[str]:
+    for part in path:
+        field = model.model_fields.get(str(part))
+        inner = list(_models_in(field.annotation)) if field else []
+        model = inner[0] if inner else model
+    yield from model.model_fields
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in getattr(annotation, "__args__", ()):
+        yield from _models_in(inner)

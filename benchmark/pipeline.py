@@ -1,0 +1,184 @@
+"""The run: every selected backbone through every selected backend, measured, compared, and kept.
+
+What happens is told to observers; the terminal, the rerun recording and others watch the run through them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from semstab import backends
+from semstab.backends import FusionBackend
+from semstab.config import Config
+from semstab.errors import DataError
+from semstab.frames import Frame
+from semstab.manifest import manifest
+from semstab.metrics import compare, flicker_percent, macro_mean, summarise
+from semstab.plan import Plan, Task, make_plan, read, resolve
+from semstab.results import GroupResult, RunResult, Unit, UnitSummary
+from semstab.run_folder import FrameRow, RunFolder, group_key
+from semstab.voxels import VoxelTable
+
+
+class Observer:
+    """Watches a run; override what is of interest."""
+
+    def run_started(self, plan: Plan) -> None:
+        """The plan is made, nothing is fused yet."""
+
+    def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
+        """A frame went into a unit's map; `frame` holds labels in the run's label space."""
+
+    def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
+        """A unit's map is complete."""
+
+    def group_kept(self, task: Task, result: GroupResult) -> None:
+        """A backbone on a scene was found finished in the run folder."""
+
+    def run_finished(self, result: RunResult) -> None:
+        """Everything has been written."""
+
+
+def run(
+    config: Config,
+    *,
+    out: str | Path | None = None,
+    observers: Sequence[Observer] = (),
+    command: Sequence[str] = (),
+) -> RunResult:
+    """Fuse, measure and compare what the configuration selects.
+
+    out is the run folder; where it holds a part of this very run, that part is kept. `command` goes into the manifest.
+    Raises ConfigError or DataError; what was finished before stays in the run folder.
+    """
+    config = resolve(config)
+    plan = make_plan(config)
+    folder = None if out is None else RunFolder(out, config)
+    watch = Stopwatch()
+    for observer in observers:
+        observer.run_started(plan)
+    groups: list[GroupResult] = []
+    for task in plan.tasks:
+        groups.append(_run_task(task, config, folder, observers, watch))
+        if folder is not None:
+            folder.save_summary(RunResult(tuple(groups)))
+            inputs = {f"{t.scene.name}/{t.backbone}": t.digest for t in plan.tasks[: len(groups)]}
+            folder.save_manifest(manifest(config, inputs, watch.seconds, command))
+    result = RunResult(tuple(groups))
+    for observer in observers:
+        observer.run_finished(result)
+    return result
+
+
+def _run_task(
+    task: Task, config: Config, folder: RunFolder | None, observers: Sequence[Observer], watch: Stopwatch
+) -> GroupResult:
+    if folder is None:
+        return _fuse(task, config, None, observers, watch)
+    with watch("digest"):
+        key = group_key(config, task.scene.name, task.backbone, task.digest)
+    kept = folder.kept(task.scene.name, task.backbone, key)
+    if kept is not None:
+        for observer in observers:
+            observer.group_kept(task, kept)
+        return kept
+    result = _fuse(task, config, folder, observers, watch)
+    folder.save_group(task.scene.name, task.backbone, key, result)
+    return result
+
+
+def _fuse(
+    task: Task, config: Config, folder: RunFolder | None, observers: Sequence[Observer], watch: Stopwatch
+) -> GroupResult:
+    """One backbone on one scene through every backend: the same frames in the same order, decoded once."""
+    maps = _maps(task, config)
+    rows: dict[Unit, list[FrameRow]] = {unit: [] for unit in maps}
+    previous: Frame | None = None
+    for index in task.indices:
+        with watch("read"):
+            frame = read(task, index, config.pixel_stride)
+            comparable = previous is not None and previous.shape == frame.shape
+            flicker = flicker_percent(previous, frame) if comparable else math.nan
+        for unit, backend in maps.items():
+            with watch(f"fuse {unit.backend}"):
+                row = FrameRow(backend.integrate(frame), frame.timestamp, flicker)
+            rows[unit].append(row)
+            with watch("observe"):
+                for observer in observers:
+                    observer.frame_fused(unit, frame, row)
+        previous = frame
+    with watch("measure"):
+        classes = task.mapping.target.classes
+        tables = {unit: dataclasses.replace(backend.table(), classes=classes) for unit, backend in maps.items()}
+        _require_voxels(task, config, tables)
+        summaries = {unit: _summary(task, config, tables[unit], unit, rows[unit]) for unit in maps}
+        agreement = tuple(
+            compare(tables[a], tables[b], (a, b), tolerance=config.tolerance)
+            for a, b in itertools.combinations(maps, 2)
+        )
+    with watch("write"):
+        for unit, backend in maps.items():
+            if folder is not None:
+                events = backend.events() if config.events else None
+                folder.save_unit(unit, tables[unit], events, rows[unit])
+    with watch("observe"):
+        for unit in maps:
+            for observer in observers:
+                observer.unit_finished(unit, tables[unit], summaries[unit])
+    return GroupResult(tuple(summaries.values()), agreement)
+
+
+def _maps(task: Task, config: Config) -> dict[Unit, FusionBackend]:
+    K = len(task.mapping.target)
+    created = (
+        backends.create(backend.name, voxel_size=config.voxel_size, num_classes=K, **backend.options)
+        for backend in config.fused_by()
+    )
+    return dict(zip(task.units, created, strict=True))
+
+
+def _require_voxels(task: Task, config: Config, tables: Mapping[Unit, VoxelTable]) -> None:
+    if any(len(table) for table in tables.values()):
+        return
+    frame = read(task, task.indices[0], config.pixel_stride)
+    depth = np.mean(np.isfinite(frame.depth) & (frame.depth > 0))
+    labelled = np.mean(frame.predicted != frame.ignore_id)
+    raise DataError(
+        f"{task.scene.name}, {task.backbone}: no pixel of {len(task.indices)} frames is valid (first frame: depth in"
+        f" {depth:.0%} of the pixels, a label in {labelled:.0%}); check depth_scale, the ignore id and the taxonomy"
+    )
+
+
+def _summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows: list[FrameRow]) -> UnitSummary:
+    return UnitSummary(
+        unit=unit,
+        taxonomy=task.mapping.target.name,
+        frames=len(task.indices),
+        table=summarise(table, config.strata),
+        flicker_percent=macro_mean([row.flicker_percent for row in rows]),
+        fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
+    )
+
+
+class Stopwatch:
+    """Adds up wall-clock seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time the block."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += time.perf_counter() - started

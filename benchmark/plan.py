@@ -1,0 +1,122 @@
+"""The plan of a run: what its configuration selects, opened and checked before the first image is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib.resources
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from semstab import backends
+from semstab.config import Config, explain, merge, read_yaml
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, options_model
+from semstab.errors import ConfigError, DataError
+from semstab.frames import Frame
+from semstab.labels import LabelMapping, LabelSpace
+from semstab.results import Unit
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A backbone on a scene: which frames, and how its labels become rows of evidence."""
+
+    scene: Scene
+    backbone: str
+    indices: list[int]
+    mapping: LabelMapping
+    backends: tuple[str, ...]
+
+    @property
+    def units(self) -> list[Unit]:
+        """One a backend."""
+        return [Unit(self.scene.name, self.backbone, backend) for backend in self.backends]
+
+    @cached_property
+    def digest(self) -> str:
+        """A hash of the input behind it."""
+        return self.scene.digest(self.indices, self.backbone)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything that a run will do, checked before the first image is read."""
+
+    config: Config
+    tasks: tuple[Task, ...]
+
+
+def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
+    """The configuration of a file with overrides on top, over what ships for its dataset in configs/datasets/."""
+    content = merge(read_yaml(path) if path is not None else {}, overrides or {})
+    dataset = content.get("dataset")
+    name = dataset.get("name") if isinstance(dataset, Mapping) else dataset
+    shipped = importlib.resources.files("semstab.configs") / "datasets" / f"{name or 'city'}.yaml"
+    base = read_yaml(Path(str(shipped))) if shipped.is_file() else {}
+    return Config.build(merge(base, content), str(path or "configuration"))
+
+
+def resolve(config: Config) -> Config:
+    """The configuration with every default of its dataset's options filled in, paths absolute."""
+    name = config.dataset.name
+    model = options_model(name)
+    try:
+        options = model.model_validate(config.dataset.options)
+    except ValidationError as error:
+        raise ConfigError(f"dataset '{name}', options: {explain(error, model)}") from error
+    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
+    content = options.model_copy(update=paths).model_dump(mode="json")
+    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": content})})
+
+
+def make_plan(config: Config) -> Plan:
+    """Open what the configuration selects and check that it fits together; no image is read."""
+    for backend in config.fused_by():  # an engine that is missing is said before anything is computed
+        backends.create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    names = _selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
+    tasks = [task for name in names for task in _tasks_of(dataset.scene(name), config)]
+    return Plan(config, tuple(tasks))
+
+
+def _tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
+    indices = config.frames.indices(len(scene))
+    if not indices:
+        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
+    extra = (GROUND_TRUTH,) if scene.ground_truth else ()
+    names = _selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
+    if not names:
+        raise DataError(f"{scene.name}: there are no label maps; put them into labels/BACKBONE/")
+    for backbone in names:
+        source = scene.label_space(backbone)
+        target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
+        fused_by = tuple(backend.name for backend in config.fused_by())
+        yield Task(scene, backbone, indices, source.mapping_to(target), fused_by)
+
+
+def _selected(
+    wanted: list[str] | None, known: Sequence[str], extra: Sequence[str], kind: str, where: str
+) -> Sequence[str]:
+    """The wanted names, all known ones where none are named; `extra` ones only by name."""
+    for name in wanted or ():
+        if name not in (*known, *extra):
+            near = difflib.get_close_matches(name, [*known, *extra], n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there is {', '.join([*known, *extra]) or 'none'}"
+            raise ConfigError(f"{where}: no {kind} '{name}'; {hint}")
+    return list(dict.fromkeys(wanted)) if wanted is not None else known
+
+
+def read(task: Task, index: int, pixel_stride: int = 1) -> Frame:
+    """A frame of the task with its labels as rows 0..K-1 of the run's label space."""
+    frame = task.scene.frame(index, task.backbone)
+    if frame.labels is not None:
+        labels = task.mapping.labels(frame.labels, frame.where("labels"))
+        frame = dataclasses.replace(frame, labels=labels)
+    else:
+        assert frame.scores is not None
+        frame = dataclasses.replace(frame, scores=task.mapping.scores(frame.scores, frame.where("scores")))
+    return frame.every(pixel_stride)

@@ -1,0 +1,133 @@
+"""The run folder: what a run leaves on disk, written unit by unit so that a killed run goes on where it was."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from semstab.config import Config, read_yaml
+from semstab.errors import ConfigError, DataError
+from semstab.files import read_json, write_json, write_text
+from semstab.metrics import dominant, entropy, sbd, vss
+from semstab.results import FrameReport, GroupResult, RunResult, Unit, slug
+from semstab.voxels import Events, VoxelTable
+
+FRAME_COLUMNS = (
+    "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
+    "map_entropy", "map_recurrent", "fuse_ms",
+)  # fmt: skip
+"""The time series RUN/frames/*.csv: one row a frame; drift in bits; an undefined number is an empty field."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameRow:
+    """One row of a unit's time series: the backend's report, and what the frame itself tells."""
+
+    report: FrameReport
+    timestamp: float | None
+    flicker_percent: float
+
+    def cells(self) -> dict[str, Any]:
+        """The row by column name, an undefined number as None."""
+        row = dataclasses.asdict(self.report) | {
+            "timestamp": self.timestamp,
+            "flicker_percent": self.flicker_percent,
+            "drift": self.report.drift,
+            "fuse_ms": self.report.seconds * 1e3,
+        }
+        return {name: None if row[name] is None or row[name] != row[name] else row[name] for name in FRAME_COLUMNS}
+
+
+class RunFolder:
+    """RUN/: opened for one configuration, which it keeps as config.yaml.
+
+    Raises ConfigError where the folder holds a run of another configuration, or files that are not a run's.
+    """
+
+    def __init__(self, path: str | Path, config: Config) -> None:
+        self.path = Path(path)
+        self._claim(config)
+        write_text(self.path / "config.yaml", config.to_yaml())
+
+    def kept(self, scene: str, backbone: str, key: str) -> GroupResult | None:
+        """The group's result from an earlier start of this run, if it was finished on the same input."""
+        path = self._group_path(scene, backbone)
+        if not path.exists():
+            return None
+        content = read_json(path)
+        if not isinstance(content, dict) or content.get("key") != key:
+            return None
+        try:
+            result = GroupResult.from_dict(content)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: damaged ({error!r}); delete it, and the unit is computed again") from error
+        return result if all(self.voxels_path(run.unit).exists() for run in result.runs) else None
+
+    def save_group(self, scene: str, backbone: str, key: str, result: GroupResult) -> None:
+        """Mark the group as finished; from now on it is kept."""
+        write_json(self._group_path(scene, backbone), {"key": key, **result.to_dict()})
+
+    def save_unit(self, unit: Unit, table: VoxelTable, events: Events | None, rows: list[FrameRow]) -> None:
+        """Write a unit's voxels, its time series and, where given, its log of observations."""
+        measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
+        table.save(self.voxels_path(unit), measures)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, FRAME_COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(row.cells() for row in rows)
+        write_text(self.path / "frames" / f"{unit.slug}.csv", text.getvalue())
+        if events is not None:
+            events.save(self.path / "events" / f"{unit.slug}.parquet")
+
+    def save_summary(self, result: RunResult) -> None:
+        """Write summary.json: what is finished so far."""
+        write_json(self.path / "summary.json", result.to_dict())
+
+    def save_manifest(self, content: Mapping[str, Any]) -> None:
+        """Write manifest.json."""
+        write_json(self.path / "manifest.json", content)
+
+    def voxels_path(self, unit: Unit) -> Path:
+        """Where a unit's voxel table is."""
+        return self.path / "voxels" / f"{unit.slug}.parquet"
+
+    def _group_path(self, scene: str, backbone: str) -> Path:
+        return self.path / "units" / f"{slug(scene, backbone)}.json"
+
+    def _claim(self, config: Config) -> None:
+        if not self.path.exists():
+            return
+        if not self.path.is_dir():
+            raise ConfigError(f"{self.path}: is a file; name a folder for the run")
+        present = self.path / "config.yaml"
+        if not present.exists():
+            if any(self.path.iterdir()):
+                raise ConfigError(f"{self.path}: is not empty and holds no run; choose another folder")
+            return
+        if changed := _first_change(read_yaml(present), yaml.safe_load(config.to_yaml())):
+            raise ConfigError(f"{self.path}: holds a run with other settings ({changed}); choose another folder")
+
+
+def group_key(config: Config, scene: str, backbone: str, digest: str) -> str:
+    """What a group's numbers depend on: the settings and the content of its input."""
+    settings = config.model_dump(mode="json", exclude={"scenes", "backbones"})
+    text = json.dumps([settings, scene, backbone, digest], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
+    for key in [*new, *(key for key in old if key not in new)]:
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            if change := _first_change(a, b, f"{prefix}{key}."):
+                return change
+        elif a != b:
+            return f"{prefix}{key}: {a} there, {b} here"
+    return None
