@@ -23,7 +23,6 @@ REGISTRY = Registry(
         "open3d": Entry(
             "semstab.backends.open3d_blocks:Open3DBlocks",
             "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",
-            needs=("open3d",),
             install=f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}",
         ),
     },

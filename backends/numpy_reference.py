@@ -21,7 +21,7 @@ from semstab.backends.association import (
 from semstab.backends.means import MapMeans
 from semstab.frames import Frame
 from semstab.results import FrameReport
-from semstab.voxels import Events, VoxelTable
+from semstab.voxels import Events, VoxelTable, index_columns
 
 
 class NumpyReference:
@@ -68,7 +68,7 @@ class NumpyReference:
         pixels = np.concatenate([seen.pixels for _, _, seen in self._history] or [order])
         by_voxel = np.argsort(voxel, kind="stable")  # stable: keeps the order of integration within a voxel
         return Events(
-            *voxels[order].T.astype(np.int32),
+            **index_columns(voxels[order]),
             voxel=voxel[by_voxel],
             frame=frame[by_voxel].astype(np.int32),
             evidence=s_bar[by_voxel],

@@ -32,7 +32,7 @@ from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.information import entropy_bits
 from semstab.results import FrameReport
-from semstab.voxels import VoxelTable
+from semstab.voxels import VoxelTable, index_columns
 
 
 class Open3DBlocks:
@@ -99,11 +99,8 @@ class Open3DBlocks:
             "self_sum",
             "frame_entropy_sum",
         )
-        return VoxelTable(
-            *index[order].T.astype(np.int32),
-            **{name: self._read(name, rows) for name in columns},
-            voxel_size=self.voxel_size,
-        )
+        values: dict[str, Any] = {name: self._read(name, rows) for name in columns}
+        return VoxelTable(**index_columns(index[order]), **values, voxel_size=self.voxel_size)
 
     def events(self) -> None:
         """None: the grid keeps sums, not the history."""
@@ -113,12 +110,13 @@ class Open3DBlocks:
         r = self.block_resolution
         block, local = index // r, index % r
         blocks, inverse = _unique_rows(block)
-        keys = o3c.Tensor(blocks.astype(np.int32), device=self.device)
+        keys = self._tensor(blocks.astype(np.int32))
         hashmap = self.grid.hashmap()
         hashmap.activate(keys)  # gives indices of new blocks only
         buffer, _ = hashmap.find(keys)
         offset = (local[:, 2] * r + local[:, 1]) * r + local[:, 0]  # Open3D's order: x runs fastest
-        return buffer.cpu().numpy().astype(np.int64)[inverse] * r**3 + offset
+        buffers: Int64 = buffer.cpu().numpy().astype(np.int64)
+        return buffers[inverse] * r**3 + offset
 
     def _index_of(self, rows: Int64) -> Int64:
         """Voxel indices (n, 3) of rows: the inverse of `_activate`."""
@@ -126,7 +124,8 @@ class Open3DBlocks:
         block, offset = np.divmod(rows, r**3)
         keys: Int64 = self.grid.hashmap().key_tensor().cpu().numpy().astype(np.int64)
         local = np.stack([offset % r, offset // r % r, offset // r**2], axis=1)
-        return keys[block] * r + local
+        index: Int64 = keys[block] * r + local
+        return index
 
     def _update(self, rows: Int64, seen: Observations, frame: int) -> tuple[Int64, Float64]:
         """Add one observation to each row; return the voxels' OP and the drift it caused, bits."""
@@ -152,19 +151,18 @@ class Open3DBlocks:
         return values.reshape((-1, values.shape[-1]))
 
     def _read(self, name: str, rows: Int64) -> npt.NDArray[Any]:
-        values: npt.NDArray[Any] = self._attribute(name)[self._rows(rows)].cpu().numpy()
+        values: npt.NDArray[Any] = self._attribute(name)[self._tensor(rows)].cpu().numpy()
         return values if name == "evidence" else values[:, 0]
 
     def _write(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
         attribute = self._attribute(name)
-        tensor = o3c.Tensor(np.ascontiguousarray(values.reshape(len(rows), -1)), device=self.device)
-        attribute[self._rows(rows)] = tensor.to(attribute.dtype)
+        attribute[self._tensor(rows)] = self._tensor(values.reshape(len(rows), -1)).to(attribute.dtype)
 
     def _add(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
         self._write(name, rows, self._read(name, rows) + values)
 
-    def _rows(self, rows: Int64) -> Any:
-        return o3c.Tensor(rows, device=self.device)
+    def _tensor(self, values: npt.NDArray[Any]) -> Any:
+        return o3c.Tensor.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:

@@ -111,7 +111,7 @@ class Frame:
             return self.labels
         assert self.scores is not None
         dtype = np.uint8 if self.scores.shape[2] <= IGNORE_8BIT else np.uint16
-        ids = self.scores.argmax(axis=2).astype(dtype)
+        ids: npt.NDArray[Any] = self.scores.argmax(axis=2).astype(dtype)
         ids[~_usable_scores(self.scores)] = self.ignore_id
         ids.setflags(write=False)
         return ids
@@ -175,9 +175,7 @@ class Frame:
             )
         R = T[:3, :3]
         if np.linalg.det(R) < 0:
-            raise DataError(
-                f"{where}: the rotation mirrors (determinant {np.linalg.det(R):.3f}); check camera_axes and the pose format"
-            )
+            raise DataError(f"{where}: the rotation mirrors (determinant {np.linalg.det(R):.3f}); check camera_axes")
         if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
             raise DataError(
                 f"{where}: the rotation is not orthonormal (determinant {np.linalg.det(R):.4g}); is there a scale?"

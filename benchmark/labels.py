@@ -161,8 +161,9 @@ class LabelMapping:
                 f"{where}: label id {listed} ({unknown.size} pixels) is outside the taxonomy {self.source.name}"
                 f" ({len(self.source)} classes, ids {min(self.source.ids)} to {max(self.source.ids)})"
             )
-        dtype = np.uint8 if len(self.target) <= IGNORE_8BIT else np.uint16
-        return table.astype(dtype)[labels]
+        if len(self.target) <= IGNORE_8BIT:
+            return table.astype(np.uint8)[labels]
+        return table.astype(np.uint16)[labels]
 
     def scores(self, scores: npt.NDArray[np.floating[Any]], where: str) -> npt.NDArray[np.floating[Any]]:
         """Map soft scores (H, W, K of the source): classes that fall together are summed, ignored ones dropped.

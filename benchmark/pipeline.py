@@ -105,8 +105,7 @@ def _fuse(
     for index in task.indices:
         with watch("read"):
             frame = read(task, index, config.pixel_stride)
-            comparable = previous is not None and previous.shape == frame.shape
-            flicker = flicker_percent(previous, frame) if comparable else math.nan
+            flicker = _flicker(previous, frame)
         for unit, backend in maps.items():
             with watch(f"fuse {unit.backend}"):
                 row = FrameRow(backend.integrate(frame), frame.timestamp, flicker)
@@ -134,6 +133,13 @@ def _fuse(
             for observer in observers:
                 observer.unit_finished(unit, tables[unit], summaries[unit])
     return GroupResult(tuple(summaries.values()), agreement)
+
+
+def _flicker(previous: Frame | None, frame: Frame) -> float:
+    """Flicker against the frame before; undefined for the first one, and where the image size changes."""
+    if previous is None or previous.shape != frame.shape:
+        return math.nan
+    return flicker_percent(previous, frame)
 
 
 def _maps(task: Task, config: Config) -> dict[Unit, FusionBackend]:

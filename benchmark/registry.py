@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -19,17 +18,11 @@ from semstab.errors import ConfigError, MissingDependencyError
 
 @dataclass(frozen=True)
 class Entry:
-    """One name: where its class is ('module:Class'), what it is, the packages it needs, and how to install them."""
+    """One name: where its class is ('module:Class'), what it is, and how to install what it needs."""
 
     target: str
     summary: str
-    needs: tuple[str, ...] = ()
     install: str = ""
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """The needed packages that are not installed; looked up, not imported."""
-        return tuple(name for name in self.needs if importlib.util.find_spec(name) is None)
 
 
 class Registry:
@@ -63,8 +56,9 @@ class Registry:
         try:
             return getattr(importlib.import_module(module), attribute)
         except (ImportError, OSError) as error:  # OSError: a shared library of the engine is missing
-            hint = entry.install or f"install {', '.join(entry.needs) or 'what it needs'}"
-            raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({error}); {hint}") from error
+            hint = entry.install or "install what it needs"
+            reason = " ".join(str(error).split())
+            raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({reason}); {hint}") from error
 
 
 def _plugin(point: EntryPoint) -> Entry:

@@ -223,4 +223,5 @@ class RunResult:
 
 
 def _means(row: Mapping[str, Any]) -> Means:
-    return Means(**{key: math.nan if value is None else value for key, value in row.items()})
+    content: dict[str, Any] = {key: math.nan if value is None else value for key, value in row.items()}
+    return Means(**content)

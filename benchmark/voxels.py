@@ -21,6 +21,7 @@ SCHEMA = 1
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
+Types = dict[str, type[np.generic]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +83,7 @@ class VoxelTable:
     @property
     def centers(self) -> Float64:
         """(n, 3) world coordinates of the voxel centres, metres."""
-        centers: Float64 = (self.index + 0.5) * self.voxel_size
-        return centers
+        return (self.index.astype(np.float64) + 0.5) * self.voxel_size
 
     def save(self, path: str | Path, extra: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
         """Write Parquet, atomically; `extra` columns (n,) go along for other programs and are not read back."""
@@ -158,7 +158,7 @@ class Events:
         accumulated = self.evidence.copy()
         age = np.arange(len(self)) - self.starts[self.voxel]
         by_age = np.argsort(age, kind="stable")
-        ends = np.cumsum(np.bincount(age)) if len(self) else []
+        ends = np.cumsum(np.bincount(age, minlength=1))
         for rows in np.split(by_age, ends)[1:]:
             accumulated[rows] += accumulated[rows - 1]
         return normalise(accumulated)
@@ -185,7 +185,7 @@ class Events:
         np.add.at(pixels, rows.ravel(), self.pixels)
         np.add.at(evidence, rows.ravel(), self.evidence * self.pixels[:, None])
         return Events(
-            *coarse.T.astype(np.int32),
+            **index_columns(coarse),
             voxel=pairs[:, 0].astype(np.int64),
             frame=pairs[:, 1].astype(np.int32),
             evidence=evidence / pixels[:, None],
@@ -206,21 +206,26 @@ class Events:
         return cls(**content | {name: content[name][first] for name in _INDEX_TYPES})
 
 
-_INDEX_TYPES = {"ix": np.int32, "iy": np.int32, "iz": np.int32}
-_VOXEL_TYPES = _INDEX_TYPES | {
+_INDEX_TYPES: Types = {"ix": np.int32, "iy": np.int32, "iz": np.int32}
+_VOXEL_TYPES: Types = _INDEX_TYPES | {
     "op": np.int32, "evidence": np.float64, "drift_sum": np.float64, "pixels": np.int64, "first_frame": np.int32,
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
-_EVENT_TYPES = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
+_EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
+
+
+def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
+    """Voxel indices (n, 3) as the columns ix, iy, iz."""
+    return dict(zip(_INDEX_TYPES, index.T.astype(np.int32), strict=True))
 
 
 def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:
     return np.add.reduceat(values, starts, axis=0) if len(starts) else values
 
 
-def _freeze_columns(table: Any, types: Mapping[str, type], like: npt.NDArray[Any]) -> None:
+def _freeze_columns(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
     for name, dtype in types.items():
-        column = np.ascontiguousarray(getattr(table, name), dtype=dtype).view()
+        column: npt.NDArray[Any] = np.ascontiguousarray(getattr(table, name), dtype=dtype).view()
         if len(column) != len(like):
             raise DataError(f"{type(table).__name__}: column '{name}' has {len(column)} rows, expected {len(like)}")
         column.setflags(write=False)
@@ -228,7 +233,10 @@ def _freeze_columns(table: Any, types: Mapping[str, type], like: npt.NDArray[Any
 
 
 def _write_parquet(
-    table: VoxelTable | Events, types: Mapping[str, type], path: str | Path, extra: Mapping[str, npt.NDArray[Any]]
+    table: VoxelTable | Events,
+    types: Types,
+    path: str | Path,
+    extra: Mapping[str, npt.NDArray[Any]],
 ) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -249,7 +257,7 @@ def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
 
 
-def _read_parquet(path: str | Path, types: Mapping[str, type]) -> dict[str, Any]:
+def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -268,6 +276,7 @@ def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any]:
     import pyarrow as pa
 
     if not pa.types.is_fixed_size_list(column.type):
-        return column.to_numpy()
-    values = column.combine_chunks().flatten().to_numpy()
-    return values.reshape(-1, column.type.list_size)
+        values: npt.NDArray[Any] = column.to_numpy()
+    else:
+        values = column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
+    return values

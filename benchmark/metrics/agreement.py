@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ def compare(
     one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
     """
     in_a, in_b = _shared_rows(a, b)
-    quantities = {
+    quantities: dict[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]] = {
         "op": (a.op, b.op),
         "vss": (vss(a), vss(b)),
         "sbd": (sbd(a), sbd(b)),
@@ -53,7 +54,7 @@ def _shared_rows(a: VoxelTable, b: VoxelTable) -> tuple[npt.NDArray[np.int64], n
     return order[twin], order[twin + 1] - len(a)
 
 
-def _difference(x: npt.NDArray[np.generic], y: npt.NDArray[np.generic]) -> Difference:
+def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Difference:
     x, y = x.astype(np.float64), y.astype(np.float64)
     difference = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y))
     difference = np.where(np.isnan(difference), 1.0, difference)

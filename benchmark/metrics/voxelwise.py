@@ -39,4 +39,5 @@ def entropy(table: VoxelTable) -> Float64:
 
 def dominant(table: VoxelTable) -> npt.NDArray[np.int64]:
     """Dominant class (n,): argmax_k e_k, the lowest on ties."""
-    return table.evidence.argmax(axis=1)
+    label: npt.NDArray[np.int64] = table.evidence.argmax(axis=1)
+    return label

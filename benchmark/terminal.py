@@ -1,0 +1,165 @@
+"""What a run looks like in the terminal: progress while it works, and the summary at its end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from semstab.frames import Frame
+from semstab.metrics import macro_mean, pool
+from semstab.pipeline import Observer
+from semstab.plan import Plan, Task
+from semstab.results import Agreement, GroupResult, Means, RunResult, Unit, UnitSummary
+from semstab.run_folder import FrameRow
+
+NOTHING = "-"
+
+
+class ProgressBar(Observer):
+    """One bar for the whole run, in frames fused."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+        self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
+        self.work = self.bar.add_task("starting", total=None)
+
+    def run_started(self, plan: Plan) -> None:
+        """Show the bar: every unit's frames are its total."""
+        self.bar.update(self.work, total=sum(len(task.indices) * len(task.backends) for task in plan.tasks))
+        self.bar.start()
+
+    def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
+        """One frame further."""
+        self.bar.update(self.work, advance=1, description=f"{unit.scene} · {unit.backbone} · {unit.backend}")
+
+    def group_kept(self, task: Task, result: GroupResult) -> None:
+        """Work that was found finished."""
+        self.bar.update(self.work, advance=len(task.indices) * len(task.backends))
+        self.bar.console.print(f"kept from before: {task.scene.name}, {task.backbone}", style="dim")
+
+    def run_finished(self, result: RunResult) -> None:
+        """Take the bar away."""
+        self.close()
+
+    def close(self) -> None:
+        """Take the bar away, also where the run was interrupted."""
+        self.bar.stop()
+
+
+def print_summary(result: RunResult, console: Console) -> None:
+    """The scene table, the strata, the agreement of the backends, and how to read them."""
+    shown = _first_backend(result)
+    console.print(_scene_table(shown))
+    console.print(_strata_table(shown))
+    if len({run.unit.backend for run in result.runs}) > 1:
+        console.print(_agreement_table(result.agreement))
+    once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
+    console.print(
+        f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
+        "Read VSS, SBD and entropy by OP, or for OP>=3."
+    )
+
+
+def _once(run: UnitSummary) -> int:
+    return sum(row.voxels for row in run.table.strata if row.name == "OP=1")
+
+
+def _first_backend(result: RunResult) -> list[UnitSummary]:
+    """The units of the backend that was named first: where backends agree, the others say the same."""
+    return [group.runs[0] for group in result.groups]
+
+
+def _scene_table(runs: Sequence[UnitSummary]) -> Table:
+    table = Table(title=_title(runs), title_justify="left", title_style="bold")
+    for name in ("scene", "backbone"):
+        table.add_column(name)
+    for name in ("voxels", "points", "mean OP", "VSS ↑", "SBD ↓ bits", "entropy ↓", "flicker %", "OP>=3 %", "ms/frame"):
+        table.add_column(name, justify="right")
+    for backbone, rows in _by_backbone(runs):
+        for run in rows:
+            table.add_row(run.unit.scene, backbone, *_scene_cells([run]))
+        if len(rows) > 1:
+            table.add_row("total / mean", backbone, *_scene_cells(rows), style="bold", end_section=True)
+        else:
+            table.add_section()
+    return table
+
+
+def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
+    """One scene's numbers, or the totals and macro means of several (each scene counts once)."""
+    tables = [run.table for run in runs]
+    return [
+        f"{sum(table.voxels for table in tables):,}",
+        f"{sum(table.points for table in tables):,}",
+        _number(macro_mean([table.mean_op for table in tables]), 2),
+        _number(macro_mean([table.vss for table in tables]), 3),
+        _number(macro_mean([table.sbd for table in tables]), 4),
+        _number(macro_mean([table.entropy for table in tables]), 4),
+        _number(macro_mean([run.flicker_percent for run in runs]), 2),
+        _number(100 * macro_mean([table.recurrent.share for table in tables]), 2),
+        _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1),
+    ]
+
+
+def _strata_table(runs: Sequence[UnitSummary]) -> Table:
+    title = "by observation persistence" + (" (voxels of all scenes pooled)" if len(_scenes(runs)) > 1 else "")
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for name in ("backbone", "persistence"):
+        table.add_column(name)
+    for name in ("voxels", "%", "VSS ↑", "SBD ↓ bits", "entropy ↓"):
+        table.add_column(name, justify="right")
+    for backbone, rows in _by_backbone(runs):
+        voxels = sum(run.table.voxels for run in rows)
+        for strata in zip(*(run.table.strata for run in rows), strict=True):
+            table.add_row(backbone, *_stratum_cells(pool(strata, voxels)))
+        recurrent = pool([run.table.recurrent for run in rows], voxels)
+        table.add_row(backbone, *_stratum_cells(recurrent), style="bold", end_section=True)
+    return table
+
+
+def _stratum_cells(row: Means) -> list[str]:
+    return [
+        row.name,
+        f"{row.voxels:,}",
+        _number(100 * row.share, 2),
+        _number(row.vss, 3),
+        _number(row.sbd, 4),
+        _number(row.entropy, 4),
+    ]
+
+
+def _agreement_table(agreement: Iterable[Agreement]) -> Table:
+    table = Table(title="agreement of the backends", title_justify="left", title_style="bold")
+    for name in ("scene", "backbone", "backends"):
+        table.add_column(name)
+    for name in ("voxels in one only", "max |ΔVSS|", "max |ΔSBD|", "max |ΔH|", "max |Δevidence|", ""):
+        table.add_column(name, justify="right")
+    for row in agreement:
+        differences = [f"{row.differences[name].max:.1e}" for name in ("vss", "sbd", "entropy", "evidence")]
+        verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
+        table.add_row(row.scene, row.backbone, " · ".join(row.backends), f"{sum(row.only_in):,}", *differences, verdict)
+    return table
+
+
+def _title(runs: Sequence[UnitSummary]) -> str:
+    first = runs[0]
+    return (
+        f"{first.unit.backend} · voxels of {first.table.voxel_size:g} m · {first.taxonomy}, K = {first.table.K} · "
+        f"{first.frames} frames a scene"
+    )
+
+
+def _by_backbone(runs: Sequence[UnitSummary]) -> list[tuple[str, list[UnitSummary]]]:
+    names = list(dict.fromkeys(run.unit.backbone for run in runs))
+    return [(name, [run for run in runs if run.unit.backbone == name]) for name in names]
+
+
+def _scenes(runs: Sequence[UnitSummary]) -> set[str]:
+    return {run.unit.scene for run in runs}
+
+
+def _number(value: float, digits: int) -> str:
+    return NOTHING if math.isnan(value) else f"{value:.{digits}f}"
