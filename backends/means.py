@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+
 from semstab.frames import Frame
 from semstab.information import entropy_bits, js_divergence, normalise
 from semstab.results import RECURRENT, FrameReport

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 import numpy as np
+
 from semstab.backends.association import (
-    Float64,
     Int64,
     Observations,
     back_project,
@@ -33,8 +33,8 @@ class NumpyReference:
         self.num_classes = num_classes
         self._row: dict[tuple[int, int, int], int] = {}  # voxel q -> its row
         self._history: list[tuple[Int64, int, Observations]] = []  # (rows, frame, observations), frame after frame
-        self._evidence: list[Float64] = []  # e(q), row by row
-        self._op: list[int] = []
+        self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
+        self._op = np.zeros(0, dtype=np.int64)
         self._means = MapMeans()
 
     def integrate(self, frame: Frame) -> FrameReport:
@@ -42,13 +42,13 @@ class NumpyReference:
         started = time.perf_counter()
         check_frame(frame, self.num_classes)
         seen = observe(frame, self.voxel_size, self.num_classes)
-        rows, before = self._rows(seen)
+        rows = self._rows(seen)
+        before = self._evidence[rows]
         after = before + seen.s_bar
-        for row, e in zip(rows.tolist(), after, strict=True):
-            self._evidence[row] = e
-            self._op[row] += 1
+        self._evidence[rows] = after
+        self._op[rows] += 1
         self._history.append((rows, frame.index, seen))
-        op = np.array([self._op[row] for row in rows.tolist()], dtype=np.int64)
+        op = self._op[rows]
         drift = self._means.update(before, after, op)
         return self._means.report(frame, seen.pixels, op, drift, time.perf_counter() - started)
 
@@ -76,16 +76,15 @@ class NumpyReference:
             voxel_size=self.voxel_size,
         )
 
-    def _rows(self, seen: Observations) -> tuple[Int64, Float64]:
-        """The rows of the frame's voxels, new ones added, and their evidence so far (n, K)."""
-        rows = np.empty(len(seen.index), dtype=np.int64)
-        for i, (ix, iy, iz) in enumerate(seen.index.tolist()):
-            rows[i] = row = self._row.setdefault((ix, iy, iz), len(self._row))
-            if row == len(self._evidence):
-                self._evidence.append(np.zeros(self.num_classes))
-                self._op.append(0)
-        before = np.array([self._evidence[row] for row in rows.tolist()]).reshape(-1, self.num_classes)
-        return rows, before
+    def _rows(self, seen: Observations) -> Int64:
+        """The rows of the frame's voxels, new ones added."""
+        voxels = map(tuple, seen.index.tolist())
+        rows = np.array([self._row.setdefault(q, len(self._row)) for q in voxels], dtype=np.int64)
+        if len(self._row) > len(self._op):
+            room = 2 * len(self._row) - len(self._op)
+            self._evidence = np.pad(self._evidence, ((0, room), (0, 0)))
+            self._op = np.pad(self._op, (0, room))
+        return rows
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:

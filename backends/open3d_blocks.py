@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import open3d.core as o3c
 from open3d.t.geometry import VoxelBlockGrid
+
 from semstab.backends.association import (
     Float64,
     Int64,
@@ -33,6 +34,9 @@ from semstab.frames import Frame
 from semstab.information import entropy_bits
 from semstab.results import FrameReport
 from semstab.voxels import VoxelTable, index_columns
+
+INITIAL_BYTES = 128 * 2**20
+"""Memory for attributes that a new map takes at once."""
 
 
 class Open3DBlocks:
@@ -67,7 +71,7 @@ class Open3DBlocks:
             attr_channels=tuple((channels,) for _, channels in attributes.values()),
             voxel_size=voxel_size,
             block_resolution=block_resolution,
-            block_count=256,
+            block_count=self._initial_blocks(attributes),
             device=self.device,
         )
 
@@ -105,9 +109,16 @@ class Open3DBlocks:
     def events(self) -> None:
         """None: the grid keeps sums, not the history."""
 
+    def _initial_blocks(self, attributes: dict[str, tuple[Any, int]]) -> int:
+        """Room for the first blocks: growing means a copy of everything, so small maps should never grow."""
+        voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in attributes.values())
+        return max(64, INITIAL_BYTES // (voxel_bytes * self.block_resolution**3))
+
     def _activate(self, index: Int64) -> Int64:
         """Rows of voxels (n, 3) in the flattened attributes, their blocks activated; new ones start at 0."""
         r = self.block_resolution
+        if not len(index):  # the hash map takes no empty list of keys
+            return np.zeros(0, dtype=np.int64)
         block, local = index // r, index % r
         blocks, inverse = _unique_rows(block)
         keys = self._tensor(blocks.astype(np.int32))
@@ -156,7 +167,7 @@ class Open3DBlocks:
 
     def _write(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
         attribute = self._attribute(name)
-        attribute[self._tensor(rows)] = self._tensor(values.reshape(len(rows), -1)).to(attribute.dtype)
+        attribute[self._tensor(rows)] = self._tensor(values.reshape(len(rows), attribute.shape[1])).to(attribute.dtype)
 
     def _add(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
         self._write(name, rows, self._read(name, rows) + values)
@@ -208,8 +219,6 @@ def _starts(key: Int64) -> Int64:
 
 def _unique_rows(index: Int64) -> tuple[Int64, Int64]:
     """Distinct rows of (n, 3) and where each row went."""
-    if not len(index):
-        return index, np.zeros(0, dtype=np.int64)
     low = index.min(axis=0)
     size = index.max(axis=0) - low + 1
     x, y, z = (index - low).T

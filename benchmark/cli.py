@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+
 from semstab import __version__
 from semstab.errors import ConfigError, SemstabError
-from typer.core import TyperGroup
 
 if TYPE_CHECKING:
     from semstab.config import Config
@@ -86,9 +87,9 @@ def run(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
     dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; all by default.")] = None,
+    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
     backbone: Annotated[
-        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; 'gt' is the ground truth.")
+        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
     ] = None,
     taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse in: a name or a YAML file.")] = None,
     voxel_size: Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")] = None,
@@ -154,6 +155,7 @@ def list_() -> None:
     """Backends, datasets and taxonomies, each with 'ready' or what to install."""
     from rich.console import Console
     from rich.table import Table
+
     from semstab import backends, datasets
     from semstab.labels import LabelSpace, shipped_taxonomies
 
@@ -182,6 +184,7 @@ def _ready(registry: Registry, name: str) -> str:
 
 def _run(config: Config, out: Path, rerun: str | None, quiet: bool) -> RunResult:
     from rich.console import Console
+
     from semstab import pipeline
     from semstab.terminal import ProgressBar, print_summary
 
@@ -212,7 +215,7 @@ def _overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:
     """The settings given as options, those of --set last."""
     import yaml
 
-    content = {key: value for key, value in named.items() if value is not None}
+    content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}
     for setting in settings:
         path, equals, text = setting.partition("=")
         if not equals:

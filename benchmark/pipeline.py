@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+
 from semstab import backends
 from semstab.backends import FusionBackend
 from semstab.config import Config
@@ -127,7 +128,8 @@ def _fuse(
         for unit, backend in maps.items():
             if folder is not None:
                 events = backend.events() if config.events else None
-                folder.save_unit(unit, tables[unit], events, rows[unit])
+                named = None if events is None else dataclasses.replace(events, classes=classes)
+                folder.save_unit(unit, tables[unit], named, rows[unit])
     with watch("observe"):
         for unit in maps:
             for observer in observers:

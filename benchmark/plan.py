@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
+
 from semstab import backends
 from semstab.config import Config, explain, merge, read_yaml
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, options_model
@@ -90,7 +91,7 @@ def _tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
     extra = (GROUND_TRUTH,) if scene.ground_truth else ()
     names = _selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
     if not names:
-        raise DataError(f"{scene.name}: there are no label maps; put them into labels/BACKBONE/")
+        raise DataError(f"{scene.name}: there are no label maps; add them in labels/BACKBONE/, or choose with --scene")
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)

@@ -1,0 +1,183 @@
+"""The built-in dataset `city`: a simulated UAV flight over a procedural town, with simulated backbones.
+
+Five towns (scene0 to scene4) with roads, buildings, trees, gardens, cars and people, every face of a uavid8 class.
+Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. What the backbones get
+wrong, and where and when, is set by `CityOptions.backbones`; `SimulatedBackbone` documents the error model.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import threading
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from semstab.datasets import GROUND_TRUTH
+from semstab.datasets.city.classes import uavid8
+from semstab.datasets.city.flight import FLIGHTS
+from semstab.datasets.city.options import CityOptions, SimulatedBackbone
+from semstab.datasets.city.rendering import Caster, Rendered, render
+from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.world import World, build_world
+from semstab.errors import ConfigError, DataError
+from semstab.frames import Frame, Intrinsics
+from semstab.labels import LabelSpace
+
+__all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedBackbone"]
+
+GENERATOR_VERSION = 1
+"""Part of every digest: raise it with any change of the towns, the flights, the rendering or the error model."""
+
+
+class City:
+    """The dataset. It keeps the scene that was opened last, so that its backbones share what is rendered."""
+
+    Options: type[BaseModel] = CityOptions
+
+    def __init__(self, options: CityOptions) -> None:
+        self.options = options
+        self._last: CityScene | None = None
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """scene0 to scene4."""
+        return tuple(FLIGHTS)
+
+    def scene(self, name: str) -> CityScene:
+        """Open a scene; its town is built when the first frame is asked for. Raises DataError for an unknown name."""
+        if name not in FLIGHTS:
+            raise DataError(f"city: scene '{name}' is not known; {_hint(name, self.scenes)}")
+        if self._last is None or self._last.name != name:
+            self._last = CityScene(name, self.options)
+        return self._last
+
+
+class CityScene:
+    """One flight over one town; see `semstab.datasets.Scene`."""
+
+    ground_truth: bool = True
+
+    def __init__(self, name: str, options: CityOptions) -> None:
+        self.name = name
+        self.backbones: tuple[str, ...] = tuple(options.backbones)
+        self.up: npt.NDArray[np.float64] | None = np.array([0.0, 0.0, 1.0])
+        self._options = options
+        self._flight = FLIGHTS[name]
+        self._origin = np.array(options.origin, dtype=np.float64)
+        self._rendered: dict[int, Rendered] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return self._options.frames
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of every frame: square pixels, the optical axis in the middle of the image."""
+        W, H = self._options.width, self._options.height
+        f = W / (2 * np.tan(np.deg2rad(self._options.field_of_view) / 2))
+        return Intrinsics(f, f, (W - 1) / 2, (H - 1) / 2)
+
+    def label_space(self, backbone: str) -> LabelSpace:
+        """uavid8, for every backbone. Raises ConfigError for an unknown one."""
+        self._model(backbone)
+        return uavid8()
+
+    def frame(self, index: int, backbone: str) -> Frame:
+        """Render frame 0 <= index < len with a backbone's labels or scores.
+
+        Raises DataError for a frame, ConfigError for a backbone that does not exist.
+        """
+        model = self._model(backbone)
+        T = self._pose(index)
+        T_wc = T.copy()
+        T_wc[:3, 3] += self._origin
+        rendered = self._render(index, T)
+        labels: npt.NDArray[np.uint8] | None = rendered.classes
+        scores = None
+        if model is not None:
+            view = View(index, rendered, self.intrinsics, T_wc, self._origin)
+            simulation = Simulation(model, self._options.seed, backbone, self.name)
+            labels, scores = (None, simulation.scores(view)) if model.softness else (simulation.labels(view), None)
+        where = f"city/{self.name}/frame {index}"
+        return Frame(
+            index=index,
+            depth=rendered.depth,
+            intrinsics=self.intrinsics,
+            T_wc=T_wc,
+            labels=labels,
+            scores=scores,
+            color=rendered.color,
+            timestamp=self._share(index) * self._flight.seconds,
+            files={what: f"{where}, {what}" for what in ("depth", "pose", "labels", "scores", "color")},
+        )
+
+    def digest(self, indices: list[int], backbone: str) -> str:
+        """A hash of all settings that the frames depend on; nothing is rendered."""
+        model = self._model(backbone)
+        content = {
+            "generator": GENERATOR_VERSION,
+            "options": self._options.model_dump(mode="json", exclude={"backbones", "cache_megabytes"}),
+            "scene": self.name,
+            "indices": [int(index) for index in indices],
+            "backbone": backbone,
+            "model": None if model is None else model.model_dump(mode="json"),
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @cached_property
+    def _world(self) -> World:
+        return build_world(self._options.seed, self._flight)
+
+    @cached_property
+    def _still(self) -> Caster:
+        return Caster(self._world.still)
+
+    @cached_property
+    def _ground(self) -> float:
+        """Mean height of the ground under the flight."""
+        return float(self._world.terrain.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
+
+    def _share(self, index: int) -> float:
+        """How much of the flight lies behind at a frame."""
+        return index / max(1, len(self) - 1)
+
+    def _pose(self, index: int) -> npt.NDArray[np.float64]:
+        if not 0 <= index < len(self):
+            raise DataError(f"city/{self.name}: there is no frame {index}; the scene has {len(self)} frames, from 0")
+        return self._flight.pose(self._share(index), self._ground, self._options.altitude)
+
+    def _render(self, index: int, T: npt.NDArray[np.float64]) -> Rendered:
+        """The rendered frame, kept while there is room.
+
+        What does not fit is rendered again: dropping old frames instead would, in passes over all frames, drop each
+        of them just before it is needed.
+        """
+        with self._lock:
+            if index in self._rendered:
+                return self._rendered[index]
+            moving = Caster(self._world.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
+            size = (self._options.height, self._options.width)
+            rendered = render(self._still, moving, T, self.intrinsics, size)
+            kept = sum(other.nbytes for other in self._rendered.values())
+            if kept + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
+                self._rendered[index] = rendered
+            return rendered
+
+    def _model(self, backbone: str) -> SimulatedBackbone | None:
+        """The error model of a backbone, None for the ground truth."""
+        if backbone == GROUND_TRUTH:
+            return None
+        if backbone not in self._options.backbones:
+            known = (*self.backbones, GROUND_TRUTH)
+            raise ConfigError(f"city: backbone '{backbone}' is not known; {_hint(backbone, known)}")
+        return self._options.backbones[backbone]
+
+
+def _hint(name: str, known: tuple[str, ...]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

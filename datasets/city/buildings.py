@@ -1,0 +1,153 @@
+"""Buildings: walls with windows under gable, hip and flat roofs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from semstab.datasets.city.classes import BUILDING
+from semstab.datasets.city.mesh import Float64, Int64, Shape, Surface, box, pane, shape
+from semstab.datasets.city.plots import Building
+from semstab.datasets.city.streets import Layout
+from semstab.datasets.city.terrain import Terrain
+
+FOUNDATION = 2.0
+"""Metres of wall below the ground in the building's middle, so that no gap opens on a slope."""
+
+OVERHANG = 0.42
+STOREY = 2.9
+WALLS = np.array([[0.86, 0.83, 0.76], [0.80, 0.74, 0.62], [0.72, 0.68, 0.66], [0.63, 0.42, 0.34], [0.90, 0.89, 0.87]])
+TILES = np.array([[0.58, 0.28, 0.20], [0.50, 0.25, 0.20], [0.38, 0.27, 0.24], [0.33, 0.33, 0.36], [0.64, 0.36, 0.24]])
+FLAT = np.array([[0.56, 0.55, 0.54], [0.44, 0.44, 0.46], [0.66, 0.64, 0.60], [0.36, 0.37, 0.36]])
+GLASS = np.array([[0.20, 0.24, 0.29]])
+METAL = np.array([0.74, 0.75, 0.76])
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Buildings as columns: middle and floor height in the world, yaw, extent; and colours."""
+
+    position: Float64
+    yaw: Float64
+    size: Float64
+    walls: Float64
+    roofs: Float64
+
+    def local(self, x: Float64, y: Float64, z: Float64) -> Float64:
+        """World points of points in the buildings' own axes; z is above the floor."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return self.position + np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
+
+    def pick(self, rows: Int64) -> _Placed:
+        return _Placed(self.position[rows], self.yaw[rows], self.size[rows], self.walls[rows], self.roofs[rows])
+
+
+def build(buildings: Sequence[Building], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> list[Surface]:
+    """Walls, roofs and windows of all buildings."""
+    columns = np.array([b[:6] for b in buildings], dtype=np.float64)
+    kind = np.array([b.roof for b in buildings])
+    x, y = layout.to_world(columns[:, 0], columns[:, 1])
+    yaw = layout.heading(columns[:, 0], columns[:, 1], columns[:, 2])
+    tone = rng.uniform(0.88, 1.08, size=(len(buildings), 1))
+    tiles = np.where((kind == "flat")[:, None], _choose(FLAT, len(kind), rng), _choose(TILES, len(kind), rng))
+    placed = _Placed(terrain.on(x, y), yaw, columns[:, 3:6], _choose(WALLS, len(kind), rng) * tone, tiles * tone)
+    return [
+        _walls(placed),
+        *_pitched(placed.pick(np.flatnonzero(kind == "gable")), _gable(), rng),
+        _gable_ends(placed.pick(np.flatnonzero(kind == "gable"))),
+        *_pitched(placed.pick(np.flatnonzero(kind == "hip")), _hip(), rng),
+        *_flat_roofs(placed.pick(np.flatnonzero(kind == "flat")), rng),
+        _windows(placed),
+    ]
+
+
+def _walls(b: _Placed) -> Surface:
+    position = b.position - [0, 0, FOUNDATION]
+    return box().place(BUILDING, position, b.yaw, b.size + np.array([0, 0, FOUNDATION]), b.walls)
+
+
+def _pitched(b: _Placed, roof: Shape, rng: np.random.Generator) -> list[Surface]:
+    """Roofs that rise with 0.75 across the ridge and stand over the walls by OVERHANG; a chimney on each."""
+    zero = np.zeros(len(b.yaw))
+    size = b.size + np.array([2 * OVERHANG, 2 * OVERHANG, 0])
+    size[:, 2] = _rise(size[:, 1])
+    eaves = b.size[:, 2] - _rise(np.full(len(zero), 2 * OVERHANG)) + 0.03
+    chimney = b.local(b.size[:, 0] * rng.uniform(-0.2, 0.2, len(zero)), b.size[:, 1] * 0.13, b.size[:, 2])
+    stack = np.stack([zero + 0.6, zero + 0.6, _rise(b.size[:, 1]) + 0.7], axis=1)
+    return [
+        roof.place(BUILDING, b.local(zero, zero, eaves), b.yaw, size, b.roofs),
+        box().place(BUILDING, chimney, b.yaw, stack, b.walls * 0.7),
+    ]
+
+
+def _gable_ends(b: _Placed) -> Surface:
+    zero = np.zeros(len(b.yaw))
+    size = np.stack([b.size[:, 0], b.size[:, 1], _rise(b.size[:, 1])], axis=1)
+    ends = shape([[x, y, z] for x in (-0.5, 0.5) for y, z in ((-0.5, 0), (0.5, 0), (0, 1))], [[0, 1, 2], [3, 4, 5]])
+    return ends.place(BUILDING, b.local(zero, zero, b.size[:, 2]), b.yaw, size, b.walls)
+
+
+def _flat_roofs(b: _Placed, rng: np.random.Generator) -> list[Surface]:
+    """A roof surface within a parapet, and ventilators on it."""
+    zero, height = np.zeros(len(b.yaw)), b.size[:, 2]
+    surface = shape([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], [[0, 1, 2, 3]])
+    parts = [surface.place(BUILDING, b.local(zero, zero, height + 0.04), b.yaw, b.size, b.roofs)]
+    rim = 0.3
+    for side in (-1, 1):
+        along = np.stack([b.size[:, 0], zero + rim, zero + 0.55], axis=1)
+        parts.append(
+            box().place(BUILDING, b.local(zero, side * (b.size[:, 1] - rim) / 2, height), b.yaw, along, b.walls)
+        )
+        across = np.stack([zero + rim, b.size[:, 1], zero + 0.55], axis=1)
+        parts.append(
+            box().place(BUILDING, b.local(side * (b.size[:, 0] - rim) / 2, zero, height), b.yaw, across, b.walls)
+        )
+    for _ in range(4):
+        x, y = (rng.uniform(-0.38, 0.38, len(zero)) * b.size[:, axis] for axis in (0, 1))
+        extent = rng.uniform([0.9, 0.9, 0.6], [2.6, 2.0, 1.7], size=(len(zero), 3))
+        parts.append(box().place(BUILDING, b.local(x, y, height), b.yaw, extent, np.tile(METAL, (len(zero), 1))))
+    return parts
+
+
+def _windows(b: _Placed) -> Surface:
+    """Panes every 2.6 m or so along each wall and on each storey, 3 cm in front of it."""
+    rows, x, y, z, turn = [], [], [], [], []
+    for row, (length, width, height) in enumerate(b.size):
+        floors = np.arange(max(1, int(height / STOREY))) * STOREY + 0.95
+        for side, (extent, distance) in enumerate(((length, width), (width, length), (length, width), (width, length))):
+            count = max(1, int(extent / 2.6))
+            along = (np.arange(count) + 0.5) * extent / count - extent / 2
+            u, v = (grid.ravel() for grid in np.meshgrid(along, floors))
+            angle = side * np.pi / 2
+            front = distance / 2 + 0.03
+            rows.append(np.full(len(u), row))
+            x.append(np.cos(angle) * u + np.sin(angle) * front)
+            y.append(np.sin(angle) * u - np.cos(angle) * front)
+            z.append(v)
+            turn.append(np.full(len(u), angle))
+    owner = b.pick(np.concatenate(rows))
+    position = owner.local(np.concatenate(x), np.concatenate(y), np.concatenate(z))
+    size = np.tile([1.25, 1.0, 1.35], (len(position), 1))
+    return pane().place(BUILDING, position, owner.yaw + np.concatenate(turn), size, np.tile(GLASS, (len(position), 1)))
+
+
+def _gable() -> Shape:
+    """Two slopes of unit extent with the ridge along x, and their undersides' edges left open."""
+    vertices = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, 0, 1], [0.5, 0, 1]]
+    return shape(vertices, [[0, 1, 5, 4], [2, 3, 4, 5]])
+
+
+def _hip() -> Shape:
+    """Four slopes of unit extent; the ridge is 0.4 long."""
+    vertices = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.2, 0, 1], [0.2, 0, 1]]
+    return shape(vertices, [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4]])
+
+
+def _rise(width: Float64) -> Float64:
+    return 0.375 * width
+
+
+def _choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
+    return colors[rng.integers(len(colors), size=count)]

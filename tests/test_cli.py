@@ -1,0 +1,239 @@
+"""The real command line, in a process of its own: exit codes, one-line errors, what it prints and leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tiny_scene
+
+COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+
+
+def bench(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
+    return subprocess.run(
+        [COMMAND, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def error_of(result: subprocess.CompletedProcess[str]) -> str:
+    """The one line that bad input leaves; exit code 2, no traceback."""
+    assert result.returncode == 2, result.stderr
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+@pytest.fixture
+def wall(tmp_path):
+    return tiny_scene.write(tmp_path / "wall")
+
+
+def test_help_shows_the_options_and_the_commands(tmp_path) -> None:
+    result = bench("--help", cwd=tmp_path)
+    assert result.returncode == 0
+    for word in ("--backend", "--voxel-size", "--rerun", "list", "view"):
+        assert word in result.stdout
+
+
+def test_help_imports_nothing_heavy(tmp_path) -> None:
+    code = (
+        "import sys; sys.argv = ['semstab-bench', '--help']\n"
+        "from semstab.cli import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "heavy = {'numpy', 'open3d', 'rerun', 'pyarrow', 'pydantic', 'cv2', 'trimesh', 'yaml'} & set(sys.modules)\n"
+        "sys.exit(f'imported: {heavy}' if heavy else 0)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+def test_list_names_what_there_is(tmp_path) -> None:
+    result = bench("list", cwd=tmp_path)
+    assert result.returncode == 0
+    for word in ("open3d", "numpy", "city", "posed_folder", "uavid7", "ready"):
+        assert word in result.stdout
+
+
+def test_a_run_on_a_folder(wall, tmp_path) -> None:
+    result = bench("--backend", "open3d", "--data", wall, "--voxel-size", "0.25", "--out", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for word in ("wall", "OP=1", "3<=OP<=5", "agree", "seen once", "run folder: run"):
+        assert word in result.stdout
+    for name in ("config.yaml", "manifest.json", "summary.json", "recording.rrd", "voxels/wall__a__open3d.parquet"):
+        assert (tmp_path / "run" / name).exists()
+    runs = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
+    assert {(run["backbone"], run["backend"]) for run in runs} == {(m, b) for m in "ab" for b in ("open3d", "numpy")}
+
+
+def test_options_reach_the_run(wall, tmp_path) -> None:
+    arguments = ("--backend", "numpy", "--check", "none", "--backbone", "gt", "--frames", ":2", "--pixel-stride", "2")
+    more = (
+        "--set",
+        "strata=[1, 4]",
+        "--set",
+        "voxel_size=0.25",
+        "--rerun",
+        "off",
+        "--out",
+        "run",
+        "--quiet",
+        "--events",
+    )
+    result = bench("run", *arguments, *more, "--data", wall, cwd=tmp_path)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    (run,) = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
+    assert (run["frames"], run["points"], run["backbone"]) == (2, 24, "gt")
+    assert [row["name"] for row in run["strata"]] == ["OP=1", "2<=OP<=4", "OP>4"]
+    assert not (tmp_path / "run" / "recording.rrd").exists()
+    assert (tmp_path / "run" / "events" / "wall__gt__numpy.parquet").exists()
+
+
+def test_the_default_run_folder_is_new_each_time(wall, tmp_path) -> None:
+    arguments = ("--backend", "numpy", "--data", wall, "--rerun", "off", "-q")
+    assert bench(*arguments, cwd=tmp_path).returncode == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert (folder / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--data", "nowhere"), "nowhere: there is no such folder"),
+        (("--data", "empty"), "empty"),
+        (("--config", "nowhere.yaml"), "nowhere.yaml: cannot be read"),
+        (("--config", "bad.yaml"), "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
+        (("--data", "wall", "--voxel-size", "0"), "voxel_size: input should be greater than 0"),
+        (("--data", "wall", "--backend", "opn3d"), "did you mean 'open3d'?"),
+        (("--data", "wall", "--backbone", "c"), "no backbone 'c'; there is a, b, gt"),
+        (("--data", "wall", "--frames", "3"), "--frames 3"),
+        (("--data", "wall", "--set", "x"), "write KEY=VALUE"),
+        (("--data", "wall", "--device", "CUDA:7"), "CUDA"),
+        (("--data", "wall", "--backend", "numpy", "--device", "CPU:0"), "none of numpy runs on a device"),
+        (("--data", "wall", "--seed", "1"), "unknown setting 'seed'"),
+        (("--data", "wall", "--out", "wall"), "is not empty and holds no run"),
+        (("view", "wall"), "there is no recording"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.yaml").write_text("voxel_sise: 1\n")
+    assert message in error_of(bench(*arguments, cwd=tmp_path))
+
+
+def damage_depth_size(wall: Path) -> str:
+    cv2.imwrite(str(wall / "depth/0001.png"), np.full((3, 4), 2000, np.uint16))
+    return "labels are 8x6 but depth is 4x3"
+
+
+def damage_pose_scale(wall: Path) -> str:
+    np.savetxt(wall / "pose/0001.txt", np.diag([2.0, 2, 2, 1]))
+    return "pose/0001.txt: the rotation is not orthonormal"
+
+
+def damage_pose_nan(wall: Path) -> str:
+    np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
+    return "pose/0001.txt: the pose is not finite"
+
+
+def damage_image(wall: Path) -> str:
+    path = wall / "depth/0001.png"
+    path.write_bytes(path.read_bytes()[:40])
+    return "depth/0001.png"
+
+
+def damage_label_id(wall: Path) -> str:
+    cv2.imwrite(str(wall / "labels/a/0001.png"), np.full((6, 8), 77, np.uint8))
+    return "labels/a/0001.png: label id 77"
+
+
+def damage_missing_label(wall: Path) -> str:
+    (wall / "labels/a/0001.png").unlink()
+    return "labels/a/0001"
+
+
+def damage_depth_invalid(wall: Path) -> str:
+    for path in (wall / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((6, 8), np.uint16))
+    return "wall, a: no pixel of 3 frames is valid"
+
+
+def damage_intrinsics(wall: Path) -> str:
+    (wall / "intrinsics.txt").unlink()
+    return "intrinsics.txt"
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        damage_depth_size,
+        damage_pose_scale,
+        damage_pose_nan,
+        damage_image,
+        damage_label_id,
+        damage_missing_label,
+        damage_depth_invalid,
+        damage_intrinsics,
+    ],
+)
+def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage) -> None:
+    message = damage(wall)
+    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path)
+    assert message in error_of(result)
+    assert not list((tmp_path / "run").rglob("wall__a*"))
+
+
+def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> None:
+    """A plug-in's backend that counts every observation twice is found out by the reference."""
+    package = tmp_path / "plugin" / "twice.py"
+    package.parent.mkdir()
+    package.write_text(
+        "import dataclasses\n"
+        "from semstab.backends.numpy_reference import NumpyReference\n"
+        "class Twice(NumpyReference):\n"
+        "    def table(self):\n"
+        "        table = super().table()\n"
+        "        return dataclasses.replace(table, op=table.op * 2)\n"
+    )
+    metadata = tmp_path / "plugin" / "twice-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: twice\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[semstab.backends]\ntwice = twice:Twice\n")
+    arguments = ["--data", "wall", "--backend", "twice", "--rerun", "off", "--out", "run"]
+    environment = {**os.environ, "PYTHONPATH": str(package.parent), "COLUMNS": "160"}
+    result = subprocess.run(
+        [COMMAND, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 3, result.stderr
+    assert "DISAGREE" in result.stdout
+    assert "error: the backends disagree" in result.stderr
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
+
+
+def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
+    wall = tiny_scene.write(tmp_path / "wall", backbones=("a", "b"), frames=400)
+    arguments = [COMMAND, "--data", str(wall), "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off"]
+    arguments += ["--out", str(tmp_path / "run")]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finished = tmp_path / "run" / "units" / "wall__a.json"
+    deadline = time.monotonic() + 60
+    while not finished.exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert "interrupted" in stderr
+    assert "Traceback" not in stderr
+    again = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert "kept from before: wall, a" in again.stderr

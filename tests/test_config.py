@@ -1,0 +1,105 @@
+"""Settings: defaults, unknown keys, YAML, the layers below a configuration file."""
+
+from __future__ import annotations
+
+import pytest
+
+from semstab.config import BackendConfig, Config, FrameSelection, merge, read_yaml
+from semstab.errors import ConfigError
+from semstab.plan import load_config, resolve
+
+
+def test_defaults_are_the_papers() -> None:
+    config = Config()
+    assert (config.voxel_size, config.strata, config.dataset.name) == (0.2, [1, 2, 5], "city")
+    assert [backend.name for backend in config.fused_by()] == ["open3d", "numpy"]
+
+
+def test_the_checking_backend_is_not_fused_twice() -> None:
+    config = Config(backends=[BackendConfig(name="numpy")])
+    assert [backend.name for backend in config.fused_by()] == ["numpy"]
+
+
+def test_yaml_round_trip(tmp_path) -> None:
+    config = Config(voxel_size=0.05, scenes=["s"], frames=FrameSelection(stride=4), check=None)
+    (tmp_path / "c.yaml").write_text(config.to_yaml())
+    assert Config.build(read_yaml(tmp_path / "c.yaml")) == config
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"voxelsize": 1}, "unknown setting 'voxelsize'; did you mean 'voxel_size'"),
+        ({"frames": {"strid": 2}}, r"unknown setting 'frames\.strid'; did you mean 'stride'"),
+        ({"backends": [{"name": "numpy", "option": {}}]}, "did you mean 'options'"),
+        ({"voxel_size": 0}, "voxel_size: input should be greater than 0"),
+        ({"voxel_size": -0.2}, "voxel_size: input should be greater than 0"),
+        ({"voxel_size": float("nan")}, "voxel_size: "),
+        ({"strata": [2, 2]}, "strata: edges must be ascending"),
+        ({"backends": []}, "backends: "),
+        ({"backends": ["numpy", "numpy"]}, "backends: each backend can be named once"),
+        ({"pixel_stride": 0}, "pixel_stride: "),
+        ({"colour": 1}, "unknown setting 'colour'; known: "),
+    ],
+)
+def test_bad_settings_are_one_line_that_names_the_setting(content, message) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        Config.build(content, "my.yaml")
+    assert str(caught.value).startswith("my.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("a: [1", "not valid YAML"), ("- 1\n- 2\n", "found a list"), ("!!python/object:os.system {}", "not valid YAML")],
+)
+def test_bad_yaml_is_one_line_that_names_the_file(tmp_path, text, message) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_configuration_file() -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: cannot be read"):
+        load_config("nowhere.yaml")
+
+
+def test_merge_goes_group_by_group() -> None:
+    assert merge({"a": {"x": 1, "y": 2}, "b": 3}, {"a": {"y": 4}}) == {"a": {"x": 1, "y": 4}, "b": 3}
+
+
+def test_city_is_fused_in_the_papers_taxonomy_unless_told_otherwise(tmp_path) -> None:
+    assert load_config().taxonomy == "uavid7"
+    assert load_config(overrides={"taxonomy": "uavid3"}).taxonomy == "uavid3"
+    assert load_config(overrides={"dataset": {"name": "posed_folder"}}).taxonomy is None
+    (tmp_path / "c.yaml").write_text("taxonomy: null\n")
+    assert load_config(tmp_path / "c.yaml").taxonomy is None
+
+
+def test_resolving_fills_in_the_datasets_own_defaults_and_absolute_paths(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = resolve(load_config(overrides={"dataset": {"name": "posed_folder", "options": {"root": "x"}}}))
+    assert config.dataset.options["root"] == str(tmp_path / "x")
+    assert resolve(config) == config
+
+
+def test_an_unknown_option_of_the_dataset_is_named() -> None:
+    options = {"root": ".", "depthscale": 10}
+    with pytest.raises(ConfigError, match="'depthscale'; did you mean 'depth_scale'"):
+        resolve(load_config(overrides={"dataset": {"name": "posed_folder", "options": options}}))
+
+
+@pytest.mark.parametrize(
+    ("selection", "expected"),
+    [
+        (FrameSelection(), list(range(10))),
+        (FrameSelection(start=2, stop=9, stride=3), [2, 5, 8]),
+        (FrameSelection(stride=4, count=2), [0, 4]),
+        (FrameSelection(start=10), []),
+    ],
+)
+def test_frame_selection(selection, expected) -> None:
+    assert selection.indices(10) == expected

@@ -1,0 +1,34 @@
+"""The command that README shows first, at a size for tests: `semstab-bench --backend open3d` on the built-in city."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+SMALL = ("width=96", "height=54", "frames=4")
+
+
+def test_the_built_in_city_from_the_command_line(tmp_path) -> None:
+    small = [word for option in SMALL for word in ("--set", f"dataset.options.{option}")]
+    environment = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
+    result = subprocess.run(
+        [COMMAND, "--backend", "open3d", *small],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    summary = json.loads((folder / "summary.json").read_text())
+    units = {(run["scene"], run["backbone"], run["backend"]) for run in summary["runs"]}
+    backbones, backends = ("sim-steady", "sim-flicker"), ("open3d", "numpy")
+    assert units == {(s, m, b) for s in ("scene0", "scene3") for m in backbones for b in backends}
+    assert all(row["agrees"] and row["only_in"] == [0, 0] for row in summary["agreement"])
+    assert {run["K"] for run in summary["runs"]} == {7}
+    assert "seen once" in result.stdout

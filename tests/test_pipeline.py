@@ -1,0 +1,267 @@
+"""The run through the API: what it computes, what it keeps, and how it goes on after an interruption."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import tiny_scene
+import yaml
+
+import semstab
+from semstab import metrics
+from semstab.config import Config
+from semstab.errors import ConfigError, DataError
+from semstab.pipeline import Observer
+from semstab.plan import load_config
+from semstab.results import RunResult, Unit
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_scene.write(tmp_path / "data" / "wall")
+
+
+def configure(root, **settings) -> Config:
+    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
+    return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25, **settings})
+
+
+def without_times(summary: dict) -> dict:
+    runs = [{key: value for key, value in run.items() if key != "fuse_ms_per_frame"} for run in summary["runs"]]
+    return {**summary, "runs": runs}
+
+
+class Watching(Observer):
+    def __init__(self) -> None:
+        self.seen: list[str] = []
+
+    def run_started(self, plan) -> None:
+        self.seen.append(f"start {len(plan.tasks)}")
+
+    def frame_fused(self, unit, frame, row) -> None:
+        self.seen.append(f"{unit.slug} {row.report.frame}")
+
+    def unit_finished(self, unit, table, summary) -> None:
+        self.seen.append(f"{unit.slug} done {len(table)}")
+
+    def group_kept(self, task, result) -> None:
+        self.seen.append(f"kept {task.backbone}")
+
+    def run_finished(self, result) -> None:
+        self.seen.append("finished")
+
+
+class Interrupting(Observer):
+    """Ctrl-C in the middle of a backbone."""
+
+    def __init__(self, slug: str) -> None:
+        self.slug = slug
+
+    def frame_fused(self, unit, frame, row) -> None:
+        if unit.slug == self.slug and row.report.frame == 1:
+            raise KeyboardInterrupt
+
+
+def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
+    """Pixels are as large as voxels here, and the truth is tied to the wall: every voxel keeps one label."""
+    (run,) = semstab.run(configure(root, backbones=["gt"])).runs
+    # 8 columns, and one more a frame; 6 rows
+    assert run.table.voxels == (8 + 2) * 6
+    assert run.table.points == run.table.observations == 3 * 48
+    assert (run.table.vss, run.table.sbd, run.table.entropy) == (1.0, 0.0, 0.0)
+    # of 10 columns, the outermost two a side are seen less often
+    assert [row.voxels for row in run.table.strata] == [2 * 6, 2 * 6, 6 * 6, 0]
+    assert run.table.recurrent.share == pytest.approx(0.6)
+    # two of eight columns change their class at each step to the right
+    assert run.flicker_percent == pytest.approx(25.0)
+
+
+def test_observers_see_everything_in_order(root) -> None:
+    watching = Watching()
+    semstab.run(configure(root, backbones=["a"]), observers=[watching])
+    unit = "wall__a__numpy"
+    assert watching.seen == ["start 1", f"{unit} 0", f"{unit} 1", f"{unit} 2", f"{unit} done 60", "finished"]
+
+
+def test_every_backbone_goes_through_every_backend_and_they_agree(root) -> None:
+    result = semstab.run(configure(root, backends=["open3d"]))
+    assert [run.unit.slug for run in result.runs] == [
+        "wall__a__open3d", "wall__a__numpy", "wall__b__open3d", "wall__b__numpy"
+    ]  # fmt: skip
+    assert [row.backends for row in result.agreement] == [("open3d", "numpy")] * 2
+    assert result.agrees
+
+
+def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
+    out = tmp_path / "run"
+    result = semstab.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"])
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary == json.loads(json.dumps(summary))
+    assert summary["schema"] == 1
+    first = summary["runs"][0]
+    for key in (
+        "scene", "backbone", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",
+        "vss", "sbd", "entropy", "strata", "recurrent", "classes", "flicker_percent", "fuse_ms_per_frame",
+    ):  # fmt: skip
+        assert key in first
+    assert first["strata"][0]["sbd"] is None
+    assert first["strata"][3] == {
+        "name": "OP>5", "share": 0.0, "voxels": 0, "vss": None, "sbd": None, "entropy": None, "sbd_voxels": 0
+    }  # fmt: skip
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["command"] == ["semstab-bench", "--x"]
+    assert set(manifest["inputs"]) == {"wall/a", "wall/b"}
+    assert manifest["peak_memory_bytes"] > 1e6
+    unit = Unit("wall", "a", "numpy")
+    voxels = pq.read_table(out / "voxels" / f"{unit.slug}.parquet")
+    assert {"ix", "iy", "iz", "op", "vss", "sbd", "entropy", "label", "evidence"} <= set(voxels.column_names)
+    table = semstab.VoxelTable.load(out / "voxels" / f"{unit.slug}.parquet")
+    np.testing.assert_array_equal(voxels.column("vss").to_numpy(), metrics.vss(table))
+    assert table.classes == ("wall", "door", "window")
+    assert metrics.summarise(table) == result.runs[0].table
+    events = semstab.Events.load(out / "events" / f"{unit.slug}.parquet")
+    assert metrics.summarise(events.table()) == result.runs[0].table
+    rows = (out / "frames" / f"{unit.slug}.csv").read_text().splitlines()
+    assert len(rows) == 4
+    assert rows[1].split(",")[rows[0].split(",").index("drift")] == ""  # nothing was seen before
+    assert not list(out.rglob(".*"))  # no temporary file is left
+
+
+def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
+    """The map's running means, kept frame by frame, equal those of the final table."""
+    for backend in ("numpy", "open3d"):
+        out = tmp_path / backend
+        (run,) = semstab.run(configure(root, backbones=["b"], backends=[backend], check=None), out=out).runs
+        text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
+        last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
+        assert int(last["map_voxels"]) == run.table.voxels
+        assert float(last["map_vss"]) == pytest.approx(run.table.vss, abs=1e-12)
+        assert float(last["map_entropy"]) == pytest.approx(run.table.entropy, abs=1e-12)
+        assert float(last["map_recurrent"]) == pytest.approx(run.table.recurrent.share, abs=1e-12)
+
+
+def test_running_the_resolved_configuration_again_gives_the_same_numbers(root, tmp_path) -> None:
+    first = semstab.run(configure(root), out=tmp_path / "one")
+    again = semstab.run(load_config(tmp_path / "one" / "config.yaml"), out=tmp_path / "two")
+    assert without_times(again.to_dict()) == without_times(first.to_dict())
+    assert (tmp_path / "one" / "config.yaml").read_text() == (tmp_path / "two" / "config.yaml").read_text()
+
+
+def test_an_interrupted_run_keeps_what_was_finished_and_goes_on(root, tmp_path) -> None:
+    out, config = tmp_path / "run", configure(root)
+    with pytest.raises(KeyboardInterrupt):
+        semstab.run(config, out=out, observers=[Interrupting("wall__b__numpy")])
+    kept = json.loads((out / "summary.json").read_text())
+    assert [run["backbone"] for run in kept["runs"]] == ["a"]
+    watching = Watching()
+    resumed = semstab.run(config, out=out, observers=[watching])
+    assert "kept a" in watching.seen
+    assert not any(line.startswith("wall__a") for line in watching.seen)
+    whole = semstab.run(config, out=tmp_path / "whole")
+    assert without_times(resumed.to_dict()) == without_times(whole.to_dict())
+    assert RunResult(resumed.groups).agrees
+
+
+def test_a_changed_input_is_computed_again(root, tmp_path) -> None:
+    out, config = tmp_path / "run", configure(root)
+    semstab.run(config, out=out)
+    cv2.imwrite(str(root / "labels/b/0001.png"), np.zeros((6, 8), np.uint8))
+    watching = Watching()
+    semstab.run(config, out=out, observers=[watching])
+    assert "kept a" in watching.seen
+    assert "kept b" not in watching.seen
+
+
+def test_a_folder_of_another_run_is_refused(root, tmp_path) -> None:
+    out = tmp_path / "run"
+    semstab.run(configure(root), out=out)
+    with pytest.raises(ConfigError, match=r"holds a run with other settings \(voxel_size: 0\.25 there, 0\.5 here\)"):
+        semstab.run(configure(root, voxel_size=0.5), out=out)
+    with pytest.raises(ConfigError, match="is not empty and holds no run"):
+        semstab.run(configure(root), out=root)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="is a file"):
+        semstab.run(configure(root), out=tmp_path / "file")
+
+
+def test_a_damaged_unit_file_is_named(root, tmp_path) -> None:
+    out, config = tmp_path / "run", configure(root)
+    semstab.run(config, out=out)
+    (out / "units" / "wall__a.json").write_text('{"key": ')
+    with pytest.raises(DataError, match=r"wall__a\.json: not valid JSON"):
+        semstab.run(config, out=out)
+
+
+def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, monkeypatch) -> None:
+    from semstab.backends.open3d_blocks import Open3DBlocks
+
+    update = Open3DBlocks._update
+    monkeypatch.setattr(Open3DBlocks, "_update", lambda self, rows, seen, frame: update(self, rows, seen, frame + 1))
+    monkeypatch.setattr(Open3DBlocks, "num_classes", 3, raising=False)
+    agreeing = semstab.run(configure(root, backbones=["a"], backends=["open3d"]))
+    assert agreeing.agrees  # frame numbers are not compared, evidence is
+
+    def half(self, rows, seen, frame):
+        return update(self, rows, type(seen)(seen.index, seen.s_bar / 2, seen.pixels), frame)
+
+    monkeypatch.setattr(Open3DBlocks, "_update", half)
+    result = semstab.run(configure(root, backbones=["a"], backends=["open3d"]), out=tmp_path / "run")
+    assert not result.agrees
+    assert result.agreement[0].differences["evidence"].max > 0.1
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
+
+
+def test_a_scene_without_a_valid_pixel_says_what_is_missing(root) -> None:
+    for path in (root / "labels/a").iterdir():
+        cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
+    with pytest.raises(DataError, match=r"wall, a: no pixel of 3 frames is valid .*depth in 100%.*label in 0%"):
+        semstab.run(configure(root))
+
+
+def test_a_label_outside_the_taxonomy_names_its_file(root) -> None:
+    path = root / "labels/a/0002.png"
+    cv2.imwrite(str(path), np.full((6, 8), 9, np.uint8))
+    with pytest.raises(DataError, match=r"labels/a/0002\.png: label id 9 \(48 pixels\) is outside the taxonomy"):
+        semstab.run(configure(root))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"backbones": ["c"]}, "wall: no backbone 'c'; there is a, b, gt"),
+        ({"scenes": ["wal"]}, "posed_folder: no scene 'wal'; did you mean 'wall'"),
+        ({"frames": {"start": 9}}, "wall: the selection of frames leaves none of its 3"),
+        ({"backends": ["open4d"]}, "backend 'open4d' is not known; did you mean 'open3d'"),
+        (
+            {"backends": [{"name": "open3d", "options": {"block": 8}}]},
+            "has no option 'block'; it takes device, bl",
+        ),
+        (
+            {"backends": [{"name": "open3d", "options": {"device": "GPU"}}]},
+            "device 'GPU' is not one; use CPU:0 or CUDA:0",
+        ),
+        ({"taxonomy": "uavid7"}, "no class takes 'wall, door, window' of "),
+        ({"taxonomy": "uavid9"}, "taxonomy 'uavid9' is not known; did you mean 'uavid"),
+    ],
+)
+def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, settings, message) -> None:
+    with pytest.raises((ConfigError, DataError), match=message):
+        semstab.run(configure(root, **settings))
+
+
+def test_pixel_stride_keeps_every_nth_pixel_at_its_place(root) -> None:
+    (run,) = semstab.run(configure(root, backbones=["gt"], pixel_stride=2)).runs
+    assert run.table.points == 3 * 4 * 3
+    assert run.table.vss == 1.0
+
+
+def test_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
+    path = tmp_path / "two.yaml"
+    path.write_text(yaml.safe_dump({"classes": ["wall", {"name": "opening", "members": ["door", "window"]}]}))
+    (run,) = semstab.run(configure(root, backbones=["gt"], taxonomy=str(path))).runs
+    assert (run.taxonomy, run.table.K) == ("two", 2)
+    assert [row.name for row in run.table.classes] == ["wall", "opening"]
