@@ -42,7 +42,10 @@ class FusionBackend(Protocol):
     """
 
     def integrate(self, frame: Frame) -> FrameReport:
-        """Fuse one frame. Raises DataError, with the map unchanged, where the frame cannot be fused."""
+        """Fuse one frame: one more observation of the voxels it sees, whatever its index.
+
+        Raises DataError, with the map unchanged, where the frame cannot be fused.
+        """
         ...
 
     def table(self) -> VoxelTable:

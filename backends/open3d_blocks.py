@@ -35,8 +35,11 @@ from semstab.information import entropy_bits
 from semstab.results import FrameReport
 from semstab.voxels import VoxelTable, index_columns
 
-INITIAL_BYTES = 128 * 2**20
-"""Memory for attributes that a new map takes at once."""
+INITIAL_BYTES = 32 * 2**20
+"""Memory for attributes that a new map takes at once: small maps never grow."""
+
+COPIED_BLOCKS = 1024
+"""Blocks that move at a time when a map grows, so that the copy needs no second map's worth of memory."""
 
 
 class Open3DBlocks:
@@ -55,7 +58,7 @@ class Open3DBlocks:
         self.block_resolution = block_resolution
         self.device = _device(device)
         self._means = MapMeans()
-        attributes = {
+        self._attributes = {
             "op": (o3c.int32, 1),
             "evidence": (o3c.float64, num_classes),
             "drift_sum": (o3c.float64, 1),
@@ -65,15 +68,8 @@ class Open3DBlocks:
             "self_sum": (o3c.float64, 1),
             "frame_entropy_sum": (o3c.float64, 1),
         }
-        self.grid = VoxelBlockGrid(
-            attr_names=tuple(attributes),
-            attr_dtypes=tuple(dtype for dtype, _ in attributes.values()),
-            attr_channels=tuple((channels,) for _, channels in attributes.values()),
-            voxel_size=voxel_size,
-            block_resolution=block_resolution,
-            block_count=self._initial_blocks(attributes),
-            device=self.device,
-        )
+        voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self._attributes.values())
+        self.grid = self._new_grid(max(64, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
@@ -109,10 +105,38 @@ class Open3DBlocks:
     def events(self) -> None:
         """None: the grid keeps sums, not the history."""
 
-    def _initial_blocks(self, attributes: dict[str, tuple[Any, int]]) -> int:
-        """Room for the first blocks: growing means a copy of everything, so small maps should never grow."""
-        voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in attributes.values())
-        return max(64, INITIAL_BYTES // (voxel_bytes * self.block_resolution**3))
+    def _new_grid(self, blocks: int) -> VoxelBlockGrid:
+        """An empty grid with room for that many blocks."""
+        return VoxelBlockGrid(
+            attr_names=tuple(self._attributes),
+            attr_dtypes=tuple(dtype for dtype, _ in self._attributes.values()),
+            attr_channels=tuple((channels,) for _, channels in self._attributes.values()),
+            voxel_size=self.voxel_size,
+            block_resolution=self.block_resolution,
+            block_count=blocks,
+            device=self.device,
+        )
+
+    def _make_room(self, keys: Any) -> None:
+        """Grow where the blocks (n, 3) do not fit, by a copy into a new grid: Open3D's own rehash takes longer."""
+        old = self.grid.hashmap()
+        _, present = old.find(keys)
+        needed = old.size() + int(np.count_nonzero(~present.cpu().numpy()))
+        if needed <= old.capacity():
+            return
+        grid = self._new_grid(2 * needed)
+        source = old.active_buf_indices().to(o3c.int64)
+        active = old.key_tensor()[source]
+        grid.hashmap().activate(active)
+        target, _ = grid.hashmap().find(active)
+        target = target.to(o3c.int64)
+        for name in self._attributes:
+            values, room = self.grid.attribute(name), grid.attribute(name)
+            values, room = values.reshape((values.shape[0], -1)), room.reshape((room.shape[0], -1))
+            for start in range(0, source.shape[0], COPIED_BLOCKS):
+                part = slice(start, start + COPIED_BLOCKS)
+                room[target[part]] = values[source[part]]
+        self.grid = grid
 
     def _activate(self, index: Int64) -> Int64:
         """Rows of voxels (n, 3) in the flattened attributes, their blocks activated; new ones start at 0."""
@@ -122,6 +146,7 @@ class Open3DBlocks:
         block, local = index // r, index % r
         blocks, inverse = _unique_rows(block)
         keys = self._tensor(blocks.astype(np.int32))
+        self._make_room(keys)
         hashmap = self.grid.hashmap()
         hashmap.activate(keys)  # gives indices of new blocks only
         buffer, _ = hashmap.find(keys)

@@ -213,7 +213,7 @@ def _run(config: Config, out: Path, rerun: str | None, quiet: bool) -> RunResult
 
 def _overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:
     """The settings given as options, those of --set last."""
-    import yaml
+    from semstab.files import parse_yaml
 
     content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}
     for setting in settings:
@@ -221,15 +221,12 @@ def _overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:
         if not equals:
             raise ConfigError(f"--set {setting}: write KEY=VALUE")
         *groups, key = path.split(".")
-        inner = content
+        inner: Any = content
         for group in groups:
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
                 raise ConfigError(f"--set {setting}: '{group}' is given as an option too; use one of the two")
-        try:
-            inner[key] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {setting}: the value is not valid YAML") from error
+        inner[key] = parse_yaml(text, f"--set {setting}")
     return content
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import reprlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
 from semstab.errors import ConfigError
+from semstab.files import parse_yaml
 
 
 class Settings(BaseModel):
@@ -107,11 +110,12 @@ class Config(Settings):
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """The mapping in a YAML file. Raises ConfigError in one line where there is none."""
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        text = Path(path).read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file ({error.reason} at byte {error.start})") from error
+    content = parse_yaml(text, str(path))
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -131,15 +135,15 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
     """The first problem of a pydantic error as one line: the setting, what is wrong, the nearest known key."""
     problem = error.errors()[0]
-    name = ".".join(str(part) for part in problem["loc"])
+    name = ".".join(" ".join(str(part).split()) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
-        unknown = str(problem["loc"][-1])
+        unknown = name.rpartition(".")[2]
         known = sorted(_keys_at(model, problem["loc"][:-1]))
         near = difflib.get_close_matches(unknown, known, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
         return f"unknown setting '{name}'; {hint}"
     message = problem["msg"].removeprefix("Value error, ")
-    return f"{name}: {message[0].lower()}{message[1:]} (got {problem['input']!r})"
+    return f"{name}: {message[0].lower()}{message[1:]} (got {reprlib.repr(problem['input'])})"
 
 
 def _keys_at(model: type[BaseModel], path: tuple[int | str, ...]) -> Iterator[str]:

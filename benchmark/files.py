@@ -11,7 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from semstab.errors import DataError
+import yaml
+
+from semstab.errors import ConfigError, DataError
 
 
 @contextmanager
@@ -55,6 +57,20 @@ def read_json(path: str | Path) -> Any:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise DataError(f"{path}: not valid JSON ({error})") from error
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The content of a YAML text, without tags that make objects.
+
+    Raises ConfigError in one line that starts with `where` where it is not valid.
+    """
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
+        # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
+        raise ConfigError(
+            f"{where}: not valid YAML ({' '.join(str(error).split()) or type(error).__name__})"
+        ) from error
 
 
 def _defined(value: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
 from semstab.errors import DataError
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
 
@@ -174,12 +175,10 @@ class Frame:
                 f"{where}: the last row of the pose is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?"
             )
         R = T[:3, :3]
+        if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
+            raise DataError(f"{where}: the rotation is not orthonormal, {_in_line(R)}; does it hold a scale?")
         if np.linalg.det(R) < 0:
-            raise DataError(f"{where}: the rotation mirrors (determinant {np.linalg.det(R):.3f}); check camera_axes")
-        if np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
-            raise DataError(
-                f"{where}: the rotation is not orthonormal (determinant {np.linalg.det(R):.4g}); is there a scale?"
-            )
+            raise DataError(f"{where}: the rotation mirrors (determinant -1), {_in_line(R)}; check camera_axes")
         return T
 
     def _checked_labels(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -213,6 +212,11 @@ class Frame:
         if shape != (H, W):
             size = "x".join(str(n) for n in shape[::-1])
             raise DataError(f"{self.where(name)}: {name} are {size} but depth is {W}x{H}; bring them to one size")
+
+
+def _in_line(matrix: npt.NDArray[np.float64]) -> str:
+    """A matrix in one line, as an error message shows it."""
+    return "[" + "; ".join(" ".join(f"{value:.4g}" for value in row) for row in matrix) + "]"
 
 
 def _usable_scores(scores: npt.NDArray[Any] | None) -> npt.NDArray[np.bool_]:

@@ -45,8 +45,8 @@ def js_divergence(p: npt.ArrayLike, q: npt.ArrayLike) -> Array:
 
 
 def _relative_entropy(p: Array, m: Array) -> Array:
-    """Kullback-Leibler divergence sum_k p_k log2(p_k / m_k), in bits, where m > 0 wherever p > 0."""
+    """Kullback-Leibler divergence sum_k p_k log2(p_k / m_k), in bits; 0 where m_k underflows to 0."""
     p, m = np.broadcast_arrays(p, m)
-    ratio = np.divide(p, m, out=np.ones(p.shape), where=p > 0)
+    ratio = np.divide(p, m, out=np.ones(p.shape), where=np.minimum(p, m) > 0)
     divergence: Array = (p * np.log2(ratio)).sum(axis=-1)
     return divergence

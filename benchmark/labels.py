@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
+
 from semstab.errors import ConfigError, DataError
+from semstab.files import parse_yaml
 
 IGNORE_8BIT = 255
 IGNORE_16BIT = 65535
@@ -79,11 +80,7 @@ class LabelSpace:
         Raises ConfigError where there is no such taxonomy or the file is not one.
         """
         text, where = _taxonomy_text(str(name_or_path))
-        try:
-            content = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{where}: not valid YAML ({' '.join(str(error).split())})") from error
-        return cls.from_dict(content, where)
+        return cls.from_dict(parse_yaml(text, where), where)
 
     @classmethod
     def from_dict(cls, content: Any, where: str = "taxonomy") -> LabelSpace:

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import semstab
 from semstab.config import Config
 
 SCHEMA = 1
@@ -24,7 +23,7 @@ def manifest(
     """The content of manifest.json: versions, digests of the inputs, wall-clock seconds by stage, peak memory."""
     return {
         "schema": SCHEMA,
-        "semstab": semstab.__version__,
+        "semstab": _version("semstab"),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "packages": {name: _version(name) for name in REPORTED_PACKAGES},

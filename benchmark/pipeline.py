@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab import backends
-from semstab.backends import FusionBackend
+from semstab.backends import FusionBackend, create
 from semstab.config import Config
 from semstab.errors import DataError
 from semstab.frames import Frame
@@ -147,7 +146,7 @@ def _flicker(previous: Frame | None, frame: Frame) -> float:
 def _maps(task: Task, config: Config) -> dict[Unit, FusionBackend]:
     K = len(task.mapping.target)
     created = (
-        backends.create(backend.name, voxel_size=config.voxel_size, num_classes=K, **backend.options)
+        create(backend.name, voxel_size=config.voxel_size, num_classes=K, **backend.options)
         for backend in config.fused_by()
     )
     return dict(zip(task.units, created, strict=True))

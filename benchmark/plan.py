@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from semstab import backends
+from semstab.backends import create
 from semstab.config import Config, explain, merge, read_yaml
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, options_model
 from semstab.errors import ConfigError, DataError
@@ -77,7 +77,7 @@ def resolve(config: Config) -> Config:
 def make_plan(config: Config) -> Plan:
     """Open what the configuration selects and check that it fits together; no image is read."""
     for backend in config.fused_by():  # an engine that is missing is said before anything is computed
-        backends.create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
+        create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     names = _selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
     tasks = [task for name in names for task in _tasks_of(dataset.scene(name), config)]

@@ -55,7 +55,7 @@ class Registry:
         module, _, attribute = entry.target.partition(":")
         try:
             return getattr(importlib.import_module(module), attribute)
-        except (ImportError, OSError) as error:  # OSError: a shared library of the engine is missing
+        except (ImportError, OSError, AttributeError) as error:  # OSError: a shared library is missing
             hint = entry.install or "install what it needs"
             reason = " ".join(str(error).split())
             raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({reason}); {hint}") from error

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
 from semstab.config import Config, read_yaml
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json, write_json, write_text

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
 from semstab.errors import DataError
 from semstab.files import atomic_path
 from semstab.information import entropy_bits, js_divergence, normalise
@@ -92,7 +94,8 @@ class VoxelTable:
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
-        return cls(**_read_parquet(path, _VOXEL_TYPES))
+        with _reading(path):
+            return cls(**_read_parquet(path, _VOXEL_TYPES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +124,8 @@ class Events:
     def __post_init__(self) -> None:
         _freeze_columns(self, _INDEX_TYPES, self.ix)
         _freeze_columns(self, _EVENT_TYPES, self.voxel)
-        n = len(self.ix)
-        if not np.array_equal(np.unique(self.voxel), np.arange(n)) or (np.diff(self.voxel) < 0).any():
+        step = np.diff(self.voxel, prepend=-1, append=len(self.ix))
+        if ((step != 0) & (step != 1)).any() or step[0] != 1 or step[-1] != 1:
             raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
 
     def __len__(self) -> int:
@@ -201,9 +204,10 @@ class Events:
     @classmethod
     def load(cls, path: str | Path) -> Events:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
-        content = _read_parquet(path, _EVENT_TYPES | _INDEX_TYPES)
-        first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
-        return cls(**content | {name: content[name][first] for name in _INDEX_TYPES})
+        with _reading(path):
+            content = _read_parquet(path, _EVENT_TYPES | _INDEX_TYPES)
+            first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
+            return cls(**content | {name: content[name][first] for name in _INDEX_TYPES})
 
 
 _INDEX_TYPES: Types = {"ix": np.int32, "iy": np.int32, "iz": np.int32}
@@ -257,24 +261,33 @@ def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
 
 
-def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
+@contextmanager
+def _reading(path: str | Path) -> Iterator[None]:
+    """Whatever is wrong with a file's content is a DataError of one line that names the file."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     try:
-        content = pq.read_table(path)
-        about = json.loads((content.schema.metadata or {})[b"semstab"])
-        columns: dict[str, Any] = {name: _to_numpy(content.column(name)) for name in types}
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a semstab table ({error})") from error
+        yield
+    except (OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
+        raise DataError(f"{path}: not a semstab table ({' '.join(str(error).split())})") from error
+
+
+def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
+    import pyarrow.parquet as pq
+
+    content = pq.read_table(path)
+    about = json.loads((content.schema.metadata or {})[b"semstab"])
     if about["schema"] != SCHEMA:
-        raise DataError(f"{path}: written with schema {about['schema']}, this version reads {SCHEMA}")
+        raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
+    columns: dict[str, Any] = {name: _to_numpy(content.column(name)) for name in types}
     return columns | {"voxel_size": float(about["voxel_size"]), "classes": tuple(about["classes"])}
 
 
 def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any]:
     import pyarrow as pa
 
+    if column.null_count:
+        raise DataError("a column has missing values")
     if not pa.types.is_fixed_size_list(column.type):
         values: npt.NDArray[Any] = column.to_numpy()
     else:

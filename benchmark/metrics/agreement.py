@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from semstab.errors import DataError
 from semstab.metrics.voxelwise import entropy, sbd, vss
 from semstab.results import Agreement, Difference, Unit
 from semstab.voxels import VoxelTable
@@ -22,7 +24,13 @@ def compare(
 
     They agree where no quantity differs by more than `tolerance`, and where at most `voxel_share` of the voxels are in
     one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
+    Raises DataError where the maps differ in K or voxel size.
     """
+    if (a.K, a.voxel_size) != (b.K, b.voxel_size):
+        raise DataError(
+            f"maps of {a.K} classes in voxels of {a.voxel_size:g} m and of {b.K} in {b.voxel_size:g} m"
+            " cannot be compared; fuse both alike"
+        )
     in_a, in_b = _shared_rows(a, b)
     quantities: dict[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]] = {
         "op": (a.op, b.op),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+
 from semstab.metrics.voxelwise import dominant, entropy, sbd, vss
 from semstab.results import RECURRENT, Means, TableSummary
 from semstab.voxels import VoxelTable

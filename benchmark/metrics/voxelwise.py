@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+
 from semstab.information import entropy_bits, normalise
 from semstab.voxels import VoxelTable
 
