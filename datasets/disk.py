@@ -1,0 +1,74 @@
+"""Files and folders of a dataset as they lie on disk: read whole, or one DataError with the path."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Container
+from pathlib import Path
+
+from semstab.errors import DataError
+
+AGAIN = "copy or export it again"
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises DataError where it cannot be read, is empty, or is a Git LFS pointer."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    if not data:
+        raise DataError(f"{path}: the file is empty; {AGAIN}")
+    if data.startswith(b"version https://git-lfs"):
+        raise DataError(f"{path}: a Git LFS pointer, not the file itself; run 'git lfs pull'")
+    return data
+
+
+def digest(path: Path) -> bytes:
+    """A hash of a file's content. Raises DataError where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).digest()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def natural(name: str) -> tuple[list[str | int], str]:
+    """Sort key with numbers by value: frame2 before frame10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
+
+
+def subfolders(folder: Path) -> list[str]:
+    """Names in natural order. Raises DataError where the folder cannot be listed."""
+    return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
+
+
+def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, Path]:
+    """The files with one of these suffixes. Raises DataError for two of one stem, or a folder that cannot be listed."""
+    files: dict[str, Path] = {}
+    for entry in _entries(folder):
+        path = folder / entry.name
+        if path.suffix.lower() not in suffixes or not entry.is_file():
+            continue
+        if path.stem in files:
+            raise DataError(f"{path}: {files[path.stem].name} is the same frame; keep one of the two")
+        files[path.stem] = path
+    return files
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What is in a folder, but for hidden entries; nothing where there is no folder."""
+    try:
+        with os.scandir(folder) as entries:
+            return [entry for entry in entries if not entry.name.startswith(".")]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
+
+
+def one_line(error: Exception) -> str:
+    """What another library's error says, without its line breaks."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,68 @@
+"""A posed_folder with every kind of file, to open whole or to break, and the check that something fails in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from semstab.datasets import open_dataset
+
+H, W, K = 6, 8, 3
+SETTINGS = {"classes": ["a", "b", "c"], "up_axis": "z"}
+
+
+def rotation(seed):
+    Q, R = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    Q = Q * np.sign(np.diag(R))
+    return Q * np.linalg.det(Q)
+
+
+def pose(k):
+    T = np.eye(4)
+    T[:3, :3] = rotation(k)
+    T[:3, 3] = (4e5 + k, 5e6, 30)
+    return T
+
+
+def save_image(path: Path, array) -> None:
+    Image.fromarray(array).save(path)
+
+
+def write_scene(folder: Path, names=("frame1", "frame2", "frame10")) -> Path:
+    """A whole scene: depth, pose, colour, labels of 'net', scores of 'net', ground truth."""
+    for part in ("depth", "pose", "color", "labels/net", "labels/gt", "scores/net"):
+        (folder / part).mkdir(parents=True)
+    (folder / "intrinsics.txt").write_text("10 0 3.5\n0 11 2.5\n0 0 1\n")
+    say(folder)
+    for k, name in enumerate(names):
+        rng = np.random.default_rng(k)
+        save_image(folder / f"depth/{name}.png", rng.integers(500, 9000, (H, W)).astype(np.uint16))
+        np.savetxt(folder / f"pose/{name}.txt", pose(k))
+        save_image(folder / f"color/{name}.png", rng.integers(0, 255, (H, W, 3)).astype(np.uint8))
+        save_image(folder / f"labels/net/{name}.png", np.full((H, W), k % K, np.uint8))
+        save_image(folder / f"labels/gt/{name}.png", np.full((H, W), (k + 1) % K, np.uint8))
+        scores = rng.dirichlet(np.ones(K), (H, W)).transpose(2, 0, 1).astype(np.float16)
+        np.savez(folder / f"scores/net/{name}.npz", scores=scores)
+    return folder
+
+
+def say(folder: Path, **settings) -> None:
+    (folder / "scene.yaml").write_text(yaml.safe_dump(SETTINGS | settings))
+
+
+def opened(folder: Path, **options):
+    dataset = open_dataset("posed_folder", {"root": folder, **options})
+    return dataset.scene(dataset.scenes[0])
+
+
+def first_frame(folder: Path, backbone="net", **options):
+    return opened(folder, **options).frame(0, backbone)
+
+
+def fails(kind, match, action, *args, **options) -> None:
+    """`action(*args, **options)` raises `kind`, in one line that matches."""
+    with pytest.raises(kind, match=match) as caught:
+        action(*args, **options)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,251 @@
+"""The posed_folder reader: its layout, incomplete frames, its digest, and the real data where it is at hand."""
+
+import logging
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from posed_scene import H, W, fails, first_frame, opened, pose, save_image, write_scene
+
+from semstab.datasets import open_dataset
+from semstab.datasets.disk import natural
+from semstab.errors import ConfigError, DataError
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return write_scene(tmp_path / "scene0")
+
+
+# --- what a scene is
+
+
+def test_a_frame_holds_what_the_files_hold(folder):
+    scene = opened(folder)
+    assert (scene.name, len(scene), scene.backbones, scene.ground_truth) == ("scene0", 3, ("net", "net-scores"), True)
+    assert scene.up.tolist() == [0, 0, 1]
+    assert scene.label_space("net").classes == scene.label_space("gt").classes == ("a", "b", "c")
+    frame = scene.frame(2, "net")
+    raw = np.asarray(Image.open(folder / "depth/frame10.png"))
+    np.testing.assert_array_equal(frame.depth, (raw / 1000).astype(np.float32))
+    np.testing.assert_array_equal(frame.T_wc, pose(2))
+    np.testing.assert_array_equal(frame.color, np.asarray(Image.open(folder / "color/frame10.png")))
+    assert (frame.index, frame.intrinsics.fx, frame.intrinsics.fy, frame.labels.max()) == (2, 10, 11, 2)
+    assert (frame.intrinsics.cx, frame.intrinsics.cy) == (3.5, 2.5)
+    assert frame.files == {
+        "depth": f"{folder}/depth/frame10.png",
+        "pose": f"{folder}/pose/frame10.txt",
+        "labels": f"{folder}/labels/net/frame10.png",
+        "color": f"{folder}/color/frame10.png",
+    }
+    assert scene.frame(2, "gt").labels.max() == 0
+    soft = scene.frame(1, "net-scores")
+    stored = np.load(folder / "scores/net/frame2.npz")["scores"]
+    np.testing.assert_array_equal(soft.scores, stored.transpose(1, 2, 0))
+    assert soft.files["scores"] == f"{folder}/scores/net/frame2.npz"
+
+
+def test_scenes_go_in_natural_order_and_other_folders_do_not_count(tmp_path):
+    for name in ("scene10", "scene2", "a (1)"):
+        write_scene(tmp_path / name, names=("1",))
+    (tmp_path / "notes").mkdir()
+    (tmp_path / ".hidden" / "depth").mkdir(parents=True)
+    dataset = open_dataset("posed_folder", {"root": tmp_path})
+    assert dataset.scenes == ("a (1)", "scene2", "scene10")
+    assert dataset.scene("a (1)").name == "a (1)"
+    message = r"scene 'scene11' is not there; there are scene10, scene2, a \(1\)"
+    fails(ConfigError, message, dataset.scene, "scene11")
+
+
+def test_the_root_can_be_the_scene_and_the_current_folder(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    scene = opened(Path())
+    assert scene.name == "scene0"
+    assert scene.frame(0, "net").files["depth"] == "depth/frame1.png"
+
+
+def test_a_root_without_a_scene_says_what_was_looked_for(tmp_path):
+    fails(DataError, re.escape(f"looked for {tmp_path}/depth and for {tmp_path}/*/depth"), opened, tmp_path)
+    fails(DataError, "nowhere: there is no such folder", opened, tmp_path / "nowhere")
+
+
+def test_names_sort_by_number():
+    assert sorted(["f10", "f9", "f09", "g1", "10", "9", "f"], key=natural) == ["9", "10", "f", "f09", "f9", "f10", "g1"]
+
+
+def test_opening_reads_no_image(folder):
+    for path in (path for part in ("depth", "pose", "labels", "scores") for path in (folder / part).rglob("frame*")):
+        path.write_bytes(b"")
+    scene = opened(folder)
+    fails(DataError, r"depth/frame1\.png: the file is empty", scene.frame, 0, "net")
+
+
+def test_a_scene_without_labels_still_has_depth_and_poses(folder):
+    (folder / "labels").rename(folder / "other labels")
+    (folder / "scores").rename(folder / "other scores")
+    scene = opened(folder)
+    assert (scene.backbones, scene.ground_truth, len(scene)) == ((), False, 3)
+    assert scene.depth(1).shape == (H, W)
+    np.testing.assert_array_equal(scene.T_wc(1), pose(1))
+    for name in ("net", "gt"):
+        message = f"backbone '{name}' is not there; put its label maps into labels/NAME/"
+        fails(ConfigError, message, scene.frame, 0, name)
+
+
+def test_an_unknown_backbone_or_frame_is_named(folder):
+    scene = opened(folder)
+    message = "'net-score' is not there; there are net-scores, net, gt$"
+    fails(ConfigError, message, scene.label_space, "net-score")
+    fails(ConfigError, message, scene.frame, 0, "net-score")
+    fails(ConfigError, message, scene.digest, [0], "net-score")
+    for index in (-1, 3):
+        fails(ConfigError, f"there is no frame {index}; it has 3", scene.frame, index, "net")
+
+
+def test_two_backbones_of_one_name_are_refused(folder):
+    (folder / "labels/net").rename(folder / "labels/net-scores")
+    fails(DataError, "labels/net-scores: .*scores/net is called 'net-scores' too; rename one", opened, folder)
+
+
+def test_two_files_of_one_frame_are_refused(folder):
+    np.save(folder / "depth/frame2.npy", np.ones((H, W)))
+    fails(DataError, r"depth/frame2\.(png|npy): frame2\.(png|npy) is the same frame", opened, folder)
+
+
+def test_files_of_the_file_system_do_not_count(folder):
+    for name in ("depth/._frame1.png", "depth/Thumbs.db", "labels/net/readme.txt", "labels/loose.png"):
+        (folder / name).write_bytes(b"x")
+    (folder / "labels/.cache").mkdir()
+    assert len(opened(folder)) == 3
+
+
+@pytest.mark.parametrize("shape", [(H + 1, W), (W, H)])
+def test_labels_of_another_size_are_named(folder, shape):
+    save_image(folder / "labels/net/frame1.png", np.zeros(shape, np.uint8))
+    fails(DataError, r"labels/net/frame1\.png: labels are .* but depth is 8x6", first_frame, folder)
+
+
+# --- incomplete frames
+
+
+@pytest.mark.parametrize(
+    "missing", ["depth/frame2.png", "pose/frame2.txt", "labels/net/frame2.png", "scores/net/frame2.npz"]
+)
+def test_an_incomplete_frame_is_an_error_or_left_out(folder, missing, caplog):
+    (folder / missing).unlink()
+    fails(DataError, f"1 missing: .*{re.escape(missing)}; add them, or set incomplete: skip", opened, folder)
+    with caplog.at_level(logging.WARNING, logger="semstab"):
+        scene = opened(folder, incomplete="skip")
+    assert missing in caplog.text
+    assert "1 of 3 frames left out" in caplog.text
+    assert len(scene) == 2
+    for backbone in scene.backbones:
+        files = [scene.frame(k, backbone).files["depth"] for k in (0, 1)]
+        assert files == [f"{folder}/depth/frame1.png", f"{folder}/depth/frame10.png"]
+    assert scene.frame(1, "gt").index == 1
+
+
+def test_many_missing_files_are_counted(folder):
+    for k in range(20):
+        (folder / f"pose/extra{k}.txt").write_text("")
+    fails(DataError, r"60 missing: .*depth/extra0\.png, .*labels/net/extra0\.png.*\(55 more\)", opened, folder)
+
+
+def test_a_scene_without_a_whole_frame_is_an_error(folder):
+    (folder / "pose").rename(folder / "poses")
+    fails(DataError, "no frame has depth, pose and labels", opened, folder, incomplete="skip")
+
+
+def test_ground_truth_may_be_sparse(folder):
+    (folder / "labels/gt/frame2.png").unlink()
+    (folder / "labels/gt/frame99.png").write_bytes(b"")
+    scene = opened(folder)
+    assert scene.frame(0, "gt").files["labels"].endswith("labels/gt/frame1.png")
+    message = r"1 missing: .*labels/gt/frame2\.png; choose frames"
+    fails(DataError, message, scene.frame, 1, "gt")
+    fails(DataError, message, scene.digest, [1], "gt")
+
+
+# --- digest
+
+
+def test_the_digest_follows_the_content(folder, tmp_path):
+    scene = opened(folder)
+    digest = scene.digest([0, 1], "net")
+    assert digest == opened(write_scene(tmp_path / "elsewhere")).digest([0, 1], "net")
+    assert len({digest, *(scene.digest([0, 1], b) for b in ("net-scores", "gt")), scene.digest([0], "net")}) == 4
+    save_image(folder / "color/frame1.png", np.zeros((H, W, 3), np.uint8))
+    save_image(folder / "labels/net/frame10.png", np.zeros((H, W), np.uint8))
+    assert opened(folder).digest([0, 1], "net") == digest
+
+
+@pytest.mark.parametrize("changed", ["depth/frame2.png", "pose/frame2.txt", "labels/net/frame2.png", "intrinsics.txt"])
+def test_the_digest_sees_a_changed_file(folder, changed):
+    digest = opened(folder).digest([0, 1], "net")
+    with (folder / changed).open("ab") as file:
+        file.write(b" ")
+    assert opened(folder).digest([0, 1], "net") != digest
+
+
+def test_the_digest_sees_a_changed_setting(folder):
+    options = ({}, {"depth_scale": 2}, {"classes": ["a", "x"]})
+    digests = {opened(folder, **option).digest([0], "net") for option in options}
+    (folder / "scene.yaml").write_text("taxonomy: mine.yaml\n")
+    for classes in ("[p, q]", "[p, r]"):
+        (folder / "mine.yaml").write_text(f"classes: {classes}\n")
+        digests.add(opened(folder).digest([0], "net"))
+    assert len(digests) == 5
+
+
+# --- real data
+
+DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
+
+
+def real(name):
+    if not (DATA / name).is_dir():
+        pytest.skip(f"no {DATA / name}; set SEMSTAB_DATA to the folder that holds {name}/")
+    return opened(DATA / name)
+
+
+def reprojection_errors(scene, a, b):
+    """Relative depth differences of frame a's valid pixels seen from frame b, where b has depth too."""
+    depth_a, depth_b = scene.depth(a).astype(np.float64), scene.depth(b)
+    K_a, K_b = scene.intrinsics(depth_a.shape).matrix, scene.intrinsics(depth_b.shape).matrix
+    v, u = np.nonzero(depth_a > 0)
+    rays = np.linalg.inv(K_a) @ np.stack([u, v, np.ones_like(u)])
+    T_ba = np.linalg.inv(scene.T_wc(b)) @ scene.T_wc(a)
+    seen = T_ba[:3, :3] @ (rays * depth_a[v, u]) + T_ba[:3, 3:]
+    seen = seen[:, seen[2] > 0]
+    u_b, v_b, _ = np.rint(K_b @ (seen / seen[2])).astype(int)
+    inside = (u_b >= 0) & (v_b >= 0) & (u_b < depth_b.shape[1]) & (v_b < depth_b.shape[0])
+    found, expected = depth_b[v_b[inside], u_b[inside]], seen[2, inside]
+    return np.abs(found / expected - 1)[found > 0]
+
+
+def test_apc_shelf():
+    scene = real("apc_shelf")
+    assert (scene.name, len(scene), scene.ground_truth) == ("apc_shelf", 15, True)
+    assert scene.backbones == ("fcn", "fcn-scores")
+    assert scene.label_space("fcn").classes[1] == "chenille_stems"
+    assert np.mean([(scene.depth(k) > 0).mean() for k in range(15)]) == pytest.approx(0.27, abs=0.02)
+    hard, soft, truth = (scene.frame(4, backbone) for backbone in ("fcn", "fcn-scores", "gt"))
+    assert hard.shape == soft.shape == (480, 640)
+    assert soft.scores.shape == (480, 640, 5)
+    assert set(np.unique(truth.labels)) <= set(range(5))
+    assert (hard.labels == truth.labels).mean() > 0.7
+    errors = [np.median(reprojection_errors(scene, k, k + 1)) for k in range(14)]
+    assert np.median(errors) == pytest.approx(0.007, abs=0.003)
+
+
+def test_hololens():
+    scene = real("hololens")
+    assert (len(scene), scene.backbones, scene.ground_truth) == (96, (), False)
+    pairs = [(k, k + 5) for k in range(0, 90, 10)]
+    errors = [np.median(reprojection_errors(scene, *pair)) for pair in pairs]
+    assert 0.002 < np.median(errors) < 0.006
+    mirrored = opened(DATA / "hololens", camera_axes="opengl")
+    assert np.median(reprojection_errors(mirrored, *pairs[0])) > 3 * errors[0]
