@@ -1,0 +1,327 @@
+"""The rerun recording, read back from its file and held against the run's own folder."""
+
+from __future__ import annotations
+
+import csv
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+import tiny_scene
+
+import semstab
+from semstab import backends, metrics, recording
+from semstab.config import Config
+from semstab.errors import ConfigError
+from semstab.frames import Frame, Intrinsics
+from semstab.labels import LabelSpace
+from semstab.pipeline import Observer
+from semstab.plan import Plan, Task, load_config
+from semstab.recording import MEASURES, SERIES, Recording
+from semstab.results import GroupResult, RunResult, Unit, UnitSummary
+from semstab.run_folder import FrameRow
+from semstab.voxels import VoxelTable
+
+NANOSECONDS = 1_000_000_000
+
+
+def config_of(root: Path) -> Config:
+    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
+    return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run folder with a recording: two backbones on a wall that three frames see."""
+    folder = tmp_path_factory.mktemp("recording")
+    root = tiny_scene.write(folder / "data" / "wall")
+    out = folder / "run"
+    semstab.run(config_of(root), out=out, observers=[Recording(out / "recording.rrd")])
+    return out
+
+
+def read(path: Path, kind: str = "recordings") -> dict[str, list[dict[str, Any]]]:
+    """Rows by entity path, in the order of the file."""
+    reader = rr.chunk.RrdReader(path)
+    (store,) = getattr(reader, kind)()
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for chunk in reader.stream(store=store):
+        batch = chunk.to_record_batch()
+        dates = [
+            field.name for field in batch.schema if str(field.type) == "timestamp[ns]"
+        ]  # no Python type holds them
+        batch = batch.drop_columns(dates)
+        rows.setdefault(chunk.entity_path, []).extend(batch.to_pylist())
+    return rows
+
+
+def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]:
+    """Value by frame."""
+    found = [row for row in rows.get(path, []) if "Scalars:scalars" in row]
+    assert len({row["frame"] for row in found}) == len(found)
+    return {row["frame"]: row["Scalars:scalars"][0] for row in found}
+
+
+def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
+    """The one VoxelGridMap of an entity, by short component names."""
+    (row,) = rows[path]
+    return {name.removeprefix("VoxelGridMap:"): value for name, value in row.items()}
+
+
+def notes(rows: dict[str, list[dict[str, Any]]], scene: str = "wall") -> list[str]:
+    return [row["TextLog:text"][0] for row in rows[f"/{scene}/log"]]
+
+
+def verify(path: Path) -> None:
+    rerun = Path(sys.executable).with_name("rerun")
+    done = subprocess.run([rerun, "rrd", "verify", path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_rerun_verifies_the_file(run) -> None:
+    verify(run / "recording.rrd")
+
+
+@pytest.mark.parametrize("backbone", ["a", "b"])
+def test_every_series_is_a_column_of_the_frame_csv(run, backbone) -> None:
+    rows = read(run / "recording.rrd")
+    with (run / "frames" / f"wall__{backbone}__numpy.csv").open() as file:
+        frames = list(csv.DictReader(file))
+    for column in SERIES:
+        backend = "" if column == "flicker_percent" else "/numpy"
+        defined = {int(row["frame"]): float(row[column]) for row in frames if row[column]}
+        assert series(rows, f"/wall/series/{column}/{backbone}{backend}") == defined
+        assert len(defined) == (2 if column in ("drift", "flicker_percent") else 3)  # undefined in the first frame
+
+
+def test_lines_are_named_and_have_distinct_colours(run) -> None:
+    rows = read(run / "recording.rrd")
+    paths = ["map_vss/a/numpy", "map_vss/b/numpy", "flicker_percent/b"]
+    styles = [next(row for row in rows[f"/wall/series/{path}"] if "SeriesLines:names" in row) for path in paths]
+    assert [style["SeriesLines:names"] for style in styles] == [["a, numpy"], ["b, numpy"], ["b"]]
+    colors = [style["SeriesLines:colors"] for style in styles]
+    assert colors[0] != colors[1] == colors[2]
+
+
+@pytest.mark.parametrize("backbone", ["a", "b"])
+def test_the_final_voxels_are_those_of_the_run(run, backbone) -> None:
+    rows = read(run / "recording.rrd")
+    table = VoxelTable.load(run / "voxels" / f"wall__{backbone}__numpy.parquet")
+    values = {name: getattr(metrics, name)(table) for name in MEASURES}
+    for name, (_, _, value_range) in MEASURES.items():
+        voxels = grid(rows, f"/wall/map/{backbone}/numpy/{name}")
+        defined = ~np.isnan(values[name])
+        assert voxels["frame"] == 2
+        np.testing.assert_array_equal(voxels["voxel_indices"], table.index[defined])
+        np.testing.assert_allclose(voxels["values"], values[name][defined], rtol=1e-6)
+        np.testing.assert_allclose(voxels["value_range"], [value_range], rtol=1e-6)
+        np.testing.assert_allclose(voxels["voxel_size"], [[0.25] * 3])
+    seen_once = grid(rows, f"/wall/map/{backbone}/numpy/sbd_undefined")
+    np.testing.assert_array_equal(seen_once["voxel_indices"], table.index[table.op == 1])
+    assert seen_once["colors"] == [0x969696FF]
+
+
+def test_voxels_have_the_colours_of_the_legend(run) -> None:
+    rows = read(run / "recording.rrd")
+    (legend,), (names,) = rows["/wall/legend"], rows["/wall/legend/names"]
+    assert names["Points2D:labels"] == ["wall", "door", "window"]
+    table = VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
+    expected = np.array(legend["Points2D:colors"])[metrics.dominant(table)]
+    np.testing.assert_array_equal(grid(rows, "/wall/map/a/numpy/class")["colors"], expected)
+
+
+def test_the_largest_sbd_has_the_last_colour() -> None:
+    table = fused([0, 1]).table()
+    assert metrics.sbd(table).max() == pytest.approx(recording.SBD_MAX, abs=1e-12)
+    assert metrics.sbd(fused([0, 1, 2]).table()).max() < recording.SBD_MAX
+
+
+def test_the_blueprint_shows_every_series_and_every_backbone_once(run) -> None:
+    views = [row for rows in read(run / "recording.rrd", "blueprints").values() for row in rows]
+    names = [row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row]
+    titles = ["Dominant class", *(title for title, _, _ in MEASURES.values())]
+    maps = [f"{backbone}: {title}" for backbone in "ab" for title in titles]
+    assert sorted(names) == sorted([*SERIES.values(), *maps, "Classes", "Notes"])
+
+
+def test_the_world_stands_upright(run) -> None:
+    (row,) = read(run / "recording.rrd")["/wall/map"]
+    assert row["ViewCoordinates:xyz"] == [[3, 2, 5]]  # right, down, forward: the scene says that up is -y
+
+
+def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> None:
+    path = run / "recording.rrd"
+    before = path.read_bytes()
+    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(path)])
+    assert path.read_bytes() == before
+    other = run.parent / "kept.rrd"  # there is none yet: it says at least why it is empty
+    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(other)])
+    verify(other)
+    assert len(notes(read(other))) == 2
+
+
+def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
+    class Interrupting(Observer):
+        def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
+            if unit.backbone == "b":
+                raise KeyboardInterrupt
+
+    config = config_of(tiny_scene.write(tmp_path / "data" / "wall"))
+    path = tmp_path / "run" / "recording.rrd"
+    first = Recording(path)
+    with pytest.raises(KeyboardInterrupt):
+        semstab.run(config, out=path.parent, observers=[first, Interrupting()])
+    first.close()
+    first.close()
+    verify(path)
+    rows = read(path)
+    assert len(series(rows, "/wall/series/voxels/a/numpy")) == 3
+    assert len(series(rows, "/wall/series/voxels/b/numpy")) == 1
+
+    semstab.run(config, out=path.parent, observers=[Recording(path)])
+    verify(path)
+    rows = read(path)
+    kept, fused_now = notes(rows)
+    assert kept.startswith("a, numpy: 60 voxels")
+    assert "finished by an earlier start" in kept
+    assert fused_now.startswith("b, numpy: 60 voxels")
+    assert not series(rows, "/wall/series/voxels/a/numpy")
+    assert len(series(rows, "/wall/series/voxels/b/numpy")) == 3
+
+
+def test_a_path_that_cannot_be_written_is_named(run, tmp_path) -> None:
+    config = config_of(run.parent / "data" / "wall")
+    with pytest.raises(ConfigError, match=r"recording cannot be written"):
+        semstab.run(config, observers=[Recording(tmp_path)])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"file/x\.rrd: the recording cannot be written"):
+        semstab.run(config, observers=[Recording(tmp_path / "file" / "x.rrd")])
+
+
+def test_without_a_recording_rerun_is_not_imported(run) -> None:
+    program = (
+        "import sys, semstab; from semstab.plan import load_config;"
+        f"semstab.run(load_config({str(run / 'config.yaml')!r}));"
+        "assert 'semstab.pipeline' in sys.modules and 'rerun' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+# From here on the observer is driven by hand, with frames that no file format is needed for.
+
+
+class Scene:
+    """A camera 2 m above a floor, which looks down on it."""
+
+    name = "floor 1"
+    backbones = ("net/x",)
+    ground_truth = False
+    up = np.array([0.0, 0.1, 0.99])
+
+
+CLASSES = LabelSpace("abc", ("a", "b", "c"))
+UNIT = Unit(Scene.name, "net/x", "numpy")
+
+
+def frame(index: int, label: int, at: tuple[float, float, float], timestamp: float | None = None) -> Frame:
+    T_wc = np.diag([1.0, -1.0, -1.0, 1.0])
+    T_wc[:3, 3] = at
+    labels = np.full((6, 8), label, dtype=np.uint8)
+    depth = np.full((6, 8), 2.0, dtype=np.float32)
+    return Frame(index, depth, Intrinsics(8.0, 8.0, 4.0, 3.0), T_wc, labels=labels, timestamp=timestamp)
+
+
+def fused(labels: list[int]) -> backends.FusionBackend:
+    backend = backends.create("numpy", voxel_size=0.25, num_classes=3)
+    for index, label in enumerate(labels):
+        backend.integrate(frame(index, label, (0.01, 0.01, 2.01)))
+    return backend
+
+
+def summary_of(table: VoxelTable) -> UnitSummary:
+    return UnitSummary(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0)
+
+
+def record(path: Path, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
+    """Drive a recording as the pipeline does."""
+    watching = Recording(path)
+    task = Task(Scene(), "net/x", [f.index for f in frames], CLASSES.mapping_to(CLASSES), ("numpy",))
+    watching.run_started(Plan(Config(voxel_size=0.25), (task,)))
+    backend = backends.create("numpy", voxel_size=0.25, num_classes=3)
+    for each in frames:
+        watching.frame_fused(UNIT, each, FrameRow(backend.integrate(each), each.timestamp, math.nan))
+    table = backend.table()
+    if finish:
+        watching.unit_finished(UNIT, table, summary_of(table))
+        watching.run_finished(RunResult((GroupResult((summary_of(table),), ()),)))
+    return watching, table
+
+
+@pytest.mark.parametrize(("start", "kind"), [(12.5, "timedelta64[ns]"), (1.7e9, "datetime64[ns]")])
+def test_timestamps_make_a_second_timeline(tmp_path, start, kind) -> None:
+    path = tmp_path / "time.rrd"
+    record(path, [frame(i, 0, (0.01, 0.01, 2.01), start + i) for i in (3, 5, 9)])
+    verify(path)
+    found: dict[int, int] = {}
+    for chunk in rr.chunk.RrdReader(path).stream():
+        if chunk.entity_path == r"/floor\ 1/series/voxels/net\/x/numpy" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            times = batch.column("time").to_numpy(zero_copy_only=False)
+            assert times.dtype == kind
+            found |= dict(zip(batch.column("frame").to_pylist(), times.astype(np.int64).tolist(), strict=True))
+    assert found == {i: int((start + i) * NANOSECONDS) for i in (3, 5, 9)}
+    assert set(read(path)[r"/floor\ 1/map"][0]) >= {"ViewCoordinates:xyz"}
+
+
+def test_frames_without_a_timestamp_have_a_number_only(tmp_path) -> None:
+    path = tmp_path / "mixed.rrd"
+    record(path, [frame(0, 0, (0.01, 0.01, 2.01), 4.0), frame(1, 0, (0.01, 0.01, 2.01), None)])
+    rows = read(path)[r"/floor\ 1/series/voxels/net\/x/numpy"]
+    assert {row["frame"]: "time" in row for row in rows if "frame" in row} == {0: True, 1: False}
+
+
+def test_utm_coordinates_are_recorded_relative_to_an_origin(tmp_path) -> None:
+    path = tmp_path / "utm.rrd"
+    _, table = record(path, [frame(i, i, (455_123.01, 5_412_345.01, 302.01)) for i in range(2)])
+    rows = read(path)
+    voxels = grid(rows, r"/floor\ 1/map/net\/x/numpy/vss")
+    origin = np.array([455_000, 5_412_000, 0]) * 4
+    np.testing.assert_array_equal(np.array(voxels["voxel_indices"]) + origin, table.index)
+    (text, _) = notes(rows, r"floor\ 1")
+    assert text.startswith("map coordinates are relative to x = 455000.000 m, y = 5412000.000 m, z = 0.000 m")
+
+
+def test_a_map_that_is_too_large_is_thinned_and_says_so(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(recording, "MAX_VOXELS", 40)
+    path = tmp_path / "large.rrd"
+    _, table = record(path, [frame(i, i % 3, (0.25 * i + 0.01, 0.01, 2.01)) for i in range(6)])
+    rows = read(path)
+    assert len(table) == 13 * 6
+    drawn = grid(rows, r"/floor\ 1/map/net\/x/numpy/op")
+    np.testing.assert_allclose(drawn["voxel_size"], [[0.5] * 3])
+    blocks = table.index // 2
+    np.testing.assert_array_equal(drawn["voxel_indices"], np.unique(blocks, axis=0))
+    of_block = {tuple(block): set(table.op[(blocks == block).all(axis=1)].tolist()) for block in blocks}
+    assert all(v in of_block[tuple(q)] for q, v in zip(drawn["voxel_indices"], drawn["values"], strict=True))
+    assert "one voxel of each block of 2x2x2" in notes(rows, r"floor\ 1")[0]
+
+
+def test_what_was_recorded_so_far_can_be_read_while_the_run_goes_on(tmp_path) -> None:
+    """As after a kill: nothing is closed, the file has no footer."""
+    path = tmp_path / "running.rrd"
+    watching, _ = record(path, [frame(i, 0, (0.01, 0.01, 2.01)) for i in range(3)], finish=False)
+    deadline = time.monotonic() + 10
+    found: dict[int, float] = {}
+    while len(found) < 3 and time.monotonic() < deadline:
+        time.sleep(0.05)
+        with pytest.warns(rr.error_utils.RerunWarning, match="no footer"):
+            found = series(read(path), r"/floor\ 1/series/map_vss/net\/x/numpy")
+    assert found == {0: 1.0, 1: 1.0, 2: 1.0}
+    watching.close()
+    verify(path)
