@@ -125,17 +125,8 @@ class Open3DBlocks:
         if needed <= old.capacity():
             return
         grid = self._new_grid(2 * needed)
-        source = old.active_buf_indices().to(o3c.int64)
-        active = old.key_tensor()[source]
-        grid.hashmap().activate(active)
-        target, _ = grid.hashmap().find(active)
-        target = target.to(o3c.int64)
-        for name in self._attributes:
-            values, room = self.grid.attribute(name), grid.attribute(name)
-            values, room = values.reshape((values.shape[0], -1)), room.reshape((room.shape[0], -1))
-            for start in range(0, source.shape[0], COPIED_BLOCKS):
-                part = slice(start, start + COPIED_BLOCKS)
-                room[target[part]] = values[source[part]]
+        if old.size():
+            _copy_blocks(self.grid, grid, tuple(self._attributes))
         self.grid = grid
 
     def _activate(self, index: Int64) -> Int64:
@@ -199,6 +190,20 @@ class Open3DBlocks:
 
     def _tensor(self, values: npt.NDArray[Any]) -> Any:
         return o3c.Tensor.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+
+def _copy_blocks(old: VoxelBlockGrid, new: VoxelBlockGrid, attributes: tuple[str, ...]) -> None:
+    """Copy every block of a grid, which has one at least, into a new one."""
+    source = old.hashmap().active_buf_indices().to(o3c.int64)
+    keys = old.hashmap().key_tensor()[source]
+    new.hashmap().activate(keys)
+    target = new.hashmap().find(keys)[0].to(o3c.int64)
+    for name in attributes:
+        values, room = (grid.attribute(name) for grid in (old, new))
+        values, room = (tensor.reshape((tensor.shape[0], -1)) for tensor in (values, room))
+        for start in range(0, source.shape[0], COPIED_BLOCKS):
+            part = slice(start, start + COPIED_BLOCKS)
+            room[target[part]] = values[source[part]]
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:

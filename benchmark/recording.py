@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,7 @@ FIRST_DATE = 1e8  # seconds; timestamps from here on count from 1970 and are sho
 LINE_COLORS = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
 )  # fmt: skip
+EYE = np.array([0.4, 0.38])  # the eye's distance across and above the map, in units of its longest extent
 BACKGROUND = (72, 72, 78)  # of the maps: neither end of the colour maps vanishes in it
 LEGEND_COLUMNS = 7
 
@@ -76,6 +77,7 @@ class Recording(Observer):
         self._stream: rr.RecordingStream | None = None
         self._kept: list[tuple[Task, UnitSummary]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
+        self._eyes: dict[str, rrb.EyeControls3D] = {}  # by scene
         self._dated: bool | None = None  # a timeline has one type: the first timestamp decides
 
     def run_started(self, plan: Plan) -> None:
@@ -101,6 +103,10 @@ class Recording(Observer):
         classes = self._tasks[unit.scene, unit.backbone].mapping.target
         for name, grid in _grids(table, classes, factor, index, rows):
             stream.log(_path(unit.scene, "map", unit.backbone, unit.backend, name), grid)
+        if unit.scene not in self._eyes and len(index):
+            up = self._tasks[unit.scene, unit.backbone].scene.up
+            self._eyes[unit.scene] = _eye((index + 0.5) * (table.voxel_size * factor), up)
+            stream.send_blueprint(blueprint(self._plan, self._eyes))
         thinned = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         stream.log(_path(unit.scene, "log"), rr.TextLog(_final(summary) + thinned * (factor > 1)))
 
@@ -135,7 +141,7 @@ class Recording(Observer):
             raise ConfigError(f"{self.path}: the recording cannot be written ({error})") from error
         stream.set_log_tick_enabled(False)
         stream.set_log_time_enabled(False)
-        stream.send_blueprint(blueprint(self._plan))
+        stream.send_blueprint(blueprint(self._plan, self._eyes))
         _log_static(stream, self._plan)
         self._log_kept(stream)
         self._stream = stream
@@ -169,10 +175,13 @@ class Recording(Observer):
             stream.log(_path(scene, "log"), rr.TextLog(f"map coordinates are relative to {where} of the scene's world"))
 
 
-def blueprint(plan: Plan) -> rrb.Blueprint:
-    """How the viewer opens a recording: the maps left, the series right, a tab for each scene."""
+def blueprint(plan: Plan, eyes: Mapping[str, rrb.EyeControls3D]) -> rrb.Blueprint:
+    """How the viewer opens a recording: the maps left, the series right, a tab for each scene.
+
+    eyes holds, by scene, where its maps are seen from; the viewer chooses where there is none.
+    """
     groups = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
-    scenes = [_scene_layout(scene, list(tasks)) for scene, tasks in groups]
+    scenes = [_scene_layout(scene, list(tasks), eyes.get(scene)) for scene, tasks in groups]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
@@ -181,9 +190,9 @@ def blueprint(plan: Plan) -> rrb.Blueprint:
     )
 
 
-def _scene_layout(scene: str, tasks: list[Task]) -> rrb.Container:
+def _scene_layout(scene: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.Container:
     titles = {"class": "Dominant class"} | {name: title for name, (title, _, _) in MEASURES.items()}
-    maps = rrb.Tabs(*(_map_views(name, title, tasks) for name, title in titles.items()))
+    maps = rrb.Tabs(*(_map_views(name, title, tasks, eye) for name, title in titles.items()))
     rows = math.ceil(len(tasks[0].mapping.target) / LEGEND_COLUMNS)
     bounds = rrb.VisualBounds2D(x_range=(-0.5, LEGEND_COLUMNS - 0.5), y_range=(-0.2, 0.5 * rows - 0.1))
     legend = rrb.Spatial2DView(origin=_path(scene, "legend"), name="Classes", visual_bounds=bounds)
@@ -199,14 +208,14 @@ def _plot(scene: str, column: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(origin=_path(scene, "series", column), name=SERIES[column], plot_legend=legend)
 
 
-def _map_views(name: str, title: str, tasks: list[Task]) -> rrb.Container:
-    views = [_map_view(name, f"{task.backbone}: {title}", task) for task in tasks]
+def _map_views(name: str, title: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.Container:
+    views = [_map_view(name, f"{task.backbone}: {title}", task, eye) for task in tasks]
     if len(views) > 4:
         return rrb.Tabs(*views, name=title)
     return rrb.Grid(*views, grid_columns=1 if len(views) <= 2 else 2, name=title)
 
 
-def _map_view(name: str, title: str, task: Task) -> rrb.Spatial3DView:
+def _map_view(name: str, title: str, task: Task, eye: rrb.EyeControls3D | None) -> rrb.Spatial3DView:
     """The first backend's map; the others' maps, which are equal where all is well, are there but hidden."""
     names = ("sbd", "sbd_undefined") if name == "sbd" else (name,)
     paths = [_path(task.scene.name, "map", task.backbone, backend, n) for backend in task.backends for n in names]
@@ -217,7 +226,20 @@ def _map_view(name: str, title: str, task: Task) -> rrb.Spatial3DView:
         name=title,
         background=BACKGROUND,
         line_grid=False,
+        eye_controls=eye,
     )
+
+
+def _eye(points: npt.NDArray[Any], up: npt.NDArray[np.float64] | None) -> rrb.EyeControls3D:
+    """A view of the points (n, 3) from above and across their longest extent, so near that they fill it."""
+    up = np.array([0.0, 0.0, 1.0]) if up is None else up
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    middle = (low + high) / 2
+    flat = (points - middle) - np.outer((points - middle) @ up, up)
+    _, directions = np.linalg.eigh(flat.T @ flat)
+    longest = directions[:, 2]
+    extent = np.ptp(np.quantile(flat @ longest, [0.02, 0.98]))
+    return rrb.EyeControls3D(position=middle + extent * EYE @ [np.cross(longest, up), up], look_target=middle)
 
 
 def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:

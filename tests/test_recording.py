@@ -46,19 +46,26 @@ def run(tmp_path_factory):
     return out
 
 
-def read(path: Path, kind: str = "recordings") -> dict[str, list[dict[str, Any]]]:
+def read(path: Path) -> dict[str, list[dict[str, Any]]]:
     """Rows by entity path, in the order of the file."""
     reader = rr.chunk.RrdReader(path)
-    (store,) = getattr(reader, kind)()
+    (store,) = reader.recordings()
     rows: dict[str, list[dict[str, Any]]] = {}
     for chunk in reader.stream(store=store):
-        batch = chunk.to_record_batch()
-        dates = [
-            field.name for field in batch.schema if str(field.type) == "timestamp[ns]"
-        ]  # no Python type holds them
-        batch = batch.drop_columns(dates)
-        rows.setdefault(chunk.entity_path, []).extend(batch.to_pylist())
+        rows.setdefault(chunk.entity_path, []).extend(rows_of(chunk))
     return rows
+
+
+def read_blueprints(path: Path) -> list[list[dict[str, Any]]]:
+    """The rows of each blueprint, in no particular order."""
+    reader = rr.chunk.RrdReader(path)
+    return [[row for chunk in reader.stream(store=store) for row in rows_of(chunk)] for store in reader.blueprints()]
+
+
+def rows_of(chunk: Any) -> list[dict[str, Any]]:
+    """The rows of a chunk without dates: no Python type holds their nanoseconds."""
+    batch = chunk.to_record_batch()
+    return batch.drop_columns([field.name for field in batch.schema if str(field.type) == "timestamp[ns]"]).to_pylist()
 
 
 def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]:
@@ -143,11 +150,23 @@ def test_the_largest_sbd_has_the_last_colour() -> None:
 
 
 def test_the_blueprint_shows_every_series_and_every_backbone_once(run) -> None:
-    views = [row for rows in read(run / "recording.rrd", "blueprints").values() for row in rows]
-    names = [row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row]
     titles = ["Dominant class", *(title for title, _, _ in MEASURES.values())]
     maps = [f"{backbone}: {title}" for backbone in "ab" for title in titles]
-    assert sorted(names) == sorted([*SERIES.values(), *maps, "Classes", "Notes"])
+    for views in read_blueprints(run / "recording.rrd"):
+        names = [row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row]
+        assert sorted(names) == sorted([*SERIES.values(), *maps, "Classes", "Notes"])
+
+
+def test_the_eye_looks_at_the_middle_of_the_map(run) -> None:
+    blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when there is a map to look at
+    eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
+    assert len(blueprints) == 2
+    assert len(eyes) == 2 * 5  # of two backbones, each a view for the class and four measures
+    table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
+    middle = (table.centers.min(axis=0) + table.centers.max(axis=0)) / 2
+    for eye in eyes:
+        np.testing.assert_allclose(eye["EyeControls3D:look_target"][0], middle, atol=0.2)
+        assert eye["EyeControls3D:position"][0][1] < middle[1]  # from above: up is -y
 
 
 def test_the_world_stands_upright(run) -> None:

@@ -1,0 +1,66 @@
+"""The conformance suite for fusion backends: subclass it, say how to make one, and pytest does the rest.
+
+    from semstab.testing import BackendConformance
+
+    class TestMine(BackendConformance):
+        def create(self, voxel_size, num_classes):
+            return MyBackend(voxel_size, num_classes)
+
+`evidence`, `geometry` and `contract` are scenes so small that the answer stands beside them, worked out by hand; they
+are also the shortest way to learn the definitions. `properties` are those of random sequences, and agreement with the
+reference. `builders` make the frames and compare the maps.
+
+Put `pytest.register_assert_rewrite("semstab.testing")` into conftest.py, and failures show the values.
+"""
+
+from semstab.errors import MissingDependencyError
+
+try:
+    import hypothesis  # noqa: F401
+    import pytest  # noqa: F401
+except ImportError as missing:
+    raise MissingDependencyError(
+        f"semstab.testing cannot be used ({missing}); pip install pytest hypothesis"
+    ) from missing
+
+from semstab.testing.builders import (
+    EXACT,
+    HITS,
+    JS_HALF,
+    SEQUENCES,
+    SUMS,
+    as_frames,
+    assert_same_map,
+    checks,
+    random_frames,
+    sight_line,
+    voxels,
+)
+from semstab.testing.contract import ContractTests
+from semstab.testing.evidence import EvidenceTests
+from semstab.testing.geometry import GeometryTests
+from semstab.testing.properties import PropertyTests
+
+__all__ = [
+    "EXACT",
+    "HITS",
+    "JS_HALF",
+    "SEQUENCES",
+    "SUMS",
+    "BackendConformance",
+    "as_frames",
+    "assert_same_map",
+    "checks",
+    "random_frames",
+    "sight_line",
+    "voxels",
+]
+
+
+class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests):
+    """What every fusion backend must do. A subclass defines `create`; the rest is inherited.
+
+    tolerance    largest difference of a sum (evidence, drift, ...) from its exact value; 1e-9 for float64
+    voxel_share  part of the voxels that may differ from the reference on random frames, because other arithmetic puts
+                 a point on the other side of a voxel's face; 0 for float64
+    """

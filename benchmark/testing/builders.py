@@ -1,0 +1,161 @@
+"""What the tests are built from: frames whose map is known by hand, random ones, and how two maps are compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+
+from semstab.frames import Frame, Intrinsics
+from semstab.metrics import entropy, sbd, vss
+from semstab.voxels import VoxelTable
+
+Voxel = tuple[int, int, int]
+Label = int | Sequence[float]
+Hit = tuple[float, Label]
+
+LOOKING = {
+    "x": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+    "y": [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+}
+"""Rotations of cameras that look along a world axis."""
+
+H_THIRD = math.log2(3) - 2 / 3
+"""Entropy of (2/3, 1/3) in bits: 2/3 log2(3/2) + 1/3 log2 3."""
+
+JS_HALF = 1.5 - 0.75 * math.log2(3)
+"""D_JS((1, 0), (1/2, 1/2)) = 0.31128 bits: with m = (3/4, 1/4) it is H(m) - (H(1, 0) + H(1/2, 1/2)) / 2.
+
+H(m) = 3/4 log2(4/3) + 1/4 log2 4 = 2 - 3/4 log2 3, and the other two entropies are 0 and 1.
+"""
+
+
+# --- Frames -----------------------------------------------------------------------------------------------------------
+
+
+def sight_line(
+    index: int,
+    hits: Sequence[Hit],
+    *,
+    start: Sequence[float] = (0.5, 0.5, 0.0),
+    along: str = "z",
+    dtype: type[Any] = np.uint8,
+) -> Frame:
+    """A frame whose pixels all look along one line: pixel i lies at start + depth_i * axis, exactly.
+
+    The focal length is so long (2^60 pixels) that the pixels' rays coincide. A hit is (depth, label id), or
+    (depth, K scores); `dtype` is the label map's, or the scores'. With voxels of 1 m the default line runs through the
+    voxels (0, 0, 0), (0, 0, 1), ...: a hit at depth 2.5 falls into (0, 0, 2).
+    """
+    T_wc = np.eye(4)
+    T_wc[:3, :3], T_wc[:3, 3] = LOOKING[along], start
+    values = np.array([[value for _, value in hits]], dtype=dtype)
+    return Frame(
+        index=index,
+        depth=np.array([[depth for depth, _ in hits]], dtype=np.float32),
+        intrinsics=Intrinsics(fx=2.0**60, fy=2.0**60, cx=0, cy=0),
+        T_wc=T_wc,
+        labels=values if values.ndim == 2 else None,
+        scores=values if values.ndim == 3 else None,
+    )
+
+
+def random_frames(seed: int, count: int = 3, K: int = 4) -> list[Frame]:
+    """A camera that wanders and turns before a scattered scene; depth has gaps, every other frame has soft scores."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for index in range(count):
+        T_wc = np.eye(4)
+        T_wc[:3, :3] = _turn(*rng.normal(0, 0.2, 3))
+        T_wc[:3, 3] = rng.normal(0, 0.5, 3)
+        depth = rng.uniform(0.5, 6, (18, 24)).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.1] = rng.choice([0, -1, np.nan, np.inf])
+        labels = rng.choice([*range(K), 255], size=depth.shape).astype(np.uint8)
+        scores = rng.random((*depth.shape, K), dtype=np.float32)
+        soft = index % 2 == 1
+        camera = Intrinsics(fx=20, fy=21, cx=11.3, cy=8.8)
+        frames.append(Frame(index, depth, camera, T_wc, None if soft else labels, scores if soft else None))
+    return frames
+
+
+def _turn(a: float, b: float, c: float) -> npt.NDArray[np.float64]:
+    """A rotation by angles about x, y, z."""
+    X = np.array([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])
+    Y = np.array([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
+    Z = np.array([[math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1]])
+    turn: npt.NDArray[np.float64] = Z @ Y @ X
+    return turn
+
+
+DEPTHS = st.sampled_from([0.0, 0.25, 0.5, 1.5, 2.5, 3.5])  # 0 is invalid; the others lie inside voxels of 1 m
+LABELS = st.sampled_from([0, 1, 2, 255])
+HITS = st.lists(st.tuples(DEPTHS, LABELS), min_size=1, max_size=6)
+SEQUENCES = st.lists(HITS, min_size=1, max_size=5)
+"""Random sequences for K = 3, one list of hits a frame."""
+
+checks = settings(
+    max_examples=25,
+    derandomize=True,  # the same examples in each run
+    database=None,
+    deadline=None,
+    phases=[Phase.explicit, Phase.generate, Phase.shrink],
+    suppress_health_check=[HealthCheck.differing_executors],  # subclasses share these tests
+)
+
+
+def as_frames(sequence: Iterable[Sequence[Hit]]) -> list[Frame]:
+    """The frames of a random sequence."""
+    return [sight_line(index, hits) for index, hits in enumerate(sequence)]
+
+
+# --- Tables -----------------------------------------------------------------------------------------------------------
+
+
+def voxels(table: VoxelTable) -> list[Voxel]:
+    """The voxels of a table in its order."""
+    return [(int(x), int(y), int(z)) for x, y, z in table.index]
+
+
+def only(table: VoxelTable) -> int:
+    """The row of a map of one voxel."""
+    assert len(table) == 1
+    return 0
+
+
+EXACT = ("ix", "iy", "iz", "op", "pixels", "first_frame", "last_frame")
+SUMS = ("evidence", "drift_sum", "self_sum", "frame_entropy_sum")
+
+
+def assert_same_map(a: VoxelTable, b: VoxelTable, tolerance: float, leaving_out: Sequence[str] = ()) -> None:
+    """The same voxels with the same rows: counts are equal, sums agree to `tolerance`."""
+    assert voxels(a) == voxels(b)
+    for name in EXACT:
+        if name not in leaving_out:
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    for name in SUMS:
+        if name not in leaving_out:
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=tolerance, err_msg=name)
+
+
+def share_that_differs(a: VoxelTable, b: VoxelTable, tolerance: float) -> float:
+    """The share of all voxels that are in one map only, or whose rows differ by more than `tolerance`."""
+    rows_a, rows_b = _rows(a), _rows(b)
+    everywhere = rows_a.keys() | rows_b.keys()
+    same = [
+        q
+        for q in rows_a.keys() & rows_b.keys()
+        if np.allclose(rows_a[q], rows_b[q], rtol=0, atol=tolerance, equal_nan=True)
+    ]
+    return 1 - len(same) / len(everywhere) if everywhere else 0.0
+
+
+def _rows(table: VoxelTable) -> dict[Voxel, npt.NDArray[np.float64]]:
+    measures = np.stack([vss(table), sbd(table), entropy(table)], axis=1)
+    columns = [measures, *(getattr(table, name).reshape(len(table), -1) for name in (*EXACT, *SUMS))]
+    return dict(zip(voxels(table), np.concatenate(columns, axis=1), strict=True))

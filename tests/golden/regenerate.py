@@ -1,0 +1,54 @@
+"""Writes small_map.json, the golden file: `python tests/golden/regenerate.py`. Look at the diff before you commit."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from semstab import backends
+from semstab.files import write_json
+from semstab.frames import Frame, Intrinsics
+from semstab.metrics import entropy, sbd, summarise, vss
+
+FILE = Path(__file__).parent / "small_map.json"
+K = 4
+
+
+def frames():
+    """Five frames of 5x6 pixels by simple arithmetic; the camera turns by 3-4-5 triangles, frame 3 has soft scores."""
+    v, u = np.mgrid[:5, :6]
+    for t in range(5):
+        c, s = ((1, 0), (0.8, 0.6), (0.6, 0.8), (0.8, -0.6), (1, 0))[t]
+        T_wc = np.array([[c, 0, s, 0.3 * t], [0, 1, 0, -0.2], [-s, 0, c, 0.1 * t], [0, 0, 0, 1]])
+        labels = ((u + t) // 3 + v // 2).astype(np.uint8) % K
+        labels[(u + v + t) % 11 == 0] = 255
+        soft = t == 3
+        scores = 1.0 + ((u * 3 + v * 5)[..., None] * np.arange(1, K + 1)) % 7
+        yield Frame(
+            index=2 * t,
+            depth=2 + ((u * 5 + v * 3 + t) % 7 - (u == t) * 9) / 4,
+            intrinsics=Intrinsics(fx=5, fy=5, cx=2.5, cy=2.0),
+            T_wc=T_wc,
+            labels=None if soft else labels,
+            scores=scores if soft else None,
+        )
+
+
+def golden(backend="numpy"):
+    """The map of these frames: its columns and measures, its summary, and the reports of the frames."""
+    fusion = backends.create(backend, voxel_size=2.0, num_classes=K)
+    reports = [dataclasses.asdict(fusion.integrate(frame)) for frame in frames()]
+    for report in reports:
+        del report["seconds"]
+    table = fusion.table()
+    columns = {name: value for name, value in vars(table).items() if isinstance(value, np.ndarray)}
+    columns |= {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table)}
+    return {
+        "voxels": {name: column.tolist() for name, column in columns.items()},
+        "summary": dataclasses.asdict(summarise(table)),
+        "reports": reports,
+    }
+
+
+if __name__ == "__main__":
+    write_json(FILE, golden())

@@ -1,0 +1,195 @@
+"""The backends that ship with the package keep the contract, and agree with the paper read once more by an oracle."""
+
+import math
+import runpy
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from oracle import Oracle
+
+from semstab import backends
+from semstab.backends.numpy_reference import NumpyReference
+from semstab.errors import ConfigError
+from semstab.files import read_json
+from semstab.frames import Frame, Intrinsics
+from semstab.metrics import dominant, entropy, sbd, vss
+from semstab.testing import BackendConformance, checks, sight_line, voxels
+
+K = 3
+
+
+class TestNumpy(BackendConformance):
+    def create(self, voxel_size, num_classes):
+        return backends.create("numpy", voxel_size=voxel_size, num_classes=num_classes)
+
+
+def open3d_map(voxel_size, num_classes, initial_bytes=0, **options):
+    """A map that starts small: it is made faster, and has to grow."""
+    with patch("semstab.backends.open3d_blocks.INITIAL_BYTES", initial_bytes):
+        return backends.create("open3d", voxel_size=voxel_size, num_classes=num_classes, **options)
+
+
+class TestOpen3D(BackendConformance):
+    def create(self, voxel_size, num_classes):
+        return open3d_map(voxel_size, num_classes, initial_bytes=2**24)
+
+
+class TestOpen3DThatGrows(BackendConformance):
+    """With room for 64 blocks to begin with, of an odd size, the map is moved again and again."""
+
+    def create(self, voxel_size, num_classes):
+        return open3d_map(voxel_size, num_classes, block_resolution=7)
+
+    def test_a_first_frame_beyond_the_room(self) -> None:
+        """The first frame alone needs 200 blocks; the second one sees the same voxels again."""
+        hits = [(7.0 * i + 0.5, i % 3) for i in range(200)]
+        table = self.fuse(sight_line(0, hits), sight_line(1, hits))
+        assert table.op.tolist() == [2] * 200
+        assert dominant(table).tolist() == [i % 3 for i in range(200)]
+
+
+class TestOracle(BackendConformance):
+    def create(self, voxel_size, num_classes):
+        return Oracle(voxel_size, num_classes)
+
+
+# --- The oracle: backends against the paper, on frames that hypothesis invents ----------------------------------------
+
+
+@st.composite
+def rotations(draw):
+    """A rotation matrix from a quaternion of small integers."""
+    w, x, y, z = draw(st.tuples(*[st.integers(-3, 3)] * 4).filter(any))
+    n = w * w + x * x + y * y + z * z
+    R = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return np.array(R) / n
+
+
+depths = st.sampled_from([0.0, -1.0, math.nan, math.inf]) | st.floats(0.125, 4, width=32)
+scores = st.sampled_from([0.0, math.nan, math.inf]) | st.floats(0, 1, width=16)
+
+
+@st.composite
+def frames(draw, index):
+    shape = draw(st.tuples(st.integers(1, 4), st.integers(1, 4)))
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = draw(rotations())
+    T_wc[:3, 3] = draw(st.tuples(*[st.floats(-3, 3)] * 3))
+    labels = hnp.arrays(draw(st.sampled_from([np.uint8, np.uint16])), shape, elements=st.integers(0, K - 1))
+    soft = draw(st.booleans())
+    given_labels = None if soft else draw(labels)
+    if given_labels is not None:
+        ignored = draw(hnp.arrays(bool, shape))
+        given_labels[ignored] = np.iinfo(given_labels.dtype).max
+    return Frame(
+        index=index,
+        depth=draw(hnp.arrays(np.float32, shape, elements=depths)),
+        intrinsics=Intrinsics(*draw(st.tuples(*[st.floats(1, 4)] * 2, *[st.floats(-2, 4)] * 2))),
+        T_wc=T_wc,
+        labels=given_labels,
+        scores=draw(hnp.arrays(np.float16, (*shape, K), elements=scores)) if soft else None,
+    )
+
+
+sequences = st.integers(1, 4).flatmap(lambda n: st.tuples(*(frames(index) for index in range(n))))
+
+
+@pytest.mark.parametrize("make", [NumpyReference, open3d_map])
+@settings(checks, max_examples=60)
+@given(sequence=sequences, voxel_size=st.sampled_from([0.2, 0.5, 1.7]))
+def test_a_backend_is_what_the_paper_says(make, sequence, voxel_size):
+    backend, oracle = make(voxel_size, K), Oracle(voxel_size, K)
+    for frame in sequence:
+        report, expected = backend.integrate(frame), oracle.integrate(frame)
+        for count in ("frame", "points", "voxels", "new_voxels", "map_voxels"):
+            assert getattr(report, count) == getattr(expected, count), count
+        assert report.drift_sum == pytest.approx(expected.drift_sum, abs=1e-9)
+    table, rows = backend.table(), oracle.rows()
+    assert voxels(table) == rows
+    for row, q in enumerate(rows):
+        assert table.op[row] == oracle.op(q)
+        assert table.pixels[row] == oracle.pixels(q)
+        assert (table.first_frame[row], table.last_frame[row]) == (oracle.first_frame(q), oracle.last_frame(q))
+        assert table.evidence[row] == pytest.approx(oracle.accumulated(q)[-1], abs=1e-9)
+        assert table.drift_sum[row] == pytest.approx(oracle.drift(q), abs=1e-9)
+        assert table.self_sum[row] == pytest.approx(oracle.self_sum(q), abs=1e-9)
+        assert table.frame_entropy_sum[row] == pytest.approx(oracle.frame_entropy_sum(q), abs=1e-9)
+        assert vss(table)[row] == pytest.approx(oracle.vss(q), abs=1e-9)
+        assert sbd(table)[row] == pytest.approx(oracle.sbd(q), abs=1e-9, nan_ok=True)
+        assert entropy(table)[row] == pytest.approx(oracle.entropy(q), abs=1e-9)
+
+
+# --- The golden file: numbers stay what they were ---------------------------------------------------------------------
+
+GOLDEN = runpy.run_path(str(Path(__file__).parent / "golden" / "regenerate.py"))
+
+
+def leaves(value, path=""):
+    """Every number, name and null of nested dictionaries and lists, by its path; null is NaN."""
+    if isinstance(value, dict | list | tuple):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return {k: v for key, item in items for k, v in leaves(item, f"{path}/{key}").items()}
+    return {path: math.nan if value is None else value}
+
+
+@pytest.mark.parametrize("name", ["numpy", "open3d"])
+def test_the_map_is_the_golden_one(name):
+    actual, expected = leaves(GOLDEN["golden"](name)), leaves(read_json(GOLDEN["FILE"]))
+    assert actual.keys() == expected.keys()
+    for path, value in expected.items():
+        if isinstance(value, str):
+            assert actual[path] == value, path
+        else:
+            assert actual[path] == pytest.approx(value, rel=0, abs=1e-12, nan_ok=True), path
+
+
+# --- What is particular to one backend --------------------------------------------------------------------------------
+
+
+def test_the_reference_keeps_the_history():
+    reference = backends.create("numpy", voxel_size=1.0, num_classes=3)
+    reference.integrate(sight_line(4, [(0.5, 0), (1.2, 1), (1.4, 2)]))
+    reference.integrate(sight_line(2, [(1.5, 1)]))
+    events = reference.events()
+    assert events.voxel.tolist() == [0, 1, 1]
+    assert events.frame.tolist() == [4, 4, 2]
+    assert events.pixels.tolist() == [1, 2, 1]
+    assert events.evidence.tolist() == [[1, 0, 0], [0, 0.5, 0.5], [0, 1, 0]]
+
+
+def test_open3d_keeps_no_history():
+    assert backends.create("open3d", voxel_size=1.0, num_classes=3).events() is None
+
+
+@pytest.mark.parametrize("options", [{"block_resolution": 0}, {"block_resolution": 65}, {"device": "TPU:0"}])
+def test_open3d_refuses_options_it_cannot_use(options):
+    with pytest.raises(ConfigError, match=next(iter(options))):
+        backends.create("open3d", voxel_size=1.0, num_classes=3, **options)
+
+
+def test_an_unknown_option_is_named():
+    with pytest.raises(ConfigError, match=r"'numpy' has no option 'device'; it takes none"):
+        backends.create("numpy", voxel_size=1.0, num_classes=3, device="CPU:0")
+
+
+def test_open3d_takes_a_device_and_the_reference_does_not():
+    assert backends.takes_option("open3d", "device")
+    assert not backends.takes_option("numpy", "device")
+
+
+def test_a_device_that_is_not_there_is_refused():
+    import open3d.core as o3c
+
+    if o3c.cuda.device_count():
+        pytest.skip("Open3D sees a CUDA device here")
+    with pytest.raises(ConfigError, match="CUDA:0"):
+        backends.create("open3d", voxel_size=1.0, num_classes=3, device="CUDA:0")

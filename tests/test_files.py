@@ -1,0 +1,74 @@
+import json
+import math
+import os
+import stat
+
+import numpy as np
+import pytest
+
+from semstab.errors import DataError
+from semstab.files import atomic_path, read_json, write_json, write_text
+
+
+def test_a_file_is_written_whole(tmp_path):
+    write_text(tmp_path / "a" / "b.txt", "größer")
+    assert (tmp_path / "a" / "b.txt").read_bytes() == "größer".encode()
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["b.txt"]
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "map.parquet"
+    path.write_text("old")
+
+    def write_half():
+        with atomic_path(path) as temporary:
+            temporary.write_text("ne")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_half()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["map.parquet"]
+
+
+def test_the_temporary_file_stands_beside_with_the_same_suffix(tmp_path):
+    with atomic_path(tmp_path / "figure.svg") as temporary:
+        assert (temporary.parent, temporary.suffix) == (tmp_path, ".svg")
+        assert not (tmp_path / "figure.svg").exists()
+        temporary.write_text("<svg/>")
+    assert (tmp_path / "figure.svg").read_text() == "<svg/>"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions as POSIX has them")
+def test_files_have_the_permissions_that_others_have(tmp_path):
+    old = os.umask(0o027)
+    try:
+        write_text(tmp_path / "a.txt", "")
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o640
+
+
+def test_undefined_numbers_are_null(tmp_path):
+    value = {"nan": math.nan, "inf": [math.inf, (-math.inf, 1.5)], "numpy": np.float64("nan"), "zero": 0.0}
+    write_json(tmp_path / "a.json", value)
+    assert read_json(tmp_path / "a.json") == {"nan": None, "inf": [None, [None, 1.5]], "numpy": None, "zero": 0.0}
+
+
+def test_numpy_scalars_are_numbers(tmp_path):
+    write_json(tmp_path / "a.json", [np.int32(3), np.float32(0.5), np.bool_(True)])
+    assert json.loads((tmp_path / "a.json").read_text()) == [3, 0.5, True]
+
+
+def test_numbers_keep_their_precision(tmp_path):
+    write_json(tmp_path / "a.json", [0.1 + 0.2, 1e-300, 2**53 + 1])
+    assert read_json(tmp_path / "a.json") == [0.1 + 0.2, 1e-300, 2**53 + 1]
+
+
+@pytest.mark.parametrize("content", [None, b"{", b"", b"\xff\xfe", b"{'a': 1}"])
+def test_json_that_cannot_be_read_is_one_line_with_the_path(tmp_path, content):
+    path = tmp_path / "summary.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=r"^.*summary\.json: [^\n]*$"):
+        read_json(path)

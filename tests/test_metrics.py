@@ -1,0 +1,389 @@
+"""The measures against the paper's tables, against hand-worked maps, and against each other."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semstab import backends
+from semstab.errors import DataError
+from semstab.frames import Frame, Intrinsics
+from semstab.metrics import (
+    compare,
+    dominant,
+    entropy,
+    flicker_percent,
+    macro_mean,
+    op,
+    pool,
+    sbd,
+    strata,
+    summarise,
+    vss,
+)
+from semstab.results import Means, Unit
+from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
+from semstab.voxels import VoxelTable
+
+
+def voxel_table(op, evidence, drift_sum=None, classes=()):
+    """A map of voxels (0, 0, 0), (0, 0, 1), ... with these rows."""
+    n = len(op)
+    zeros = np.zeros(n)
+    return VoxelTable(
+        zeros,
+        zeros,
+        np.arange(n),
+        op=op,
+        evidence=evidence,
+        drift_sum=zeros if drift_sum is None else drift_sum,
+        pixels=op,
+        first_frame=zeros,
+        last_frame=zeros,
+        self_sum=zeros,
+        frame_entropy_sum=zeros,
+        voxel_size=0.2,
+        classes=classes,
+    )
+
+
+def fuse(frames, K=3):
+    backend = backends.create("numpy", voxel_size=1.0, num_classes=K)
+    for frame in frames:
+        backend.integrate(frame)
+    return backend.table()
+
+
+# --- The paper's tables -----------------------------------------------------------------------------------------------
+
+
+def two_frames_that_disagree(disagreeing, voxels):
+    """Every voxel is seen twice; the labels of the first `disagreeing` ones differ."""
+    first = [(i + 0.5, 0) for i in range(voxels)]
+    second = [(i + 0.5, 1 if i < disagreeing else 0) for i in range(voxels)]
+    return fuse([sight_line(0, first), sight_line(1, second)])
+
+
+def test_the_row_op_2_of_the_persistence_table_is_one_hot_labels_of_which_a_quarter_disagree():
+    row = summarise(two_frames_that_disagree(65, 256)).strata[1]
+    assert row.name == "OP=2"
+    assert (round(row.vss, 3), round(row.sbd, 4), round(row.entropy, 4)) == (0.873, 0.0790, 0.1602)
+
+
+@pytest.mark.parametrize("disagreeing", [0, 1, 254, 500, 1000])
+def test_measures_at_op_2_are_linear_in_the_share_that_disagrees(disagreeing):
+    f = disagreeing / 1000
+    summary = summarise(two_frames_that_disagree(disagreeing, 1000))
+    assert summary.vss == pytest.approx(1 - f / 2)
+    assert summary.sbd == pytest.approx(f * JS_HALF)
+    assert summary.entropy == pytest.approx(f * math.log(2) / math.log(3))
+
+
+SCENES = {  # voxels, sampled points, VSS, SBD, H: the paper's multi-scene table
+    "scene0": (306957, 637068, 0.951, 0.0466, 0.0395),
+    "scene1": (320725, 624234, 0.908, 0.0949, 0.0758),
+    "scene3": (27904, 32999, 0.981, 0.0714, 0.0133),
+    "scene5": (23862, 27433, 0.978, 0.1007, 0.0155),
+    "scene8": (26454, 32169, 0.966, 0.1091, 0.0239),
+}
+
+
+def test_the_last_row_of_the_scene_table_holds_totals_and_macro_means():
+    voxels, points, *measures = zip(*SCENES.values(), strict=True)
+    assert (sum(voxels), sum(points)) == (705902, 1353903)
+    mean_op = [p / v for p, v in zip(points, voxels, strict=True)]
+    assert round(macro_mean(mean_op), 2) == 1.51
+    assert [round(macro_mean(column), digits) for column, digits in zip(measures, (3, 4, 4), strict=True)] == [
+        0.957,
+        0.0845,
+        0.0336,
+    ]
+
+
+def test_the_scene_table_is_not_pooled():
+    voxels, points, *_ = zip(*SCENES.values(), strict=True)
+    assert round(sum(points) / sum(voxels), 2) == 1.92
+
+
+def test_mean_op_is_observations_by_voxels():
+    summary = summarise(voxel_table(op=[1, 1, 3, 7], evidence=[[1, 0]] * 4))
+    assert (summary.observations, summary.voxels, summary.mean_op) == (12, 4, 3.0)
+
+
+def test_points_and_observations_are_counted_apart():
+    summary = summarise(fuse([sight_line(0, [(0.2, 0), (0.4, 0), (1.5, 1)]), sight_line(1, [(0.5, 0)])]))
+    assert (summary.points, summary.observations, summary.voxels, summary.mean_op) == (4, 3, 2, 1.5)
+
+
+def test_the_shares_of_the_persistence_table_are_of_all_voxels():
+    counts = [5789, 2032, 1802, 377]
+    ops = np.repeat([1, 2, 4, 9], counts)
+    summary = summarise(voxel_table(ops, np.ones((len(ops), 2))))
+    assert [round(100 * row.share, 2) for row in summary.strata] == [57.89, 20.32, 18.02, 3.77]
+    assert sum(row.share for row in summary.strata) == pytest.approx(1)
+    assert round(100 * summary.recurrent.share, 2) == 21.79
+
+
+# --- Strata, recurrent voxels, classes --------------------------------------------------------------------------------
+
+
+def test_the_papers_strata():
+    assert [row[0] for row in strata([1, 2, 5])] == ["OP=1", "OP=2", "3<=OP<=5", "OP>5"]
+
+
+@pytest.mark.parametrize(
+    ("edges", "names"),
+    [([1], ["OP=1", "OP>1"]), ([3], ["1<=OP<=3", "OP>3"]), ([2, 3, 9], ["1<=OP<=2", "OP=3", "4<=OP<=9", "OP>9"])],
+)
+def test_strata_follow_their_edges(edges, names):
+    assert [row[0] for row in strata(edges)] == names
+
+
+@checks
+@given(st.sets(st.integers(1, 50), min_size=1, max_size=6), st.integers(1, 2**31 - 1))
+def test_each_op_is_in_one_stratum(edges, value):
+    assert sum(low <= value <= high for _, low, high in strata(sorted(edges))) == 1
+
+
+def test_strata_count_their_edges_in():
+    summary = summarise(voxel_table(op=[1, 2, 3, 5, 6], evidence=[[1, 0]] * 5))
+    assert [row.voxels for row in summary.strata] == [1, 1, 2, 1]
+
+
+def test_recurrent_means_seen_three_times_or_more():
+    summary = summarise(voxel_table(op=[1, 2, 3, 4], evidence=[[1, 0], [1, 1], [2, 1], [2, 2]]))
+    assert (summary.recurrent.name, summary.recurrent.voxels, summary.recurrent.share) == ("OP>=3", 2, 0.5)
+    assert summary.recurrent.vss == pytest.approx((2 / 3 + 1 / 2) / 2)
+
+
+def test_sbd_is_averaged_over_voxels_seen_twice_or_more():
+    table = voxel_table(op=[1, 2, 3], evidence=[[1, 0]] * 3, drift_sum=[0, 0.3, 0.2])
+    assert sbd(table)[1:].tolist() == [0.3, 0.1]
+    summary = summarise(table)
+    assert summary.sbd == pytest.approx(0.2)
+    assert math.isnan(summary.strata[0].sbd)
+    assert [row.sbd_voxels for row in summary.strata] == [0, 1, 1, 0]
+
+
+def test_classes_hold_the_voxels_that_they_dominate():
+    evidence = [[2, 1, 0], [0, 1, 2], [0, 2, 2], [1, 1, 1]]
+    table = voxel_table(op=[3, 3, 4, 3], evidence=evidence, classes=("road", "tree", "car"))
+    assert dominant(table).tolist() == [0, 2, 1, 0]
+    classes = summarise(table).classes
+    assert [(row.name, row.voxels) for row in classes] == [("road", 2), ("tree", 1), ("car", 1)]
+    assert classes[0].vss == pytest.approx((2 / 3 + 1 / 3) / 2)
+
+
+def test_classes_without_names_go_by_number():
+    assert [row.name for row in summarise(voxel_table([1], [[1, 0, 0]])).classes] == ["0", "1", "2"]
+
+
+def test_means_of_nothing_are_undefined():
+    summary = summarise(voxel_table(op=[1], evidence=[[1, 0]]))
+    for row in (summary.strata[1], summary.recurrent, summary.classes[1]):
+        assert (row.voxels, row.share) == (0, 0)
+        assert math.isnan(row.vss)
+        assert math.isnan(row.sbd)
+        assert math.isnan(row.entropy)
+
+
+def test_a_map_without_voxels_has_a_summary():
+    summary = summarise(backends.create("numpy", voxel_size=0.2, num_classes=3).table())
+    assert (summary.voxels, summary.points, summary.observations, summary.K) == (0, 0, 0, 3)
+    undefined = [summary.mean_op, summary.vss, summary.sbd, summary.entropy, summary.recurrent.share]
+    assert all(math.isnan(value) for value in undefined)
+
+
+@checks
+@given(SEQUENCES)
+def test_strata_and_classes_partition_the_voxels(sequence):
+    summary = summarise(fuse(as_frames(sequence)))
+    for rows in (summary.strata, summary.classes):
+        assert sum(row.voxels for row in rows) == summary.voxels
+        assert pool(rows, summary.voxels).vss == pytest.approx(summary.vss, nan_ok=True)
+        assert pool(rows, summary.voxels).sbd == pytest.approx(summary.sbd, nan_ok=True)
+        assert pool(rows, summary.voxels).entropy == pytest.approx(summary.entropy, nan_ok=True)
+
+
+def test_pooling_weighs_scenes_by_their_voxels():
+    a = Means("OP=2", share=0.5, voxels=1, vss=1.0, sbd=0.1, entropy=0.0, sbd_voxels=1)
+    b = Means("OP=2", share=0.25, voxels=3, vss=0.6, sbd=math.nan, entropy=0.4, sbd_voxels=0)
+    pooled = pool([a, b], voxels=14)
+    assert (pooled.name, pooled.voxels, pooled.sbd_voxels) == ("OP=2", 4, 1)
+    assert (pooled.share, pooled.vss, pooled.sbd, pooled.entropy) == pytest.approx((4 / 14, 0.7, 0.1, 0.3))
+
+
+def test_a_macro_mean_leaves_out_what_is_undefined():
+    assert macro_mean([1.0, math.nan, 2.0]) == 1.5
+    assert math.isnan(macro_mean([math.nan]))
+    assert math.isnan(macro_mean([]))
+
+
+# --- One voxel --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("evidence", "concentration", "uncertainty"),
+    [([4, 0, 0, 0], 1, 0), ([1, 1, 1, 1], 0.25, 1), ([2, 2, 0, 0], 0.5, 0.5), ([0.5, 0, 0, 0.5], 0.5, 0.5)],
+)
+def test_vss_and_entropy_of_a_voxel(evidence, concentration, uncertainty):
+    table = voxel_table([4], [evidence])
+    assert vss(table)[0] == pytest.approx(concentration)
+    assert entropy(table)[0] == pytest.approx(uncertainty)
+
+
+def test_op_is_the_number_of_frames():
+    assert op(voxel_table([1, 5], [[1, 0]] * 2)).tolist() == [1, 5]
+
+
+def test_the_same_evidence_is_less_uncertain_among_more_classes():
+    of_two, of_four = voxel_table([2], [[1, 1]]), voxel_table([2], [[1, 1, 0, 0]])
+    assert entropy(of_two)[0] == pytest.approx(1)
+    assert entropy(of_four)[0] == pytest.approx(0.5)
+
+
+# --- Flicker ----------------------------------------------------------------------------------------------------------
+
+
+def labelled(labels, depth=None, dtype=np.uint8, index=0, **more):
+    labels = np.array(labels, dtype=dtype)
+    depth = np.ones(labels.shape[:2]) if depth is None else np.array(depth, dtype=float)
+    kind = {"scores": labels} if labels.ndim == 3 else {"labels": labels}
+    return Frame(index, depth, Intrinsics(1, 1, 0, 0), np.eye(4), **kind, **more)
+
+
+def test_flicker_is_the_share_of_labels_that_change():
+    assert flicker_percent(labelled([[0, 1, 2, 0]]), labelled([[0, 1, 1, 1]])) == 50
+    assert flicker_percent(labelled([[0, 1]]), labelled([[0, 1]])) == 0
+
+
+def test_flicker_counts_pixels_that_are_valid_in_both_frames():
+    previous = labelled([[0, 0, 0, 255, 0]], depth=[[1, 1, 0, 1, 1]])
+    current = labelled([[1, 0, 1, 1, 255]], depth=[[1, 1, 1, 1, 1]])
+    assert flicker_percent(previous, current) == 50
+
+
+def test_flicker_is_undefined_where_no_pixel_is_valid_in_both():
+    assert math.isnan(flicker_percent(labelled([[0, 255]]), labelled([[255, 0]])))
+
+
+def test_flicker_of_soft_scores_is_that_of_the_largest_class():
+    previous = labelled([[[0.6, 0.4], [0.2, 0.8], [0, 0]]], dtype=np.float32)
+    current = labelled([[[0.4, 0.6], [0.1, 0.9], [1, 0]]], dtype=np.float32)
+    assert flicker_percent(previous, current) == 50
+
+
+def test_flicker_compares_labels_with_scores_and_16_bit_maps():
+    assert flicker_percent(labelled([[0, 1]]), labelled([[[1, 0], [1, 0]]], dtype=np.float32)) == 50
+    assert flicker_percent(labelled([[0, 255]]), labelled([[0, 65535]], dtype=np.uint16)) == 0
+
+
+def test_flicker_needs_frames_of_one_size():
+    current = labelled([[0]], index=7, files={"depth": "depth/7.png"})
+    with pytest.raises(DataError, match=r"^depth/7.png: frames 0 and 7 differ in size \(2x1 and 1x1\)$"):
+        flicker_percent(labelled([[0, 1]]), current)
+
+
+# --- Agreement --------------------------------------------------------------------------------------------------------
+
+UNITS = (Unit("s", "b", "numpy"), Unit("s", "b", "open3d"))
+TABLE = voxel_table(op=[1, 2, 4], evidence=[[1, 0], [1, 1], [3, 1]], drift_sum=[0, 0.3, 0.3])
+
+
+def test_a_map_agrees_with_itself():
+    row = compare(TABLE, TABLE, UNITS)
+    assert row.agrees
+    assert (row.scene, row.backbone, row.backends) == ("s", "b", ("numpy", "open3d"))
+    assert (row.voxels, row.only_in) == ((3, 3), (0, 0))
+    assert {name: (d.max, d.mean) for name, d in row.differences.items()} == dict.fromkeys(
+        ["op", "vss", "sbd", "entropy", "evidence"], (0, 0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "quantities"),
+    [
+        ("op", 2, 5, {"op", "sbd"}),
+        ("drift_sum", 1, 0.4, {"sbd"}),
+        ("evidence", 1, [2, 2], {"evidence"}),
+        ("evidence", 2, [1, 3], {"evidence"}),
+        ("evidence", 2, [2, 2], {"evidence", "vss", "entropy"}),
+    ],
+)
+def test_a_difference_in_any_quantity_is_disagreement(column, row, value, quantities):
+    values = getattr(TABLE, column).copy()
+    values[row] = value
+    result = compare(TABLE, dataclasses.replace(TABLE, **{column: values}), UNITS)
+    assert not result.agrees
+    assert {name for name, difference in result.differences.items() if difference.max > 1e-9} == quantities
+
+
+def test_differences_are_largest_and_mean_over_shared_voxels():
+    drift = TABLE.drift_sum.copy()
+    drift[2] = 0.6
+    sbd_difference = compare(TABLE, dataclasses.replace(TABLE, drift_sum=drift), UNITS).differences["sbd"]
+    assert (sbd_difference.max, sbd_difference.mean) == pytest.approx((0.1, 0.1 / 3))
+
+
+def test_differences_within_the_tolerance_agree():
+    other = dataclasses.replace(TABLE, drift_sum=TABLE.drift_sum + np.array([0, 1e-6, 0]))
+    assert not compare(TABLE, other, UNITS).agrees
+    assert compare(TABLE, other, UNITS, tolerance=1e-5).agrees
+
+
+def test_an_sbd_that_one_map_lacks_is_a_difference_of_1():
+    other = dataclasses.replace(TABLE, op=np.array([2, 2, 4]))
+    assert compare(TABLE, other, UNITS).differences["sbd"].max == 1
+
+
+def without(table, row):
+    """The table less one voxel."""
+    columns = {name: np.delete(getattr(table, name), row, axis=0) for name in COLUMNS}
+    return dataclasses.replace(table, **columns)
+
+
+COLUMNS = [field.name for field in dataclasses.fields(VoxelTable) if field.name not in ("voxel_size", "classes")]
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_voxels_in_one_map_only(row):
+    less = without(TABLE, row)
+    for a, b, only_in in ((TABLE, less, (1, 0)), (less, TABLE, (0, 1))):
+        result = compare(a, b, UNITS)
+        assert not result.agrees
+        assert (result.only_in, result.voxels) == (only_in, (len(a), len(b)))
+        assert all(difference.max == 0 for difference in result.differences.values())
+        assert compare(a, b, UNITS, voxel_share=0.34).agrees
+
+
+def test_maps_that_share_no_voxel():
+    result = compare(TABLE, dataclasses.replace(TABLE, ix=TABLE.ix + 1), UNITS)
+    assert not result.agrees
+    assert result.only_in == (3, 3)
+    assert math.isnan(result.differences["vss"].max)
+
+
+def test_two_empty_maps_agree():
+    empty = voxel_table([], np.zeros((0, 2)))
+    result = compare(empty, backends.create("numpy", voxel_size=0.2, num_classes=2).table(), UNITS)
+    assert result.agrees
+    assert (result.voxels, result.only_in) == ((0, 0), (0, 0))
+
+
+def test_an_empty_map_disagrees_with_another():
+    empty = without(without(without(TABLE, 0), 0), 0)
+    assert compare(empty, TABLE, UNITS).only_in == (0, 3)
+    assert not compare(TABLE, empty, UNITS).agrees
+
+
+def test_maps_of_different_numbers_of_classes_cannot_be_compared():
+    with pytest.raises(DataError, match=r"2 classes in voxels of 0\.2 m and of 5 in 0\.2 m cannot be compared"):
+        compare(TABLE, voxel_table([1, 2, 4], np.ones((3, 5))), UNITS)
+
+
+def test_maps_of_different_voxel_sizes_cannot_be_compared():
+    with pytest.raises(DataError, match="cannot be compared"):
+        compare(TABLE, dataclasses.replace(TABLE, voxel_size=0.4), UNITS)

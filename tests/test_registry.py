@@ -1,0 +1,104 @@
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from semstab import backends, registry
+from semstab.errors import ConfigError, MissingDependencyError, SemstabError
+from semstab.registry import Entry, Registry
+
+SHAPES = Registry(
+    "shape",
+    {
+        "fraction": Entry("fractions:Fraction", "in the standard library"),
+        "engine": Entry("semstab_no_such_engine:Engine", "", "pip install the-engine"),
+        "bare": Entry("semstab_no_such_engine:Engine", ""),
+    },
+)
+
+
+def test_a_name_gives_its_class():
+    from fractions import Fraction
+
+    assert SHAPES.load("fraction") is Fraction
+
+
+def test_an_unknown_name_gets_the_nearest_known_one():
+    with pytest.raises(ConfigError, match=r"^backend 'open3' is not known; did you mean 'open3d'\?$"):
+        backends.create("open3", voxel_size=0.2, num_classes=3)
+
+
+def test_a_name_like_no_other_gets_them_all():
+    with pytest.raises(ConfigError, match=r"^shape 'xyz' is not known; known: bare, engine, fraction$"):
+        SHAPES.load("xyz")
+
+
+def test_a_missing_package_says_how_to_install_it():
+    with pytest.raises(MissingDependencyError, match=r"^shape 'engine' cannot be used \(.*\); pip install the-engine$"):
+        SHAPES.load("engine")
+    with pytest.raises(MissingDependencyError, match=r"No module named .*; install what it needs$"):
+        SHAPES.load("bare")
+
+
+def test_a_shared_library_that_is_missing_is_a_missing_dependency(monkeypatch):
+    def import_module(name):
+        raise OSError("libGL.so.1: cannot open shared object file:\nNo such file")
+
+    monkeypatch.setattr(registry.importlib, "import_module", import_module)
+    with pytest.raises(MissingDependencyError, match=r"^shape 'engine' .*libGL[^\n]*; pip install the-engine$"):
+        SHAPES.load("engine")
+
+
+def test_errors_are_what_they_look_like():
+    assert issubclass(MissingDependencyError, ImportError)
+    assert issubclass(ConfigError, ValueError)
+    assert issubclass(MissingDependencyError, SemstabError)
+    assert SemstabError.exit_code == 2
+
+
+@pytest.fixture
+def plugins(monkeypatch):
+    """Entry points as another package would declare them."""
+    declared = [
+        EntryPoint("ratio", "fractions:Fraction", "semstab.shapes"),
+        EntryPoint("engine", "fractions:Fraction", "semstab.shapes"),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: [p for p in declared if p.group == group])
+
+
+@pytest.mark.usefixtures("plugins")
+def test_other_packages_add_names():
+    from fractions import Fraction
+
+    assert SHAPES.load("ratio") is Fraction
+    assert SHAPES.entry("ratio").summary == "from the package fractions"
+    assert "ratio" not in Registry("backend", {}).entries()
+
+
+@pytest.mark.usefixtures("plugins")
+def test_other_packages_do_not_replace_names():
+    assert SHAPES.entry("engine").install == "pip install the-engine"
+
+
+def test_the_package_imports_nothing_heavy():
+    heavy = ("numpy", "open3d", "rerun", "matplotlib", "pydantic", "pyarrow", "cv2", "trimesh", "yaml")
+    code = f"import sys, semstab; print([name for name in {heavy} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("module", ["semstab.backends", "semstab.frames", "semstab.metrics", "semstab.voxels"])
+def test_the_data_model_needs_numpy_alone(module):
+    heavy = ("open3d", "rerun", "matplotlib", "pyarrow", "cv2", "trimesh", "hypothesis", "pytest")
+    code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_public_names_are_all_there():
+    import semstab
+
+    assert all(hasattr(semstab, name) for name in semstab.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        semstab.nonsense  # noqa: B018
