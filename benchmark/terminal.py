@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -73,19 +74,36 @@ def _first_backend(result: RunResult) -> list[UnitSummary]:
     return [group.runs[0] for group in result.groups]
 
 
+def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
+    """A table that fits 80 columns: no lines between columns, headers of two lines."""
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True
+    )
+    for name in names:
+        table.add_column(name, vertical="bottom", no_wrap=True)
+    for name in numbers:
+        table.add_column(name, justify="right", vertical="bottom", no_wrap=True)
+    return table
+
+
 def _scene_table(runs: Sequence[UnitSummary]) -> Table:
-    table = Table(title=_title(runs), title_justify="left", title_style="bold")
-    for name in ("scene", "backbone"):
-        table.add_column(name)
-    for name in ("voxels", "points", "mean OP", "VSS ↑", "SBD ↓ bits", "entropy ↓", "flicker %", "OP>=3 %", "ms/frame"):
-        table.add_column(name, justify="right")
+    numbers = (
+        "voxels",
+        "mean\nOP",
+        "VSS\n↑",
+        "SBD ↓\nbits",
+        "entropy\n↓",
+        "flicker\n%",
+        "OP>=3\n%",
+        "ms a\nframe",
+    )
+    table = _table(_title(runs), ("scene",), numbers)
     for backbone, rows in _by_backbone(runs):
+        table.add_row(backbone, style="bold")
         for run in rows:
-            table.add_row(run.unit.scene, backbone, *_scene_cells([run]))
+            table.add_row(f"  {run.unit.scene}", *_scene_cells([run]))
         if len(rows) > 1:
-            table.add_row("total / mean", backbone, *_scene_cells(rows), style="bold", end_section=True)
-        else:
-            table.add_section()
+            table.add_row("  total / mean", *_scene_cells(rows))
     return table
 
 
@@ -94,7 +112,6 @@ def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
     tables = [run.table for run in runs]
     return [
         f"{sum(table.voxels for table in tables):,}",
-        f"{sum(table.points for table in tables):,}",
         _number(macro_mean([table.mean_op for table in tables]), 2),
         _number(macro_mean([table.vss for table in tables]), 3),
         _number(macro_mean([table.sbd for table in tables]), 4),
@@ -106,24 +123,20 @@ def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
 
 
 def _strata_table(runs: Sequence[UnitSummary]) -> Table:
-    title = "by observation persistence" + (" (voxels of all scenes pooled)" if len(_scenes(runs)) > 1 else "")
-    table = Table(title=title, title_justify="left", title_style="bold")
-    for name in ("backbone", "persistence"):
-        table.add_column(name)
-    for name in ("voxels", "%", "VSS ↑", "SBD ↓ bits", "entropy ↓"):
-        table.add_column(name, justify="right")
+    title = "by observation persistence" + (", all scenes pooled" if len(_scenes(runs)) > 1 else "")
+    table = _table(title, ("persistence",), ("voxels", "%", "VSS\n↑", "SBD ↓\nbits", "entropy\n↓"))
     for backbone, rows in _by_backbone(runs):
+        table.add_row(backbone, style="bold")
         voxels = sum(run.table.voxels for run in rows)
         for strata in zip(*(run.table.strata for run in rows), strict=True):
-            table.add_row(backbone, *_stratum_cells(pool(strata, voxels)))
-        recurrent = pool([run.table.recurrent for run in rows], voxels)
-        table.add_row(backbone, *_stratum_cells(recurrent), style="bold", end_section=True)
+            table.add_row(*_stratum_cells(pool(strata, voxels)))
+        table.add_row(*_stratum_cells(pool([run.table.recurrent for run in rows], voxels)), style="italic")
     return table
 
 
 def _stratum_cells(row: Means) -> list[str]:
     return [
-        row.name,
+        f"  {row.name}",
         f"{row.voxels:,}",
         _number(100 * row.share, 2),
         _number(row.vss, 3),
@@ -132,23 +145,23 @@ def _stratum_cells(row: Means) -> list[str]:
     ]
 
 
-def _agreement_table(agreement: Iterable[Agreement]) -> Table:
-    table = Table(title="agreement of the backends", title_justify="left", title_style="bold")
-    for name in ("scene", "backbone", "backends"):
-        table.add_column(name)
-    for name in ("voxels in one only", "max |ΔVSS|", "max |ΔSBD|", "max |ΔH|", "max |Δevidence|", ""):
-        table.add_column(name, justify="right")
-    for row in agreement:
-        differences = [f"{row.differences[name].max:.1e}" for name in ("vss", "sbd", "entropy", "evidence")]
-        verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
-        table.add_row(row.scene, row.backbone, " · ".join(row.backends), f"{sum(row.only_in):,}", *differences, verdict)
+def _agreement_table(agreement: Sequence[Agreement]) -> Table:
+    numbers = ("voxels in\none only", "|ΔOP|", "|ΔVSS|", "|ΔSBD|", "|ΔH|", "|Δe|", "")
+    table = _table("agreement: largest differences of a voxel (H entropy, e evidence)", ("scene, backbone",), numbers)
+    for pair in dict.fromkeys(row.backends for row in agreement):
+        table.add_row(" · ".join(pair), style="bold")
+        for row in (row for row in agreement if row.backends == pair):
+            largest = [row.differences[name].max for name in ("op", "vss", "sbd", "entropy", "evidence")]
+            differences = [f"{difference:.0e}" if difference else "0" for difference in largest]
+            verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
+            table.add_row(f"  {row.scene}, {row.backbone}", f"{sum(row.only_in):,}", *differences, verdict)
     return table
 
 
 def _title(runs: Sequence[UnitSummary]) -> str:
     first = runs[0]
     return (
-        f"{first.unit.backend} · voxels of {first.table.voxel_size:g} m · {first.taxonomy}, K = {first.table.K} · "
+        f"{first.unit.backend}, voxels of {first.table.voxel_size:g} m, {first.taxonomy} (K = {first.table.K}), "
         f"{first.frames} frames a scene"
     )
 
