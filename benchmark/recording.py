@@ -58,7 +58,7 @@ FIRST_DATE = 1e8  # seconds; timestamps from here on count from 1970 and are sho
 LINE_COLORS = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
 )  # fmt: skip
-EYE = np.array([0.4, 0.38])  # the eye's distance across and above the map, in units of its longest extent
+EYE_DISTANCE = 0.55  # in units of the map's diagonal
 BACKGROUND = (72, 72, 78)  # of the maps: neither end of the colour maps vanishes in it
 LEGEND_COLUMNS = 7
 
@@ -77,6 +77,7 @@ class Recording(Observer):
         self._stream: rr.RecordingStream | None = None
         self._kept: list[tuple[Task, UnitSummary]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
+        self._cameras: dict[str, list[npt.NDArray[np.float64]]] = {}  # poses by scene
         self._eyes: dict[str, rrb.EyeControls3D] = {}  # by scene
         self._dated: bool | None = None  # a timeline has one type: the first timestamp decides
 
@@ -91,6 +92,7 @@ class Recording(Observer):
         self._set_time(stream, frame.index, frame.timestamp)
         if unit.scene not in self._origins:
             self._log_origin(stream, unit.scene, frame)
+        self._cameras.setdefault(unit.scene, []).append(frame.T_wc)
         cells = row.cells()
         for column in _columns(unit, self._tasks[unit.scene, unit.backbone]):
             if cells[column] is not None:
@@ -104,8 +106,10 @@ class Recording(Observer):
         for name, grid in _grids(table, classes, factor, index, rows):
             stream.log(_path(unit.scene, "map", unit.backbone, unit.backend, name), grid)
         if unit.scene not in self._eyes and len(index):
+            cameras = np.array(self._cameras[unit.scene])
+            cameras[:, :3, 3] -= self._origins[unit.scene] * table.voxel_size
             up = self._tasks[unit.scene, unit.backbone].scene.up
-            self._eyes[unit.scene] = _eye((index + 0.5) * (table.voxel_size * factor), up)
+            self._eyes[unit.scene] = _eye((index + 0.5) * (table.voxel_size * factor), cameras, up)
             stream.send_blueprint(blueprint(self._plan, self._eyes))
         thinned = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         stream.log(_path(unit.scene, "log"), rr.TextLog(_final(summary) + thinned * (factor > 1)))
@@ -230,16 +234,23 @@ def _map_view(name: str, title: str, task: Task, eye: rrb.EyeControls3D | None) 
     )
 
 
-def _eye(points: npt.NDArray[Any], up: npt.NDArray[np.float64] | None) -> rrb.EyeControls3D:
-    """A view of the points (n, 3) from above and across their longest extent, so near that they fill it."""
-    up = np.array([0.0, 0.0, 1.0]) if up is None else up
+def _eye(points: npt.NDArray[Any], cameras: npt.NDArray[Any], up: npt.NDArray[Any] | None) -> rrb.EyeControls3D:
+    """An eye on the points (n, 3), so near that they fill the view; cameras are poses (t, 4, 4).
+
+    Where the world's up is known it looks down on them, across their longest extent; else from the cameras' side.
+    """
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     middle = (low + high) / 2
-    flat = (points - middle) - np.outer((points - middle) @ up, up)
-    _, directions = np.linalg.eigh(flat.T @ flat)
-    longest = directions[:, 2]
-    extent = np.ptp(np.quantile(flat @ longest, [0.02, 0.98]))
-    return rrb.EyeControls3D(position=middle + extent * EYE @ [np.cross(longest, up), up], look_target=middle)
+    side = cameras[:, :3, 3].mean(axis=0) - middle
+    if up is None:
+        up = -cameras[:, :3, 1].mean(axis=0)  # the images' top
+        side = side / max(float(np.linalg.norm(side)), 1e-9) + 0.3 * up
+    else:
+        flat = (points - middle) - np.outer((points - middle) @ up, up)
+        across = np.cross(np.linalg.eigh(flat.T @ flat)[1][:, 2], up)
+        side = across * (1 if across @ side > 0 else -1) + up
+    side *= EYE_DISTANCE * np.linalg.norm(high - low) / np.linalg.norm(side)
+    return rrb.EyeControls3D(position=middle + side, look_target=middle, eye_up=up)
 
 
 def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
