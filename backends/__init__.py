@@ -20,6 +20,11 @@ REGISTRY = Registry(
             "semstab.backends.numpy_reference:NumpyReference",
             "the reference: keeps every observation and computes each metric from its definition",
         ),
+        "numba": Entry(
+            "semstab.backends.numba_hash:NumbaHash",
+            "the fast one on a CPU: an open-addressing hash map in compiled parallel code",
+            install="pip install numba",
+        ),
         "open3d": Entry(
             "semstab.backends.open3d_blocks:Open3DBlocks",
             "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",

@@ -1,12 +1,13 @@
 """Backend `open3d`: semantic attributes on the hashed voxel blocks of `open3d.t.geometry.VoxelBlockGrid`.
 
-Pixels become one observation a voxel before the hash is touched, so a frame costs one look-up a block. The hash and the
-attributes live on the device; the logarithms of the update, which Open3D tensors lack, are taken on the host, for the
-touched voxels only.
+Pixels become one observation a voxel, in compiled code, before the hash is touched: a frame costs one look-up a block.
+Hash and attributes live on the device. On a CPU the touched voxels are updated in place; a CUDA device hands their rows
+to the host and takes them back, because Open3D tensors have no logarithm.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -15,23 +16,11 @@ import numpy.typing as npt
 import open3d.core as o3c
 from open3d.t.geometry import VoxelBlockGrid
 
-from semstab.backends.association import (
-    Float64,
-    Int64,
-    Observations,
-    back_project,
-    check_frame,
-    check_settings,
-    evidence_of,
-    no_observations,
-    pack,
-    unpack,
-    voxel_index,
-)
-from semstab.backends.means import MapMeans
+from semstab.backends.aggregator import Aggregator, Observed
+from semstab.backends.association import Int64, check_frame, check_settings
+from semstab.backends.updates import update_rows
 from semstab.errors import ConfigError
 from semstab.frames import Frame
-from semstab.information import entropy_bits
 from semstab.results import FrameReport
 from semstab.voxels import VoxelTable, index_columns
 
@@ -45,6 +34,8 @@ COPIED_BLOCKS = 1024
 class Open3DBlocks:
     """Incremental fusion on voxel blocks; `grid` is the VoxelBlockGrid, its attributes named as VoxelTable's columns.
 
+    A map reaches 2^20 voxels to either side of its first camera.
+
     device            'CPU:0', or 'CUDA:0' where Open3D sees such a device
     block_resolution  voxels along an edge of a block; a block takes memory for all of its voxels
     """
@@ -57,7 +48,10 @@ class Open3DBlocks:
         self.num_classes = num_classes
         self.block_resolution = block_resolution
         self.device = _device(device)
-        self._means = MapMeans()
+        self._in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
+        self._pixels = Aggregator(voxel_size, num_classes)
+        self._sums = np.zeros(2)  # of VSS and of entropy in bits, over the map
+        self._voxels = self._recurrent = 0
         self._attributes = {
             "op": (o3c.int32, 1),
             "evidence": (o3c.float64, num_classes),
@@ -74,11 +68,28 @@ class Open3DBlocks:
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
         started = time.perf_counter()
-        check_frame(frame, self.num_classes)
-        seen = observe(frame, self.voxel_size, self.num_classes)
-        rows = self._activate(seen.index)
-        op, drift = self._update(rows, seen, frame.index)
-        return self._means.report(frame, seen.pixels, op, drift, time.perf_counter() - started)
+        if frame.scores is not None:
+            check_frame(frame, self.num_classes)
+        seen = self._pixels.observe(frame)
+        observed = time.perf_counter()
+        rows = self._activate(self._pixels.index_of(seen.key)) if len(seen.key) else seen.key
+        new, drift = self._update(rows, seen, frame.index)
+        finished = time.perf_counter()
+        n = max(self._voxels, 1)
+        return FrameReport(
+            frame=frame.index,
+            points=int(seen.pixels.sum()),
+            voxels=len(rows),
+            new_voxels=new,
+            drift_sum=drift,
+            seconds=finished - started,
+            map_voxels=self._voxels,
+            map_vss=float(self._sums[0]) / n if self._voxels else math.nan,
+            map_entropy=float(self._sums[1]) / math.log2(self.num_classes) / n if self._voxels else math.nan,
+            map_recurrent=self._recurrent / n if self._voxels else math.nan,
+            association_seconds=observed - started,
+            update_seconds=finished - observed,
+        )
 
     def table(self) -> VoxelTable:
         """The map so far: the voxels of all active blocks that a frame has seen."""
@@ -154,23 +165,19 @@ class Open3DBlocks:
         index: Int64 = keys[block] * r + local
         return index
 
-    def _update(self, rows: Int64, seen: Observations, frame: int) -> tuple[Int64, Float64]:
-        """Add one observation to each row; return the voxels' OP and the drift it caused, bits."""
-        before = self._read("evidence", rows)
-        after = before + seen.s_bar
-        op = self._read("op", rows).astype(np.int64) + 1
-        drift = self._means.update(before, after, op)
-        first, last = self._read("first_frame", rows), self._read("last_frame", rows)
-        self._write("evidence", rows, after)
-        self._write("op", rows, op)
-        self._write("first_frame", rows, np.where(op == 1, frame, np.minimum(first, frame)))
-        self._write("last_frame", rows, np.where(op == 1, frame, np.maximum(last, frame)))
-        self._add("drift_sum", rows, drift)
-        self._add("pixels", rows, seen.pixels)
-        s_bar = np.asfortranarray(seen.s_bar)  # sums over few classes run along n
-        self._add("self_sum", rows, (s_bar**2).sum(axis=1))
-        self._add("frame_entropy_sum", rows, entropy_bits(s_bar))
-        return op, drift
+    def _update(self, rows: Int64, seen: Observed, frame: int) -> tuple[int, float]:
+        """Add one observation to each row; return the number of new voxels, and the drift caused, bits."""
+        names = tuple(self._attributes)
+        values = {name: self._attribute(name).numpy() if self._in_place else self._read(name, rows) for name in names}
+        columns = {name: value if name == "evidence" else value.reshape(-1) for name, value in values.items()}
+        sums = update_rows(rows if self._in_place else np.arange(len(rows)), seen, frame, **columns)
+        if not self._in_place:
+            for name in names:
+                self._write(name, rows, values[name])
+        self._sums += sums[:2]
+        self._voxels += int(sums[3])
+        self._recurrent += int(sums[4])
+        return int(sums[3]), float(sums[2])
 
     def _attribute(self, name: str) -> Any:
         """The attribute, flattened to (voxels, channels); taken anew each time, because a rehash moves the buffers."""
@@ -184,9 +191,6 @@ class Open3DBlocks:
     def _write(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
         attribute = self._attribute(name)
         attribute[self._tensor(rows)] = self._tensor(values.reshape(len(rows), attribute.shape[1])).to(attribute.dtype)
-
-    def _add(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
-        self._write(name, rows, self._read(name, rows) + values)
 
     def _tensor(self, values: npt.NDArray[Any]) -> Any:
         return o3c.Tensor.from_numpy(np.ascontiguousarray(values)).to(self.device)
@@ -204,47 +208,6 @@ def _copy_blocks(old: VoxelBlockGrid, new: VoxelBlockGrid, attributes: tuple[str
         for start in range(0, source.shape[0], COPIED_BLOCKS):
             part = slice(start, start + COPIED_BLOCKS)
             room[target[part]] = values[source[part]]
-
-
-def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:
-    """The frame's observations, one a voxel, from one sort of its pixels' keys."""
-    points = back_project(frame)
-    if not points.shape[1]:
-        return no_observations(num_classes)
-    key, low, size = pack(voxel_index(points, voxel_size, frame), frame)
-    if frame.labels is not None:
-        voxels, counts = _count_labels(key * num_classes + frame.labels[frame.valid], num_classes)
-    else:
-        voxels, counts = _sum_scores(key, evidence_of(frame, num_classes))
-    pixels = counts.sum(axis=1).round()
-    return Observations(unpack(voxels, low, size), counts / pixels[:, None], pixels.astype(np.int64))
-
-
-def _count_labels(key: Int64, num_classes: int) -> tuple[Int64, Float64]:
-    """Voxels and their (n, K) label counts, from keys that hold voxel and label; runs of equal pixels sort as one."""
-    starts = _starts(key)
-    runs = np.diff(np.append(starts, len(key)))
-    order = np.argsort(key[starts])
-    key, runs = key[starts][order], runs[order]
-    starts = _starts(key)
-    voxel, label = np.divmod(key[starts], num_classes)
-    first = _starts(voxel)
-    counts = np.zeros((len(first), num_classes))
-    row = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(voxel))))
-    counts[row, label] = np.add.reduceat(runs, starts)
-    return voxel[first], counts
-
-
-def _sum_scores(key: Int64, s: Float64) -> tuple[Int64, Float64]:
-    """Voxels and the (n, K) sums of their pixels' evidence."""
-    voxels, inverse = np.unique(key, return_inverse=True)
-    sums = [np.bincount(inverse, weights=s[:, k], minlength=len(voxels)) for k in range(s.shape[1])]
-    return voxels, np.stack(sums, axis=1)
-
-
-def _starts(key: Int64) -> Int64:
-    """First positions of the runs of equal keys."""
-    return np.flatnonzero(np.diff(key, prepend=key[0] - 1))
 
 
 def _unique_rows(index: Int64) -> tuple[Int64, Int64]:

@@ -56,7 +56,7 @@ class Config(Settings):
     scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
     backbones: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
     backends: list[BackendConfig] = Field(
-        [BackendConfig(name="open3d")], min_length=1, description="fusion backends, each fuses the same frames"
+        [BackendConfig(name="numba")], min_length=1, description="fusion backends, each fuses the same frames"
     )
     check: str | None = Field("numpy", description="backend that the others are checked against; null for none")
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
@@ -65,6 +65,9 @@ class Config(Settings):
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
     frames: FrameSelection = FrameSelection()
     strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
+    threads: int | None = Field(
+        None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
+    )
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
 
     @field_validator("backends", mode="before")

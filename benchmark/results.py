@@ -12,6 +12,10 @@ from typing import Any
 SCHEMA = 1
 """Version of summary.json."""
 
+STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
+"""Where a frame's time goes: decoding in a worker thread, beside the rest; waiting for it; flicker; the two parts of
+fusion, where the backend tells them apart; telling the observers."""
+
 RECURRENT = 3
 """A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
 
@@ -49,6 +53,9 @@ class FrameReport:
     map_vss          mean VSS over them
     map_entropy      mean normalised entropy over them
     map_recurrent    share of them with OP >= 3
+
+    Of `seconds`, where a backend tells them apart, association_seconds go from pixels to voxels with their evidence,
+    update_seconds into the map.
     """
 
     frame: int
@@ -61,6 +68,8 @@ class FrameReport:
     map_vss: float = math.nan
     map_entropy: float = math.nan
     map_recurrent: float = math.nan
+    association_seconds: float = math.nan
+    update_seconds: float = math.nan
 
     @property
     def drift(self) -> float:
@@ -105,7 +114,7 @@ class TableSummary:
 
 @dataclass(frozen=True)
 class UnitSummary:
-    """One entry of 'runs' in summary.json."""
+    """One entry of 'runs' in summary.json; stages_ms has mean milliseconds a frame by stage, see `STAGES`."""
 
     unit: Unit
     taxonomy: str
@@ -113,16 +122,19 @@ class UnitSummary:
     table: TableSummary
     flicker_percent: float
     fuse_ms_per_frame: float
+    stages_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object; `from_dict` reads it back."""
         rest = {name: getattr(self, name) for name in _UNIT_FIELDS}
-        return dataclasses.asdict(self.unit) | rest | dataclasses.asdict(self.table)
+        return (
+            dataclasses.asdict(self.unit) | rest | {"stages_ms": dict(self.stages_ms)} | dataclasses.asdict(self.table)
+        )
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> UnitSummary:
         """Read one entry of 'runs'; null is NaN."""
-        content = {key: math.nan if value is None else value for key, value in content.items()}
+        content = _defined(content)
         groups = {
             "strata": tuple(_means(row) for row in content["strata"]),
             "classes": tuple(_means(row) for row in content["classes"]),
@@ -133,6 +145,7 @@ class UnitSummary:
             Unit(content["scene"], content["backbone"], content["backend"]),
             table=TableSummary(**table | groups),
             **{name: content[name] for name in _UNIT_FIELDS},
+            stages_ms=_defined(content.get("stages_ms", {})),  # runs of earlier versions have none
         )
 
 
@@ -166,10 +179,7 @@ class Agreement:
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Agreement:
         """Read one entry of 'agreement'; null is NaN."""
-        differences = {
-            name: Difference(**{key: math.nan if value is None else value for key, value in row.items()})
-            for name, row in content["differences"].items()
-        }
+        differences = {name: Difference(**_defined(row)) for name, row in content["differences"].items()}
         pairs = {name: tuple(content[name]) for name in ("backends", "voxels", "only_in")}
         return cls(**dict(content) | pairs | {"differences": differences})
 
@@ -223,5 +233,9 @@ class RunResult:
 
 
 def _means(row: Mapping[str, Any]) -> Means:
-    content: dict[str, Any] = {key: math.nan if value is None else value for key, value in row.items()}
-    return Means(**content)
+    return Means(**_defined(row))
+
+
+def _defined(row: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON's null is NaN."""
+    return {key: math.nan if value is None else value for key, value in row.items()}

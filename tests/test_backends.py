@@ -1,5 +1,6 @@
 """The backends that ship with the package keep the contract, and agree with the paper read once more by an oracle."""
 
+import dataclasses
 import math
 import runpy
 from pathlib import Path
@@ -14,11 +15,11 @@ from oracle import Oracle
 
 from semstab import backends
 from semstab.backends.numpy_reference import NumpyReference
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 from semstab.files import read_json
 from semstab.frames import Frame, Intrinsics
 from semstab.metrics import dominant, entropy, sbd, vss
-from semstab.testing import BackendConformance, checks, sight_line, voxels
+from semstab.testing import EXACT, SUMS, BackendConformance, checks, random_frames, sight_line, voxels
 
 K = 3
 
@@ -34,13 +35,47 @@ def open3d_map(voxel_size, num_classes, initial_bytes=0, **options):
         return backends.create("open3d", voxel_size=voxel_size, num_classes=num_classes, **options)
 
 
+def numba_map(voxel_size, num_classes):
+    return backends.create("numba", voxel_size=voxel_size, num_classes=num_classes)
+
+
+class TestNumba(BackendConformance):
+    reach = 2**20
+
+    def create(self, voxel_size, num_classes):
+        return numba_map(voxel_size, num_classes)
+
+
+class TestNumbaInSinglePrecision(BackendConformance):
+    reach = 2**20
+    tolerance = 5e-4
+
+    def create(self, voxel_size, num_classes):
+        return backends.create("numba", voxel_size=voxel_size, num_classes=num_classes, evidence="float32")
+
+
 class TestOpen3D(BackendConformance):
+    reach = 2**20
+
     def create(self, voxel_size, num_classes):
         return open3d_map(voxel_size, num_classes, initial_bytes=2**24)
 
 
+class TestOpen3DByRows(BackendConformance):
+    """The rows of the touched voxels go to the host and back, as they do on a CUDA device."""
+
+    reach = 2**20
+
+    def create(self, voxel_size, num_classes):
+        backend = open3d_map(voxel_size, num_classes, initial_bytes=2**24)
+        backend._in_place = False
+        return backend
+
+
 class TestOpen3DThatGrows(BackendConformance):
     """With room for 64 blocks to begin with, of an odd size, the map is moved again and again."""
+
+    reach = 2**20
 
     def create(self, voxel_size, num_classes):
         return open3d_map(voxel_size, num_classes, block_resolution=7)
@@ -103,7 +138,7 @@ def frames(draw, index):
 sequences = st.integers(1, 4).flatmap(lambda n: st.tuples(*(frames(index) for index in range(n))))
 
 
-@pytest.mark.parametrize("make", [NumpyReference, open3d_map])
+@pytest.mark.parametrize("make", [NumpyReference, open3d_map, numba_map])
 @settings(checks, max_examples=60)
 @given(sequence=sequences, voxel_size=st.sampled_from([0.2, 0.5, 1.7]))
 def test_a_backend_is_what_the_paper_says(make, sequence, voxel_size):
@@ -141,7 +176,7 @@ def leaves(value, path=""):
     return {path: math.nan if value is None else value}
 
 
-@pytest.mark.parametrize("name", ["numpy", "open3d"])
+@pytest.mark.parametrize("name", ["numpy", "numba", "open3d"])
 def test_the_map_is_the_golden_one(name):
     actual, expected = leaves(GOLDEN["golden"](name)), leaves(read_json(GOLDEN["FILE"]))
     assert actual.keys() == expected.keys()
@@ -193,3 +228,44 @@ def test_a_device_that_is_not_there_is_refused():
         pytest.skip("Open3D sees a CUDA device here")
     with pytest.raises(ConfigError, match="CUDA:0"):
         backends.create("open3d", voxel_size=1.0, num_classes=3, device="CUDA:0")
+
+
+@pytest.mark.parametrize("name", ["numba", "open3d"])
+def test_the_numbers_do_not_depend_on_the_number_of_threads(name):
+    import numba
+
+    tables = []
+    for threads in (1, numba.config.NUMBA_NUM_THREADS):
+        numba.set_num_threads(threads)
+        backend = backends.create(name, voxel_size=0.25, num_classes=4)
+        reports = [dataclasses.replace(backend.integrate(f), **NO_TIMES) for f in random_frames(seed=3, count=6)]
+        tables.append((backend.table(), reports))
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    (one, reports_one), (many, reports_many) = tables
+    for column in (*EXACT, *SUMS):
+        np.testing.assert_array_equal(getattr(one, column), getattr(many, column), err_msg=column)
+    assert reports_one == reports_many
+
+
+NO_TIMES = {"seconds": 0.0, "association_seconds": 0.0, "update_seconds": 0.0}
+
+
+def test_numba_leaves_the_number_of_threads_as_it_was():
+    import numba
+
+    before = numba.get_num_threads()
+    backend = backends.create("numba", voxel_size=1.0, num_classes=3, threads=1)
+    backend.integrate(sight_line(0, [(0.5, 0)]))
+    assert numba.get_num_threads() == before
+    with pytest.raises(ConfigError, match="threads = 0: use 1 to"):
+        backends.create("numba", voxel_size=1.0, num_classes=3, threads=0)
+    with pytest.raises(ConfigError, match="evidence = 'float16': use float64 or float32"):
+        backends.create("numba", voxel_size=1.0, num_classes=3, evidence="float16")
+
+
+def test_points_beyond_the_reach_are_refused_with_their_extent():
+    backend = backends.create("numba", voxel_size=0.001, num_classes=3)
+    backend.integrate(sight_line(0, [(0.5, 0)]))
+    with pytest.raises(DataError, match=r"frame 7 spans .* more than 2\^20 voxels of 0\.001 m .* use larger voxels"):
+        backend.integrate(sight_line(7, [(0.5, 0), (5000.0, 1)]))
+    assert len(backend.table()) == 1

@@ -12,7 +12,7 @@ from semstab.plan import load_config, resolve
 def test_defaults_are_the_papers() -> None:
     config = Config()
     assert (config.voxel_size, config.strata, config.dataset.name) == (0.2, [1, 2, 5], "city")
-    assert [backend.name for backend in config.fused_by()] == ["open3d", "numpy"]
+    assert [backend.name for backend in config.fused_by()] == ["numba", "numpy"]
 
 
 def test_the_checking_backend_is_not_fused_twice() -> None:

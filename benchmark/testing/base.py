@@ -16,6 +16,7 @@ class BackendTests:
 
     tolerance: float = 1e-9
     voxel_share: float = 0.0
+    reach: int = 2**31
 
     def create(self, voxel_size: float, num_classes: int) -> FusionBackend:
         """A new, empty map."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from semstab.errors import DataError
 from semstab.frames import Frame, Intrinsics
 from semstab.metrics import dominant
 from semstab.testing.base import BackendTests
@@ -66,13 +67,20 @@ class GeometryTests(BackendTests):
         assert voxels(there) == [(2_500_000, 20_000_000 + i, 0) for i in range(20)]
         assert there.evidence == self.near(here.evidence)
 
-    def test_the_whole_range_of_int32(self) -> None:
-        """The outermost voxels, -2^31 and 2^31 - 1, are as good as any."""
-        low = sight_line(0, [(0.5, 0)], start=(0, 0, -(2.0**31)))
-        high = sight_line(1, [(0.5, 1)], start=(0, 0, 2.0**31 - 1))
-        table = self.fuse(low, high)
-        assert table.iz.tolist() == [-(2**31), 2**31 - 1]
-        assert dominant(table).tolist() == [0, 1]
+    def test_the_outermost_voxels(self) -> None:
+        """As far as the backend reaches, -2^31 and 2^31 - 1 if nothing else is said, voxels are as good as any.
+
+        The next one is refused, and the map stays as it is.
+        """
+        frames = [sight_line(t, [(0.5, t)], start=(0, 0, z)) for t, z in enumerate((0, -self.reach, self.reach - 1))]
+        backend = self.create(1.0, 3)
+        for frame in frames:
+            backend.integrate(frame)
+        with pytest.raises(DataError, match="frame 3"):
+            backend.integrate(sight_line(3, [(0.5, 0)], start=(0, 0, self.reach)))
+        table = backend.table()
+        assert table.iz.tolist() == [-self.reach, 0, self.reach - 1]
+        assert dominant(table).tolist() == [1, 0, 2]
 
     def test_growth_keeps_earlier_voxels(self) -> None:
         """A map that outgrows its first allocation, many times over, forgets nothing: each voxel is seen twice."""

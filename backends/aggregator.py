@@ -1,0 +1,198 @@
+"""From the pixels of a frame to its observations, one a voxel, in compiled parallel code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.association import INDEX_LIMIT, back_project, check_frame, voxel_index
+from semstab.backends.kernels import (
+    HALF,
+    PARTITIONS,
+    compact,
+    find_entries,
+    group,
+    merge_scores,
+    scatter,
+    sort_labels,
+    sum_scores,
+)
+from semstab.errors import DataError
+from semstab.frames import Frame
+from semstab.labels import IGNORE_8BIT
+
+BANDS = 64
+MIN_BAND_ROWS = 8
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """The observations of a frame as sparse rows, grouped by partition; valid until the next frame is observed.
+
+    key     (n,) int64 packed voxel index, relative to the origin
+    pixels  (n,) int64 pixels in the voxel
+    start   (n + 1,) int64 first entry of each voxel
+    label   (m,) uint16 classes seen in the voxel, ascending
+    weight  (m,) float64 pixels of that class, or the sum of their normalised scores; s_bar = weight / pixels
+    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
+    """
+
+    key: Int64
+    pixels: Int64
+    start: Int64
+    label: npt.NDArray[np.uint16]
+    weight: Float64
+    bounds: Int64
+
+
+class Aggregator:
+    """Turns frames into observations; keeps its work space from frame to frame."""
+
+    def __init__(self, voxel_size: float, num_classes: int) -> None:
+        self.voxel_size = voxel_size
+        self.num_classes = num_classes
+        self.origin: Int64 | None = None
+        self._space: dict[str, npt.NDArray[Any]] = {}
+
+    def observe(self, frame: Frame) -> Observed:
+        """The frame's observations; the first frame's camera sets the origin.
+
+        Raises DataError for a label outside the classes, or a voxel out of reach of the packed keys.
+        """
+        H, W = frame.shape
+        rows = max(MIN_BAND_ROWS, -(-H // BANDS))
+        bands = -(-H // rows)
+        origin = self._origin_at(frame) if self.origin is None else self.origin
+        soft = frame.scores is not None
+        camera = frame.intrinsics
+        ray_x = (np.arange(W) - camera.cx) / camera.fx
+        ray_y = (np.arange(H) - camera.cy) / camera.fy
+        labels = np.where(frame.valid, np.uint8(0), np.uint8(IGNORE_8BIT)) if soft else frame.labels
+        key, label = self._room("key", H * W, np.int64), self._room("label", H * W, np.uint16)
+        count, where = self._room("count", H * W, np.int32), self._room("where", H * W if soft else 1, np.int32)
+        threads = nb.get_num_threads()
+        row_keys = self._room("row_keys", threads * 2 * W, np.int64).reshape(threads, 2, W)
+        row_changes = self._room("row_changes", threads * W, np.uint8).reshape(threads, W)
+        row_runs = self._room("row_runs", threads * 4 * (W + 1), np.int32).reshape(threads, 4, W + 1)
+        slots = self._room("slots", threads * _slots_for(rows * W), np.int32).reshape(threads, -1)
+        entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
+        highest = np.full(bands, -1, dtype=np.int64)
+        spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
+        find_entries(
+            _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin,
+            IGNORE_8BIT if soft else frame.ignore_id, soft, rows, row_keys, row_changes, row_runs, slots, key, label,
+            count, where, entries, lost, highest, spread,
+        )  # fmt: skip
+        if highest.max() >= self.num_classes:
+            check_frame(frame, self.num_classes)
+        if lost.any():
+            self._refuse(frame, origin)
+        self.origin = origin
+        return self._merged(frame, rows, key, label, count, where, entries, spread)
+
+    def _merged(
+        self, frame: Frame, rows: int, key: Any, label: Any, count: Any, where: Any, entries: Int64, spread: Int64
+    ) -> Observed:
+        W, K = frame.shape[1], self.num_classes
+        total = int(entries.sum())
+        offset = np.zeros((PARTITIONS, len(entries)), dtype=np.int64)
+        offset.reshape(-1)[1:] = np.cumsum(spread.T.reshape(-1))[:-1]
+        edges = np.append(offset[:, 0], total)
+        order = self._room("order", total, np.int64)
+        scatter(key, rows * W, entries, offset, order)
+        voxel = self._room("voxel", total, np.int64)
+        merged_key = self._room("merged_key", total, np.int64)
+        merged_pixels = self._room("merged_pixels", total, np.int64)
+        merged_size = self._room("merged_size", total, np.int64)
+        found = np.zeros(PARTITIONS, dtype=np.int64)
+        group(key, count, order, edges, voxel, merged_key, merged_pixels, merged_size, found)
+        bounds = np.concatenate([[0], np.cumsum(found)])
+        n = int(bounds[-1])
+        keys, pixels = self._room("keys", n, np.int64), self._room("pixels", n, np.int64)
+        if frame.scores is None:
+            out_label = self._room("out_label", total, np.uint16)
+            out_weight = self._room("out_weight", total, np.float64)
+            kept = np.zeros(PARTITIONS, dtype=np.int64)
+            sort_labels(label, count, order, edges, voxel, merged_size, found, out_label, out_weight, kept)
+            entry_bounds = np.concatenate([[0], np.cumsum(kept)])
+            m = int(entry_bounds[-1])
+            start = self._room("start", n + 1, np.int64)
+            labels, weight = self._room("labels", m, np.uint16), self._room("weight", m, np.float64)
+            compact(
+                edges,
+                bounds,
+                entry_bounds,
+                merged_key,
+                merged_pixels,
+                merged_size,
+                out_label,
+                out_weight,
+                keys,
+                pixels,
+                start,
+                labels,
+                weight,
+            )
+            return Observed(keys, pixels, start, labels, weight, bounds)
+        base = np.concatenate([[0], np.cumsum(entries)])
+        sums = np.zeros((total, K))
+        sum_scores(_fixed(_widened(frame.scores)), where[: frame.depth.size].reshape(frame.shape), rows, base, sums)
+        weights = np.zeros((n, K))
+        merge_scores(
+            order, edges, voxel, bounds, rows * W, base, sums, merged_key, merged_pixels, keys, pixels, weights
+        )
+        start = np.arange(n + 1, dtype=np.int64) * K
+        return Observed(keys, pixels, start, np.tile(np.arange(K, dtype=np.uint16), n), weights.reshape(-1), bounds)
+
+    def index_of(self, key: Int64) -> Int64:
+        """Voxel indices (n, 3) of packed keys."""
+        assert self.origin is not None
+        mask = (1 << 21) - 1
+        return np.stack([key >> 42, (key >> 21) & mask, key & mask], axis=1) - HALF + self.origin
+
+    def _origin_at(self, frame: Frame) -> Int64:
+        """The camera's voxel, from which the packed keys count."""
+        origin = np.floor(frame.T_wc[:3, 3] / self.voxel_size)
+        if np.abs(origin).max() > INDEX_LIMIT - 2 * HALF:
+            voxel_index(frame.T_wc[:3, 3:], self.voxel_size, frame)
+            self._refuse(frame, origin)
+        return origin.astype(np.int64)
+
+    def _refuse(self, frame: Frame, origin: npt.NDArray[Any]) -> None:
+        """Say where the frame's points are: too far for 32-bit indices, or for keys that count from the origin."""
+        points = back_project(frame)
+        voxel_index(points, self.voxel_size, frame)
+        low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))
+        raise DataError(
+            f"{frame.where('depth')}: frame {frame.index} spans {low} to {high} m, more than 2^20 voxels of"
+            f" {self.voxel_size:g} m from the map's origin {(origin * self.voxel_size).round(1).tolist()};"
+            " leave out far depth (sky?), check depth and pose units, or use larger voxels"
+        )
+
+    def _room(self, name: str, size: int, dtype: Any) -> npt.NDArray[Any]:
+        if name not in self._space or len(self._space[name]) < size:
+            self._space[name] = np.empty(max(size, 1), dtype=dtype)
+        return self._space[name][:size]
+
+
+def _fixed(array: Any) -> Any:
+    """Contiguous and read-only, so that numba compiles one version."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
+def _widened(scores: Any) -> Any:
+    """Half-precision scores as float32: numba knows no float16."""
+    return scores.astype(np.float32) if scores.dtype == np.float16 else scores
+
+
+def _slots_for(entries: int) -> int:
+    return 1 << max(10, int(2 * entries - 1).bit_length())

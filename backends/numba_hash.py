@@ -1,0 +1,343 @@
+"""Backend `numba`: an open-addressing hash map of voxels, updated in compiled parallel code.
+
+A voxel's record holds the class that it saw first; further classes hang on it as a chain of nodes. So memory follows
+the classes that were seen, not K, and a voxel on which all frames agree touches one record. The map is cut into
+partitions by a hash of the voxel's key; each is updated by one thread at a time, in the frame's order.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.aggregator import Aggregator, Observed
+from semstab.backends.association import check_frame, check_settings
+from semstab.backends.kernels import PARTITIONS, mix, parallel, serial
+from semstab.backends.updates import js_term, plogp
+from semstab.errors import ConfigError
+from semstab.frames import Frame
+from semstab.results import RECURRENT, FrameReport
+from semstab.voxels import VoxelTable, index_columns
+
+Int64 = npt.NDArray[np.int64]
+
+SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
+FULL = 0.7
+"""Largest share of a partition's slots in use."""
+
+
+def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
+    """The types of a voxel's record and of a node of its chain, for evidence of that float type."""
+    record = [
+        ("key", np.int64), ("pixels", np.int64), ("drift_sum", np.float64), ("self_sum", np.float64),
+        ("frame_entropy_sum", np.float64), ("value", evidence), ("next", np.int32), ("op", np.int32),
+        ("first_frame", np.int32), ("last_frame", np.int32), ("label", np.uint16),
+    ]  # fmt: skip
+    node = [("value", evidence), ("next", np.int32), ("label", np.uint16)]
+    return np.dtype(record, align=True), np.dtype(node, align=True)
+
+
+class NumbaHash:
+    """Incremental fusion in compiled code; the same numbers for any number of threads.
+
+    A map reaches 2^20 voxels to either side of its first camera.
+
+    evidence  'float64', or 'float32' for half the memory of the evidence
+    threads   how many to use; all of numba's where not given
+    """
+
+    def __init__(
+        self, voxel_size: float, num_classes: int, evidence: str = "float64", threads: int | None = None
+    ) -> None:
+        check_settings(voxel_size, num_classes)
+        if evidence not in ("float64", "float32"):
+            raise ConfigError(f"evidence = '{evidence}': use float64 or float32")
+        if threads is not None and not 1 <= threads <= nb.config.NUMBA_NUM_THREADS:
+            raise ConfigError(
+                f"threads = {threads}: use 1 to {nb.config.NUMBA_NUM_THREADS}, the threads that numba has"
+            )
+        if not _is_compiled():
+            logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); the result is cached")
+        self.voxel_size = voxel_size
+        self.num_classes = num_classes
+        self.threads = threads
+        self._pixels = Aggregator(voxel_size, num_classes)
+        record, node = record_types(np.dtype(evidence))
+        self._rows = 0
+        self._records = np.zeros(1024, dtype=record)
+        self._nodes = np.zeros(1024, dtype=node)
+        self._nodes_used = 0
+        self._slots = np.zeros((PARTITIONS, 64), dtype=SLOT)
+        self._slots["row"] = -1
+        self._used = np.zeros(PARTITIONS, dtype=np.int64)
+        self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
+        self._sums = np.zeros(2)  # of VSS and of entropy in bits, over the map
+        self._recurrent = 0
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Fuse one frame: pixels to observations, then each partition of the map."""
+        threads = nb.get_num_threads()
+        nb.set_num_threads(self.threads or threads)
+        try:
+            started = time.perf_counter()
+            if frame.scores is not None:
+                check_frame(frame, self.num_classes)
+            seen = self._pixels.observe(frame)
+            observed = time.perf_counter()
+            new, drift = self._add(seen, frame.index)
+            finished = time.perf_counter()
+        finally:
+            nb.set_num_threads(threads)
+        mean = self._sums / self._rows if self._rows else np.full(2, np.nan)
+        return FrameReport(
+            frame=frame.index,
+            points=int(seen.pixels.sum()),
+            voxels=len(seen.key),
+            new_voxels=new,
+            drift_sum=drift,
+            seconds=finished - started,
+            map_voxels=self._rows,
+            map_vss=float(mean[0]),
+            map_entropy=float(mean[1]) / math.log2(self.num_classes),
+            map_recurrent=self._recurrent / self._rows if self._rows else math.nan,
+            association_seconds=observed - started,
+            update_seconds=finished - observed,
+        )
+
+    def _add(self, seen: Observed, frame: int) -> tuple[int, float]:
+        """Add a frame's observations; return the number of new voxels, and the drift caused, bits."""
+        self._make_slots(int((self._used + np.diff(seen.bounds)).max()))
+        row, slot = np.empty_like(seen.key), np.empty_like(seen.key)
+        new = np.zeros(PARTITIONS, dtype=np.int64)
+        _look_up(seen.key, seen.bounds, self._slots, row, slot, new)
+        base = self._rows + np.concatenate([[0], np.cumsum(new)])
+        self._make_records(int(base[-1]))
+        self._make_nodes(np.diff(seen.start[seen.bounds]))
+        sums = np.zeros((PARTITIONS, 3))
+        recurrent = np.zeros(PARTITIONS, dtype=np.int64)
+        _update(
+            seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, self.num_classes,
+            row, slot, base, self._slots, self._records, self._nodes, self._ranges, sums, recurrent,
+        )  # fmt: skip
+        self._rows = int(base[-1])
+        self._used += new
+        self._sums += sums[:, :2].sum(axis=0)
+        self._recurrent += int(recurrent.sum())
+        return int(new.sum()), float(sums[:, 2].sum())
+
+    def table(self) -> VoxelTable:
+        """The map so far."""
+        records = self._records[: self._rows]
+        order = np.argsort(records["key"], kind="stable")
+        evidence = np.zeros((self._rows, self.num_classes))
+        _unchain(self._records, self._nodes, order, evidence)
+        columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
+        values: dict[str, Any] = {name: records[name][order] for name in columns}
+        index = self._pixels.index_of(records["key"][order]) if self._rows else np.zeros((0, 3), dtype=np.int64)
+        return VoxelTable(**index_columns(index), **values, evidence=evidence, voxel_size=self.voxel_size)
+
+    def events(self) -> None:
+        """None: the map keeps sums, not the history."""
+
+    def _make_slots(self, needed: int) -> None:
+        size = self._slots.shape[1]
+        while needed > FULL * size:
+            size *= 2
+        if size > self._slots.shape[1]:
+            slots = np.empty((PARTITIONS, size), dtype=SLOT)
+            _rehash(self._slots, slots)
+            self._slots = slots
+
+    def _make_records(self, needed: int) -> None:
+        if needed > len(self._records):
+            records = np.empty(max(needed, len(self._records) * 3 // 2), dtype=self._records.dtype)
+            records[: self._rows] = self._records[: self._rows]
+            self._records = records
+
+    def _make_nodes(self, entries: Int64) -> None:
+        """Give each partition room for a node an entry; what is left of its last stretch is used first."""
+        ranges = self._ranges
+        spent = ranges[:, 0] == ranges[:, 1]
+        ranges[spent, :2] = ranges[spent, 2:]
+        ranges[spent, 2:] = 0
+        free = (ranges[:, 1] - ranges[:, 0]) + (ranges[:, 3] - ranges[:, 2])
+        for p in np.flatnonzero(free < entries):
+            size = max(256, 2 * int(entries[p]))
+            ranges[p, 2:] = self._nodes_used, self._nodes_used + size
+            self._nodes_used += size
+        if self._nodes_used > len(self._nodes):
+            nodes = np.empty(max(self._nodes_used, len(self._nodes) * 3 // 2), dtype=self._nodes.dtype)
+            nodes[: len(self._nodes)] = self._nodes
+            self._nodes = nodes
+
+
+def _is_compiled() -> bool:
+    """Whether an earlier process left compiled code in numba's cache."""
+    return any(Path(_update._cache.cache_path).glob("numba_hash._update*.nbi"))
+
+
+@parallel
+def _look_up(key, bounds, slots, row, slot, new):
+    """The row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition."""
+    mask = np.uint64(slots.shape[1] - 1)
+    for p in nb.prange(PARTITIONS):
+        n = 0
+        for v in range(bounds[p], bounds[p + 1]):
+            at = np.int64(mix(key[v]) & mask)
+            while slots[p, at].row != -1 and slots[p, at].key != key[v]:
+                at = (at + 1) & np.int64(mask)
+            slot[v] = at
+            if slots[p, at].row == -1:
+                n += 1
+                slots[p, at].key = key[v]
+                slots[p, at].row = -1 - n
+                row[v] = -n
+            else:
+                row[v] = slots[p, at].row
+        new[p] = n
+
+
+@parallel
+def _rehash(old, new):
+    mask = np.uint64(new.shape[1] - 1)
+    for p in nb.prange(PARTITIONS):
+        for at in range(new.shape[1]):
+            new[p, at].row = -1
+        for i in range(old.shape[1]):
+            if old[p, i].row >= 0:
+                at = np.int64(mix(old[p, i].key) & mask)
+                while new[p, at].row != -1:
+                    at = (at + 1) & np.int64(mask)
+                new[p, at].key = old[p, i].key
+                new[p, at].row = old[p, i].row
+
+
+@serial
+def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
+    """Add one observation to a voxel that disagrees with itself, or with the frame.
+
+    s is work space (K,), all 0. Leaves in `out` the change of VSS, that of the entropy in bits, and the drift in bits.
+    """
+    for e in range(first, last):
+        s[label[e]] = weight[e] / pixels
+    before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
+    top_before = top_after = plogp_before = plogp_after = drift = 0.0
+    at = np.int64(-2)  # the record itself
+    while True:
+        lab = record.label if at == -2 else nodes[at].label
+        value = np.float64(record.value) if at == -2 else np.float64(nodes[at].value)
+        p = value * before
+        value += s[lab]
+        s[lab] = 0.0
+        q = value * after
+        if at == -2:
+            record.value = value
+            following = np.int64(record.next)
+        else:
+            nodes[at].value = value
+            following = np.int64(nodes[at].next)
+        top_before, top_after = max(top_before, p), max(top_after, q)
+        plogp_before += plogp(p)
+        plogp_after += plogp(q)
+        drift += js_term(p, q)
+        if following < 0:
+            break
+        at = following
+    for e in range(first, last):
+        share = s[label[e]]
+        if share > 0.0:
+            s[label[e]] = 0.0
+            if ranges[0] == ranges[1]:
+                ranges[0], ranges[1] = ranges[2], ranges[3]
+                ranges[2] = ranges[3]
+            node = ranges[0]
+            ranges[0] += 1
+            nodes[node].label = label[e]
+            nodes[node].value = share
+            nodes[node].next = -1
+            if at == -2:
+                record.next = node
+            else:
+                nodes[at].next = node
+            at = node
+            q = share * after
+            top_after = max(top_after, q)
+            plogp_after += plogp(q)
+            drift += js_term(0.0, q)
+    out[0] = top_after - top_before
+    out[1] = plogp_before - plogp_after
+    out[2] = min(max(drift, 0.0), 1.0) if op > 0 else 0.0
+
+
+@parallel
+def _update(
+    key, pixels, start, label, weight, bounds, frame, K, row, slot, base, slots, records, nodes, ranges, sums,
+    recurrent,
+):  # fmt: skip
+    """Add the frame's observations; sums (PARTITIONS, 3) takes the changes of VSS and entropy, and the drift."""
+    for p in nb.prange(PARTITIONS):
+        s = np.zeros(K)
+        out = np.zeros(3)
+        own = ranges[p]
+        vss = entropy = drift = 0.0
+        reached = 0
+        for v in range(bounds[p], bounds[p + 1]):
+            first, last = start[v], start[v + 1]
+            r = row[v]
+            if r < 0:
+                r = base[p] - r - 1
+                slots[p, slot[v]].row = r
+                new = records[r]
+                new.key = key[v]
+                new.pixels = 0
+                new.drift_sum = 0.0
+                new.self_sum = 0.0
+                new.frame_entropy_sum = 0.0
+                new.value = 0.0
+                new.next = -1
+                new.op = 0
+                new.first_frame = frame
+                new.last_frame = frame
+                new.label = label[first]
+            record = records[r]
+            op = record.op
+            if last - first == 1 and record.next < 0 and record.label == label[first]:
+                record.value += 1.0
+                record.self_sum += 1.0
+                vss += 1.0 if op == 0 else 0.0
+            else:
+                _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
+                vss += out[0]
+                entropy += out[1]
+                drift += out[2]
+                record.drift_sum += out[2]
+                for e in range(first, last):
+                    share = weight[e] / pixels[v]
+                    record.self_sum += share * share
+                    record.frame_entropy_sum -= plogp(share)
+            record.op = op + 1
+            record.pixels += pixels[v]
+            record.first_frame = min(record.first_frame, frame)
+            record.last_frame = max(record.last_frame, frame)
+            reached += 1 if op + 1 == RECURRENT else 0
+        sums[p, 0], sums[p, 1], sums[p, 2] = vss, entropy, drift
+        recurrent[p] = reached
+
+
+@parallel
+def _unchain(records, nodes, order, evidence):
+    """Evidence (n, K) of the records in that order."""
+    for i in nb.prange(order.shape[0]):
+        record = records[order[i]]
+        evidence[i, record.label] = record.value
+        at = np.int64(record.next)
+        while at >= 0:
+            evidence[i, nodes[at].label] = nodes[at].value
+            at = np.int64(nodes[at].next)

@@ -1,0 +1,97 @@
+"""Compiled update of dense voxel columns with a frame's observations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.aggregator import Observed
+from semstab.backends.kernels import PARTITIONS, parallel, serial
+from semstab.results import RECURRENT
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+
+
+def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> Float64:
+    """Add a frame's observations to rows of dense columns, in place.
+
+    columns are evidence (N, K) and the others of VoxelTable (N,), all 0 in rows not seen before. Returns the changes of
+    the sums over the map: of VSS, of entropy in bits, drift in bits, voxels, recurrent voxels.
+    """
+    chunks = np.linspace(0, len(rows), PARTITIONS + 1).astype(np.int64)
+    sums = np.zeros((PARTITIONS, 5))
+    _update_rows(
+        rows, chunks, seen.start, seen.label, seen.weight, seen.pixels, frame, sums, columns["evidence"], columns["op"],
+        columns["drift_sum"], columns["pixels"], columns["first_frame"], columns["last_frame"], columns["self_sum"],
+        columns["frame_entropy_sum"],
+    )  # fmt: skip
+    total: Float64 = sums.sum(axis=0)
+    return total
+
+
+@serial
+def plogp(p):
+    """p log2 p, 0 for 0."""
+    return p * np.log2(p) if p > 0.0 else 0.0
+
+
+@serial
+def js_term(p, q):
+    """One class's part of the Jensen-Shannon divergence, bits."""
+    m = 0.5 * (p + q)
+    term = 0.0
+    if p > 0.0 and m > 0.0:
+        term += p * np.log2(p / m)
+    if q > 0.0 and m > 0.0:
+        term += q * np.log2(q / m)
+    return 0.5 * term
+
+
+@parallel
+def _update_rows(
+    rows, chunks, start, label, weight, seen_pixels, frame, sums, evidence, op, drift_sum, pixels, first_frame,
+    last_frame, self_sum, frame_entropy_sum,
+):  # fmt: skip
+    K = evidence.shape[1]
+    for chunk in nb.prange(PARTITIONS):
+        s = np.zeros(K)
+        vss = entropy = drifted = 0.0
+        new = recurrent = 0
+        for i in range(chunks[chunk], chunks[chunk + 1]):
+            r = rows[i]
+            T = op[r]
+            for e in range(start[i], start[i + 1]):
+                share = weight[e] / seen_pixels[i]
+                s[label[e]] = share
+                self_sum[r] += share * share
+                frame_entropy_sum[r] -= plogp(share)
+            top_before = top_after = drift = 0.0
+            for k in range(K):
+                if evidence[r, k] == 0.0 and s[k] == 0.0:
+                    continue
+                p = evidence[r, k] / max(T, 1)
+                evidence[r, k] += s[k]
+                q = evidence[r, k] / (T + 1)
+                s[k] = 0.0
+                top_before, top_after = max(top_before, p), max(top_after, q)
+                if p != 1.0 or q != 1.0:
+                    entropy += plogp(p) - plogp(q)
+                    drift += js_term(p, q)
+            vss += top_after - top_before
+            if T == 0:
+                new += 1
+                first_frame[r], last_frame[r] = frame, frame
+            else:
+                drift = min(max(drift, 0.0), 1.0)
+                drifted += drift
+                drift_sum[r] += drift
+                first_frame[r], last_frame[r] = min(first_frame[r], frame), max(last_frame[r], frame)
+            op[r] = T + 1
+            pixels[r] += seen_pixels[i]
+            recurrent += 1 if T + 1 == RECURRENT else 0
+        sums[chunk, 0], sums[chunk, 1], sums[chunk, 2] = vss, entropy, drifted
+        sums[chunk, 3], sums[chunk, 4] = new, recurrent
