@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -282,4 +283,6 @@ def _say(text: str) -> None:
 
 def main() -> None:
     """Entry point of the console script."""
+    # Threads that spin while they wait for the next frame take the time of those that decode it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     app()

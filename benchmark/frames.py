@@ -130,6 +130,12 @@ class Frame:
         """(H, W) in pixels."""
         return self.depth.shape[0], self.depth.shape[1]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its images, the mask of valid pixels included."""
+        images = (self.depth, self.labels, self.scores, self.color)
+        return self.depth.size + sum(image.nbytes for image in images if image is not None)
+
     def every(self, stride: int) -> Frame:
         """The frame that keeps every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
         if stride == 1:

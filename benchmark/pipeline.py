@@ -5,12 +5,13 @@ What happens is told to observers; the terminal, the rerun recording and others 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,13 +24,16 @@ from semstab.frames import Frame
 from semstab.manifest import manifest
 from semstab.metrics import compare, flicker_percent, macro_mean, summarise
 from semstab.plan import Plan, Task, make_plan, read, resolve
-from semstab.results import GroupResult, RunResult, Unit, UnitSummary
+from semstab.prefetch import Fetched, prefetch
+from semstab.results import STAGES, GroupResult, RunResult, Unit, UnitSummary
 from semstab.run_folder import FrameRow, RunFolder, group_key
 from semstab.voxels import VoxelTable
 
 
 class Observer:
-    """Watches a run; override what is of interest."""
+    """Watches a run; override what is of interest. Frames have their colour where an observer `wants_color`."""
+
+    wants_color = False
 
     def run_started(self, plan: Plan) -> None:
         """The plan is made, nothing is fused yet."""
@@ -83,16 +87,25 @@ def _run_task(
 ) -> GroupResult:
     if folder is None:
         return _fuse(task, config, None, observers, watch)
-    with watch("digest"):
-        key = group_key(config, task.scene.name, task.backbone, task.digest)
-    kept = folder.kept(task.scene.name, task.backbone, key)
+    kept = _kept(task, config, folder, watch)
     if kept is not None:
         for observer in observers:
             observer.group_kept(task, kept)
         return kept
     result = _fuse(task, config, folder, observers, watch)
-    folder.save_group(task.scene.name, task.backbone, key, result)
+    folder.save_group(task.scene.name, task.backbone, _key(task, config, watch), result)
     return result
+
+
+def _kept(task: Task, config: Config, folder: RunFolder, watch: Stopwatch) -> GroupResult | None:
+    """What an earlier start found. Only then is the input read to compare it; else its digest comes with decoding."""
+    scene, backbone = task.scene.name, task.backbone
+    return folder.kept(scene, backbone, _key(task, config, watch)) if folder.has(scene, backbone) else None
+
+
+def _key(task: Task, config: Config, watch: Stopwatch) -> str:
+    with watch("digest"):
+        return group_key(config, task.scene.name, task.backbone, task.digest)
 
 
 def _fuse(
@@ -100,20 +113,7 @@ def _fuse(
 ) -> GroupResult:
     """One backbone on one scene through every backend: the same frames in the same order, decoded once."""
     maps = _maps(task, config)
-    rows: dict[Unit, list[FrameRow]] = {unit: [] for unit in maps}
-    previous: Frame | None = None
-    for index in task.indices:
-        with watch("read"):
-            frame = read(task, index, config.pixel_stride)
-            flicker = _flicker(previous, frame)
-        for unit, backend in maps.items():
-            with watch(f"fuse {unit.backend}"):
-                row = FrameRow(backend.integrate(frame), frame.timestamp, flicker)
-            rows[unit].append(row)
-            with watch("observe"):
-                for observer in observers:
-                    observer.frame_fused(unit, frame, row)
-        previous = frame
+    rows = _fuse_frames(task, config, maps, observers, watch)
     with watch("measure"):
         classes = task.mapping.target.classes
         tables = {unit: dataclasses.replace(backend.table(), classes=classes) for unit, backend in maps.items()}
@@ -134,6 +134,42 @@ def _fuse(
             for observer in observers:
                 observer.unit_finished(unit, tables[unit], summaries[unit])
     return GroupResult(tuple(summaries.values()), agreement)
+
+
+def _fuse_frames(
+    task: Task, config: Config, maps: Mapping[Unit, FusionBackend], observers: Sequence[Observer], watch: Stopwatch
+) -> dict[Unit, list[FrameRow]]:
+    """Every frame into every map, while worker threads decode the next ones."""
+    rows: dict[Unit, list[FrameRow]] = {unit: [] for unit in maps}
+    previous: Frame | None = None
+    with contextlib.closing(_decoded(task, config, observers)) as frames:
+        for fetched in frames:
+            frame = fetched.item
+            watch.seconds["read"] += fetched.waited
+            with watch("flicker") as flicker_time:
+                flicker = _flicker(previous, frame)
+            for unit, backend in maps.items():
+                with watch(f"fuse {unit.backend}"):
+                    report = backend.integrate(frame)
+                row = FrameRow(report, frame.timestamp, flicker, fetched.seconds, fetched.waited, flicker_time.seconds)
+                with watch("observe") as logging_time:
+                    for observer in observers:
+                        observer.frame_fused(unit, frame, row)
+                rows[unit].append(dataclasses.replace(row, logging_seconds=logging_time.seconds))
+            previous = frame
+    return rows
+
+
+def _decoded(task: Task, config: Config, observers: Sequence[Observer]) -> Generator[Fetched[Frame], None, None]:
+    """The task's frames in order, each with what makes them ready to fuse done in a worker thread."""
+    color = any(observer.wants_color for observer in observers)
+
+    def decode(index: int) -> Frame:
+        frame = read(task, index, config.pixel_stride, color=color)
+        _ = frame.valid  # computed once and kept: here, where it costs the caller no time
+        return frame
+
+    return prefetch(decode, task.indices, threads=config.threads, size=lambda frame: frame.nbytes)
 
 
 def _flicker(previous: Frame | None, frame: Frame) -> float:
@@ -172,7 +208,14 @@ def _summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows: li
         table=summarise(table, config.strata),
         flicker_percent=macro_mean([row.flicker_percent for row in rows]),
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
+        stages_ms=_stages_ms(rows),
     )
+
+
+def _stages_ms(rows: list[FrameRow]) -> dict[str, float]:
+    """Mean milliseconds a frame by stage; NaN where no frame has it."""
+    stages = [row.stage_ms() for row in rows]
+    return {stage: macro_mean([row[stage] for row in stages]) for stage in STAGES}
 
 
 class Stopwatch:
@@ -182,10 +225,19 @@ class Stopwatch:
         self.seconds: defaultdict[str, float] = defaultdict(float)
 
     @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time the block."""
+    def __call__(self, stage: str) -> Iterator[Lap]:
+        """Time the block; the yielded lap has its own seconds once it is over."""
+        lap = Lap()
         started = time.perf_counter()
         try:
-            yield
+            yield lap
         finally:
-            self.seconds[stage] += time.perf_counter() - started
+            lap.seconds = time.perf_counter() - started
+            self.seconds[stage] += lap.seconds
+
+
+@dataclasses.dataclass
+class Lap:
+    """What one timed block took."""
+
+    seconds: float = math.nan

@@ -111,9 +111,9 @@ def _selected(
     return list(dict.fromkeys(wanted)) if wanted is not None else known
 
 
-def read(task: Task, index: int, pixel_stride: int = 1) -> Frame:
-    """A frame of the task with its labels as rows 0..K-1 of the run's label space."""
-    frame = task.scene.frame(index, task.backbone)
+def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) -> Frame:
+    """A frame of the task with its labels as rows 0..K-1 of the run's label space, colour only where it is wanted."""
+    frame = task.scene.frame(index, task.backbone, color=color)
     if frame.labels is not None:
         labels = task.mapping.labels(frame.labels, frame.where("labels"))
         frame = dataclasses.replace(frame, labels=labels)

@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,23 +18,36 @@ from semstab.config import Config, read_yaml
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json, write_json, write_text
 from semstab.metrics import dominant, entropy, sbd, vss
-from semstab.results import FrameReport, GroupResult, RunResult, Unit, slug
+from semstab.results import STAGES, FrameReport, GroupResult, RunResult, Unit, slug
 from semstab.voxels import Events, VoxelTable
 
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
     "map_entropy", "map_recurrent", "fuse_ms",
+    "decode_ms", "wait_ms", "association_ms", "update_ms",
 )  # fmt: skip
 """The time series RUN/frames/*.csv: one row a frame; drift in bits; an undefined number is an empty field."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameRow:
-    """One row of a unit's time series: the backend's report, and what the frame itself tells."""
+    """One row of a unit's time series: the backend's report, what the frame itself tells, and seconds by stage.
+
+    logging_seconds is known once the observers have seen the row.
+    """
 
     report: FrameReport
     timestamp: float | None
     flicker_percent: float
+    decode_seconds: float = math.nan
+    wait_seconds: float = math.nan
+    flicker_seconds: float = math.nan
+    logging_seconds: float = math.nan
+
+    def stage_ms(self) -> dict[str, float]:
+        """Milliseconds of each of `STAGES`; NaN where it is not known."""
+        seconds = dataclasses.asdict(self.report) | dataclasses.asdict(self)
+        return {stage: 1e3 * seconds[f"{stage}_seconds"] for stage in STAGES}
 
     def cells(self) -> dict[str, Any]:
         """The row by column name, an undefined number as None."""
@@ -42,6 +56,7 @@ class FrameRow:
             "flicker_percent": self.flicker_percent,
             "drift": self.report.drift,
             "fuse_ms": self.report.seconds * 1e3,
+            **{f"{stage}_ms": value for stage, value in self.stage_ms().items()},
         }
         return {name: None if row[name] is None or row[name] != row[name] else row[name] for name in FRAME_COLUMNS}
 
@@ -56,6 +71,10 @@ class RunFolder:
         self.path = Path(path)
         self._claim(config)
         write_text(self.path / "config.yaml", config.to_yaml())
+
+    def has(self, scene: str, backbone: str) -> bool:
+        """Whether an earlier start finished the group, on whatever input."""
+        return self._group_path(scene, backbone).exists()
 
     def kept(self, scene: str, backbone: str, key: str) -> GroupResult | None:
         """The group's result from an earlier start of this run, if it was finished on the same input."""

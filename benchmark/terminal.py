@@ -14,7 +14,7 @@ from semstab.frames import Frame
 from semstab.metrics import macro_mean, pool
 from semstab.pipeline import Observer
 from semstab.plan import Plan, Task
-from semstab.results import Agreement, GroupResult, Means, RunResult, Unit, UnitSummary
+from semstab.results import STAGES, Agreement, GroupResult, Means, RunResult, Unit, UnitSummary
 from semstab.run_folder import FrameRow
 
 NOTHING = "-"
@@ -58,6 +58,7 @@ def print_summary(result: RunResult, console: Console) -> None:
     console.print(_strata_table(shown))
     if len({run.unit.backend for run in result.runs}) > 1:
         console.print(_agreement_table(result.agreement))
+    console.print(_stages_line(shown), soft_wrap=True)
     once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
     console.print(
         f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
@@ -143,6 +144,14 @@ def _stratum_cells(row: Means) -> list[str]:
         _number(row.sbd, 4),
         _number(row.entropy, 4),
     ]
+
+
+def _stages_line(runs: Sequence[UnitSummary]) -> str:
+    """Mean milliseconds a frame by stage, of those that are known."""
+    means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
+    means |= {"fusion": macro_mean([run.fuse_ms_per_frame for run in runs])}
+    known = [f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)]
+    return f"ms a frame: {', '.join(known)} (decode: in worker threads, beside the rest)\n"
 
 
 def _agreement_table(agreement: Sequence[Agreement]) -> Table:

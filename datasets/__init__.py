@@ -31,7 +31,7 @@ REGISTRY = Registry(
 
 
 class Scene(Protocol):
-    """One sequence. Opening it reads no image; `frame` decodes one.
+    """One sequence. Opening it reads no image; `frame` decodes one, and may be called from several threads at once.
 
     name          the scene's name, usable in a file name
     backbones     names of the label sources, without the ground truth
@@ -52,8 +52,10 @@ class Scene(Protocol):
         """The classes of that backbone's label maps or scores."""
         ...
 
-    def frame(self, index: int, backbone: str) -> Frame:
+    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
         """Frame 0 <= index < len, with that backbone's labels or scores in its own label space.
+
+        Without `color` a scene may leave colour out, where that saves time.
 
         Raises DataError that names the file.
         """

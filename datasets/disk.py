@@ -11,6 +11,7 @@ from pathlib import Path
 from semstab.errors import DataError
 
 AGAIN = "copy or export it again"
+DIGEST_SIZE = 16
 
 
 def read_bytes(path: Path) -> bytes:
@@ -26,11 +27,16 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
-def digest(path: Path) -> bytes:
-    """A hash of a file's content. Raises DataError where it cannot be read."""
+def digest(data: bytes) -> bytes:
+    """A hash of a file's content."""
+    return hashlib.blake2b(data, digest_size=DIGEST_SIZE).digest()
+
+
+def file_digest(path: Path) -> bytes:
+    """The same of a file that was not read. Raises DataError where it cannot be."""
     try:
         with path.open("rb") as file:
-            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).digest()
+            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=DIGEST_SIZE)).digest()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 

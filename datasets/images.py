@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,15 +26,16 @@ NO_CLASS = IGNORE_16BIT
 
 Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 Size = tuple[int, int]
+Read = Callable[[Path], bytes]
 
 
-def read_depth(path: Path, scale: float | None = None) -> npt.NDArray[np.float32]:
+def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) -> npt.NDArray[np.float32]:
     """Depth (H, W) in metres, float32, as stored: what marks a pixel invalid stays.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
     Raises DataError for another type, more than one channel, integers without a scale, or a damaged file.
     """
-    data = read_bytes(path)
+    data = read(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
         depth, scale = _decode_depth_png(path, data), scale or MILLIMETRES
@@ -52,13 +54,13 @@ def read_depth(path: Path, scale: float | None = None) -> npt.NDArray[np.float32
     return metres
 
 
-def read_labels(path: Path, space: LabelSpace | None = None) -> Labels:
+def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_bytes) -> Labels:
     """Class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
 
     Wider integers are narrowed. Raises DataError for a colour or an id that no class can have, an RGB map without
     `space`, another type, or a damaged file.
     """
-    data = read_bytes(path)
+    data = read(path)
     if path.suffix.lower() != ".png":
         return _narrow(path, decode_array(path, data, "labels"), space)
     png = parse_png(path, data)
@@ -71,13 +73,15 @@ def read_labels(path: Path, space: LabelSpace | None = None) -> Labels:
     return _labels_by_color(path, _opaque(path, png.samples()), space)
 
 
-def read_scores(path: Path, layout: Literal["KHW", "HWK"], size: Size) -> npt.NDArray[np.floating[Any]]:
+def read_scores(
+    path: Path, layout: Literal["KHW", "HWK"], size: Size, read: Read = read_bytes
+) -> npt.NDArray[np.floating[Any]]:
     """Soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is that of the file.
 
     `size` is (H, W) of the depth, to recognise the other layout. Raises DataError where the file has another
     type or layout, or is damaged.
     """
-    scores = decode_array(path, read_bytes(path), "scores")
+    scores = decode_array(path, read(path), "scores")
     if scores.ndim != 3 or scores.dtype.kind != "f":
         raise DataError(
             f"{path}: scores must be float16 or float32 with three axes, got {scores.dtype} of shape {scores.shape}"

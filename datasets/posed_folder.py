@@ -68,6 +68,7 @@ class PosedScene:
         self.backbones = tuple(self._files.sources)
         self.ground_truth = self._files.ground_truth is not None
         up = self.settings.up_axis
+        self._digests: dict[Path, bytes] = {}
         self.up: npt.NDArray[np.float64] | None = np.array(UP_AXES[up], dtype=np.float64) if up else None
 
     def __len__(self) -> int:
@@ -87,8 +88,8 @@ class PosedScene:
             )
         return self._space
 
-    def frame(self, index: int, backbone: str) -> Frame:
-        """Frame 0 <= index < len with that backbone's labels or scores, and colour where there is any.
+    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+        """Frame 0 <= index < len with that backbone's labels or scores, and colour where there is any and it is wanted.
 
         Raises DataError that names the file, ConfigError where there is no such frame or backbone.
         """
@@ -100,15 +101,15 @@ class PosedScene:
             depth=depth,
             intrinsics=self.intrinsics(depth.shape),
             T_wc=self.T_wc(index),
-            labels=read_labels(files["labels"], self._space) if "labels" in files else None,
-            scores=read_scores(files["scores"], layout, depth.shape) if "scores" in files else None,
-            color=read_color(files["color"]) if "color" in files else None,
+            labels=read_labels(files["labels"], self._space, self._read) if "labels" in files else None,
+            scores=read_scores(files["scores"], layout, depth.shape, self._read) if "scores" in files else None,
+            color=read_color(files["color"]) if color and "color" in files else None,
             files={what: str(file) for what, file in files.items()},
         )
 
     def depth(self, index: int) -> npt.NDArray[np.float32]:
         """Depth (H, W) float32 in metres; needs no labels. Raises DataError that names the file."""
-        return read_depth(self._files.depth.files[self._name(index)], self.settings.depth_scale)
+        return read_depth(self._files.depth.files[self._name(index)], self.settings.depth_scale, self._read)
 
     def intrinsics(self, shape: tuple[int, ...]) -> Intrinsics:
         """Intrinsics of the depth image of that shape (H, W), pixels."""
@@ -130,7 +131,10 @@ class PosedScene:
         return T
 
     def digest(self, indices: list[int], backbone: str) -> str:
-        """A hash of the settings, the classes and the files behind those frames; colour does not count."""
+        """A hash of the settings, the classes and the files behind those frames; colour does not count.
+
+        Of the images it is the content that `frame` read, where it did; others are read for it.
+        """
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps(self._effective_settings()).encode())
         paths = [self.folder / "intrinsics.txt"]
@@ -138,8 +142,14 @@ class PosedScene:
             paths += [path for kind, path in self._frame_files(index, backbone).items() if kind != "color"]
         for path in paths:
             digest.update(path.relative_to(self.folder).as_posix().encode() + b"\0")
-            digest.update(disk.digest(path))
+            digest.update(self._digests.get(path) or disk.file_digest(path))
         return digest.hexdigest()
+
+    def _read(self, path: Path) -> bytes:
+        """The content of an image file; its digest is kept, so that `digest` need not read the file again."""
+        data = disk.read_bytes(path)
+        self._digests[path] = disk.digest(data)
+        return data
 
     @cached_property
     def _space(self) -> LabelSpace | None:

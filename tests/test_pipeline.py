@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import cv2
@@ -14,10 +15,11 @@ import yaml
 import semstab
 from semstab import metrics
 from semstab.config import Config
+from semstab.datasets import disk
 from semstab.errors import ConfigError, DataError
 from semstab.pipeline import Observer
 from semstab.plan import load_config
-from semstab.results import RunResult, Unit
+from semstab.results import STAGES, RunResult, Unit
 
 
 @pytest.fixture
@@ -31,7 +33,8 @@ def configure(root, **settings) -> Config:
 
 
 def without_times(summary: dict) -> dict:
-    runs = [{key: value for key, value in run.items() if key != "fuse_ms_per_frame"} for run in summary["runs"]]
+    times = ("fuse_ms_per_frame", "stages_ms")
+    runs = [{key: value for key, value in run.items() if key not in times} for run in summary["runs"]]
     return {**summary, "runs": runs}
 
 
@@ -197,18 +200,19 @@ def test_a_damaged_unit_file_is_named(root, tmp_path) -> None:
 
 
 def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, monkeypatch) -> None:
-    from semstab.backends.open3d_blocks import Open3DBlocks
+    from semstab.backends.numpy_reference import NumpyReference
 
-    update = Open3DBlocks._update
-    monkeypatch.setattr(Open3DBlocks, "_update", lambda self, rows, seen, frame: update(self, rows, seen, frame + 1))
-    monkeypatch.setattr(Open3DBlocks, "num_classes", 3, raising=False)
+    table = NumpyReference.table
+    late = {"first_frame": np.full(60, 7), "last_frame": np.full(60, 8)}
+    monkeypatch.setattr(NumpyReference, "table", lambda self: dataclasses.replace(table(self), **late))
     agreeing = semstab.run(configure(root, backbones=["a"], backends=["open3d"]))
     assert agreeing.agrees  # frame numbers are not compared, evidence is
 
-    def half(self, rows, seen, frame):
-        return update(self, rows, type(seen)(seen.index, seen.s_bar / 2, seen.pixels), frame)
+    def half(self):
+        whole = table(self)
+        return dataclasses.replace(whole, evidence=whole.evidence / 2)
 
-    monkeypatch.setattr(Open3DBlocks, "_update", half)
+    monkeypatch.setattr(NumpyReference, "table", half)
     result = semstab.run(configure(root, backbones=["a"], backends=["open3d"]), out=tmp_path / "run")
     assert not result.agrees
     assert result.agreement[0].differences["evidence"].max > 0.1
@@ -265,3 +269,67 @@ def test_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
     (run,) = semstab.run(configure(root, backbones=["gt"], taxonomy=str(path))).runs
     assert (run.taxonomy, run.table.K) == ("two", 2)
     assert [row.name for row in run.table.classes] == ["wall", "opening"]
+
+
+def test_the_number_of_threads_changes_no_number(root, tmp_path) -> None:
+    """And is no part of what a run folder is compared by: what one thread finished, four keep."""
+    out = tmp_path / "run"
+    one = semstab.run(configure(root, threads=1), out=out)
+    four = semstab.run(configure(root, threads=4), out=tmp_path / "four")
+    assert without_times(one.to_dict()) == without_times(four.to_dict())
+    watching = Watching()
+    semstab.run(configure(root, threads=4), out=out, observers=[watching])
+    assert watching.seen == ["start 2", "kept a", "kept b", "finished"]
+
+
+def test_a_damaged_image_stops_the_run_at_its_frame(root) -> None:
+    (root / "depth/0002.png").write_bytes(b"no image")
+    watching = Watching()
+    with pytest.raises(DataError, match=r"depth/0002\.png: not a PNG image"):
+        semstab.run(configure(root, backbones=["a"], threads=4), observers=[watching])
+    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1"]
+
+
+def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
+    (run,) = semstab.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
+    assert tuple(run.stages_ms) == STAGES
+    assert all(run.stages_ms[stage] >= 0 for stage in ("decode", "wait", "flicker", "logging"))
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["runs"][0]["stages_ms"]["association"] is None  # numpy does not tell its parts apart
+    (kept,) = semstab.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
+    assert kept.stages_ms["decode"] == run.stages_ms["decode"]
+    header, first, *_ = (tmp_path / "run" / "frames" / "wall__a__numpy.csv").read_text().splitlines()
+    row = dict(zip(header.split(","), first.split(","), strict=True))
+    assert float(row["decode_ms"]) > 0
+    assert row["association_ms"] == ""
+
+
+def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
+    (root / "color").mkdir()
+    for i in range(tiny_scene.FRAMES):
+        cv2.imwrite(str(root / f"color/{i:04d}.png"), np.full((6, 8, 3), i, np.uint8))
+    seen = []
+
+    class Painting(Observer):
+        def frame_fused(self, unit, frame, row) -> None:
+            seen.append(frame.color is not None)
+
+    semstab.run(configure(root, backbones=["a"]), observers=[Painting()])
+    Painting.wants_color = True
+    semstab.run(configure(root, backbones=["a"]), observers=[Painting()])
+    assert seen == [False] * 3 + [True] * 3
+
+
+def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
+    """The key of a unit comes from the bytes that were decoded, and equals the one that a later start computes."""
+    read = []
+    monkeypatch.setattr(
+        disk, "file_digest", lambda path, digest=disk.file_digest: (read.append(path.name), digest(path))[1]
+    )
+    config = configure(root, backbones=["a"])
+    semstab.run(config, out=tmp_path / "run")
+    assert not [name for name in read if name.endswith(".png")]
+    watching = Watching()
+    semstab.run(config, out=tmp_path / "run", observers=[watching])
+    assert "kept a" in watching.seen
+    assert len([name for name in read if name.endswith(".png")]) == 2 * tiny_scene.FRAMES

@@ -87,8 +87,8 @@ class CityScene:
         self._model(backbone)
         return uavid8()
 
-    def frame(self, index: int, backbone: str) -> Frame:
-        """Render frame 0 <= index < len with a backbone's labels or scores.
+    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+        """Render frame 0 <= index < len with a backbone's labels or scores; colour comes with it.
 
         Raises DataError for a frame, ConfigError for a backbone that does not exist.
         """
@@ -149,7 +149,9 @@ class CityScene:
     def _pose(self, index: int) -> npt.NDArray[np.float64]:
         if not 0 <= index < len(self):
             raise DataError(f"city/{self.name}: there is no frame {index}; the scene has {len(self)} frames, from 0")
-        return self._flight.pose(self._share(index), self._ground, self._options.altitude)
+        with self._lock:  # the town is built once, by whoever asks first
+            ground = self._ground
+        return self._flight.pose(self._share(index), ground, self._options.altitude)
 
     def _render(self, index: int, T: npt.NDArray[np.float64]) -> Rendered:
         """The rendered frame, kept while there is room.

@@ -1,0 +1,76 @@
+"""Reading ahead: worker threads prepare the items that come next, while the caller works on this one."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+LOOK_AHEAD_BYTES = 1 << 30
+MOST_THREADS = 8
+"""Used where no number is given: more threads than this only hold more frames in memory."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Fetched(Generic[T]):
+    """An item, the wall-clock seconds that its worker took, and those that the caller stood still for it."""
+
+    item: T
+    seconds: float
+    waited: float
+
+
+def default_threads() -> int:
+    """One a core that this process may use, at least 2, at most `MOST_THREADS`."""
+    return min(max(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2), MOST_THREADS)
+
+
+def prefetch(
+    read: Callable[[int], T],
+    indices: Sequence[int],
+    *,
+    threads: int | None = None,
+    size: Callable[[T], int] = lambda item: 0,
+    limit: int = LOOK_AHEAD_BYTES,
+) -> Generator[Fetched[T], None, None]:
+    """Yield read(index) for each index in order; `threads` workers are at most `threads` + 1 items ahead.
+
+    Where that many items, each of `size` bytes, exceed `limit` bytes, fewer are read ahead, but always one.
+    What read raises for an index is raised in its place, after the items before it. Closing the iterator drops what
+    was not begun and waits for what was: no thread outlives it.
+    """
+    threads = threads or default_threads()
+    waiting = iter(indices)
+    ahead: deque[Future[tuple[T, float]]] = deque()
+    room = 2  # until the size of an item is known
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="semstab-read")
+
+    def fill() -> None:
+        while len(ahead) < room and (index := next(waiting, None)) is not None:
+            ahead.append(pool.submit(_timed, read, index))
+
+    try:
+        fill()
+        while ahead:
+            started = time.perf_counter()
+            item, seconds = ahead.popleft().result()
+            waited = time.perf_counter() - started
+            room = max(1, min(threads + 1, limit // max(1, size(item))))
+            fill()
+            fetched = Fetched(item, seconds, waited)
+            del item  # a suspended generator keeps its variables alive
+            yield fetched
+            del fetched
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _timed(read: Callable[[int], T], index: int) -> tuple[T, float]:
+    started = time.perf_counter()
+    return read(index), time.perf_counter() - started

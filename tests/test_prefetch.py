@@ -1,0 +1,127 @@
+"""Reading ahead: in order, errors in their place, a bounded number of items alive, no thread left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import threading
+import time
+import weakref
+
+import pytest
+
+from semstab.errors import DataError
+from semstab.prefetch import prefetch
+
+
+def readers() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("semstab-read")]
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_stays():
+    yield
+    assert readers() == []
+
+
+class Item:
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4, None])
+def test_items_come_in_the_order_of_the_indices(threads) -> None:
+    def read(index: int) -> int:
+        time.sleep(0.002 * (index % 3))  # later ones are often ready first
+        return index * index
+
+    indices = [7, 0, 5, 3, 3, 9, 1, 2]
+    fetched = list(prefetch(read, indices, threads=threads))
+    assert [each.item for each in fetched] == [index * index for index in indices]
+    assert all(each.seconds >= 0 and each.waited >= 0 for each in fetched)
+    assert list(prefetch(read, [], threads=threads)) == []
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+@pytest.mark.parametrize("bad", [0, 3, 9])
+def test_an_error_is_raised_in_its_place(threads, bad) -> None:
+    """After the items before it, although the workers met it earlier; and the first of several."""
+
+    def read(index: int) -> int:
+        time.sleep(0 if index >= bad else 0.005)
+        if index >= bad:
+            raise DataError(f"depth/{index}.png: damaged")
+        return index
+
+    seen = []
+
+    def consume() -> None:
+        for fetched in prefetch(read, range(10), threads=threads):
+            seen.append(fetched.item)
+
+    with pytest.raises(DataError, match=f"^depth/{bad}.png: damaged$"):
+        consume()
+    assert seen == list(range(bad))
+
+
+@pytest.mark.parametrize(("threads", "size", "most"), [(1, 0, 4), (3, 0, 6), (3, 60, 3), (3, 1000, 3), (3, 30, 5)])
+def test_few_items_are_alive_whatever_the_length(threads, size, most) -> None:
+    """Those ahead, bounded in number and bytes (limit 100), the one in hand, and the one before it."""
+    alive: weakref.WeakSet[Item] = weakref.WeakSet()
+    lock = threading.Lock()
+
+    def read(index: int) -> Item:
+        item = Item(index)
+        with lock:
+            alive.add(item)
+        return item
+
+    counts = []
+    before = None
+    for fetched in prefetch(read, range(200), threads=threads, size=lambda item: size, limit=100):
+        time.sleep(0.0005)  # the workers get ahead as far as they may
+        counts.append(len(alive))
+        before = fetched
+    del fetched, before
+    gc.collect()
+    assert max(counts[2:]) <= most
+    assert len(alive) == 0
+
+
+def test_closing_drops_what_was_not_begun() -> None:
+    begun = []
+
+    def read(index: int) -> int:
+        begun.append(index)
+        time.sleep(0.01)
+        return index
+
+    with contextlib.closing(prefetch(read, range(1000), threads=2)) as items:
+        assert next(items).item == 0
+    assert readers() == []
+    assert len(begun) <= 4
+
+
+def test_an_interruption_ends_the_workers() -> None:
+    def work() -> None:
+        with contextlib.closing(prefetch(lambda index: index, range(1000), threads=3)) as items:
+            for fetched in items:
+                if fetched.item == 5:
+                    raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert readers() == []
+
+
+def test_workers_run_while_the_caller_works() -> None:
+    """Waiting (sleeping) workers and caller overlap: 10 x (20 + 20) ms of work in clearly less."""
+
+    def read(index: int) -> int:
+        time.sleep(0.02)
+        return index
+
+    started = time.perf_counter()
+    for _ in prefetch(read, range(10), threads=2):
+        time.sleep(0.02)
+    assert time.perf_counter() - started < 0.36
