@@ -147,11 +147,11 @@ def _stratum_cells(row: Means) -> list[str]:
 
 
 def _stages_line(runs: Sequence[UnitSummary]) -> str:
-    """Mean milliseconds a frame by stage, of those that are known."""
+    """Mean milliseconds a frame by stage, of those that are known; decoding goes on beside them in worker threads."""
     means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
-    means |= {"fusion": macro_mean([run.fuse_ms_per_frame for run in runs])}
+    decode = means.pop("decode")
     known = [f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)]
-    return f"ms a frame: {', '.join(known)} (decode: in worker threads, beside the rest)\n"
+    return f"ms a frame: {', '.join(known)}; beside them decode {_number(decode, 1)}\n"
 
 
 def _agreement_table(agreement: Sequence[Agreement]) -> Table:
