@@ -17,3 +17,8 @@ class DataError(SemstabError, ValueError):
 
 class MissingDependencyError(SemstabError, ImportError):
     """An optional package that is not installed; the message holds the command that installs it."""
+
+
+def one_line(error: Exception) -> str:
+    """What another library's error says, without its line breaks; its type where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError, DataError, one_line
 
 
 @contextmanager
@@ -68,9 +68,7 @@ def parse_yaml(text: str, where: str) -> Any:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
-        raise ConfigError(
-            f"{where}: not valid YAML ({' '.join(str(error).split()) or type(error).__name__})"
-        ) from error
+        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
 
 
 def _defined(value: Any) -> Any:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from semstab.errors import ConfigError, MissingDependencyError
+from semstab.errors import ConfigError, MissingDependencyError, one_line
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,7 @@ class Registry:
             return getattr(importlib.import_module(module), attribute)
         except (ImportError, OSError, AttributeError) as error:  # OSError: a shared library is missing
             hint = entry.install or "install what it needs"
-            reason = " ".join(str(error).split())
-            raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({reason}); {hint}") from error
+            raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({one_line(error)}); {hint}") from error
 
 
 def _plugin(point: EntryPoint) -> Entry:

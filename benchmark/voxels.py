@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import DataError
+from semstab.errors import DataError, one_line
 from semstab.files import atomic_path
 from semstab.information import entropy_bits, js_divergence, normalise
 
@@ -269,7 +269,7 @@ def _reading(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a semstab table ({' '.join(str(error).split())})") from error
+        raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
 
 
 def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.disk import AGAIN, one_line
-from semstab.errors import DataError
+from semstab.datasets.disk import AGAIN
+from semstab.errors import DataError, one_line
 
 MAX_PIXELS = 2**28
 

@@ -73,8 +73,3 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
         return []
     except OSError as error:
         raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
-
-
-def one_line(error: Exception) -> str:
-    """What another library's error says, without its line breaks."""
-    return " ".join(str(error).split()) or type(error).__name__

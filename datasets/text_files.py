@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.disk import one_line, read_bytes
-from semstab.errors import DataError
+from semstab.datasets.disk import read_bytes
+from semstab.errors import DataError, one_line
 from semstab.frames import Intrinsics
 
 MAX_TEXT_BYTES = 2**16
