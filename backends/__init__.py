@@ -81,5 +81,14 @@ def takes_option(name: str, option: str) -> bool:
     return option in _options(REGISTRY.load(name))
 
 
+def expected_bytes(name: str, voxels: int, observations: int, num_classes: int) -> int:
+    """Bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
+
+    A backend says it with a static method of that name and the last three parameters.
+    """
+    says = getattr(REGISTRY.load(name), "expected_bytes", None)
+    return int(says(voxels, observations, num_classes)) if says else 0
+
+
 def _options(cls: Any) -> list[str]:
     return [name for name in inspect.signature(cls).parameters if name not in ("voxel_size", "num_classes")]

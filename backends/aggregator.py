@@ -27,6 +27,8 @@ from semstab.labels import IGNORE_8BIT
 
 BANDS = 64
 MIN_BAND_ROWS = 8
+FIRST_ROOM = 1 << 13
+"""Entries that a band has room for at first: a sixteenth of its pixels in an image of 3840x2160."""
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -52,6 +54,26 @@ class Observed:
     bounds: Int64
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The entries (distinct pairs of voxel and label) of each band of `rows` rows; a band has `room` for them.
+
+    key, label, count  (bands * room,) packed voxel, class and pixels of each
+    where              (H * W,) entry of each pixel within its band, where the evidence is soft
+    entries            (bands,) how many there are
+    spread             (bands, PARTITIONS) of them by partition
+    """
+
+    rows: int
+    room: int
+    key: Int64
+    label: npt.NDArray[np.uint16]
+    count: npt.NDArray[np.int32]
+    where: npt.NDArray[np.int32]
+    entries: Int64
+    spread: Int64
+
+
 class Aggregator:
     """Turns frames into observations; keeps its work space from frame to frame."""
 
@@ -59,6 +81,7 @@ class Aggregator:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.origin: Int64 | None = None
+        self._band_room = FIRST_ROOM
         self._space: dict[str, npt.NDArray[Any]] = {}
 
     def observe(self, frame: Frame) -> Observed:
@@ -66,53 +89,61 @@ class Aggregator:
 
         Raises DataError for a label outside the classes, or a voxel out of reach of the packed keys.
         """
+        origin = self._origin_at(frame) if self.origin is None else self.origin
+        found = self._found(frame, origin)
+        self.origin = origin
+        return self._merged(frame, found)
+
+    def _found(self, frame: Frame, origin: Int64) -> _Found:
+        """The entries of each band of rows, with more room for them where the first attempt had too little."""
         H, W = frame.shape
         rows = max(MIN_BAND_ROWS, -(-H // BANDS))
         bands = -(-H // rows)
-        origin = self._origin_at(frame) if self.origin is None else self.origin
         soft = frame.scores is not None
         camera = frame.intrinsics
         ray_x = (np.arange(W) - camera.cx) / camera.fx
         ray_y = (np.arange(H) - camera.cy) / camera.fy
         labels = np.where(frame.valid, np.uint8(0), np.uint8(IGNORE_8BIT)) if soft else frame.labels
-        key, label = self._room("key", H * W, np.int64), self._room("label", H * W, np.uint16)
-        count, where = self._room("count", H * W, np.int32), self._room("where", H * W if soft else 1, np.int32)
+        where = self._room("where", H * W if soft else 1, np.int32)
         threads = nb.get_num_threads()
         row_keys = self._room("row_keys", threads * 2 * W, np.int64).reshape(threads, 2, W)
         row_changes = self._room("row_changes", threads * W, np.uint8).reshape(threads, W)
         row_runs = self._room("row_runs", threads * 4 * (W + 1), np.int32).reshape(threads, 4, W + 1)
-        slots = self._room("slots", threads * _slots_for(rows * W), np.int32).reshape(threads, -1)
-        entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
-        highest = np.full(bands, -1, dtype=np.int64)
-        spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
-        find_entries(
-            _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin,
-            IGNORE_8BIT if soft else frame.ignore_id, soft, rows, row_keys, row_changes, row_runs, slots, key, label,
-            count, where, entries, lost, highest, spread,
-        )  # fmt: skip
-        if highest.max() >= self.num_classes:
-            check_frame(frame, self.num_classes)
-        if lost.any():
-            self._refuse(frame, origin)
-        self.origin = origin
-        return self._merged(frame, rows, key, label, count, where, entries, spread)
+        while True:
+            room = min(self._band_room, rows * W)
+            key, label = self._room("key", bands * room, np.int64), self._room("label", bands * room, np.uint16)
+            count = self._room("count", bands * room, np.int32)
+            slots = self._room("slots", threads * _slots_for(room), np.int32).reshape(threads, -1)
+            entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
+            highest = np.full(bands, -1, dtype=np.int64)
+            spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
+            find_entries(
+                _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin,
+                IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes, row_runs, slots,
+                key, label, count, where, entries, lost, highest, spread,
+            )  # fmt: skip
+            if highest.max() >= self.num_classes:
+                check_frame(frame, self.num_classes)
+            if lost.any():
+                self._refuse(frame, origin)
+            if entries.min() >= 0:
+                return _Found(rows, room, key, label, count, where, entries, spread)
+            self._band_room *= 4
 
-    def _merged(
-        self, frame: Frame, rows: int, key: Any, label: Any, count: Any, where: Any, entries: Int64, spread: Int64
-    ) -> Observed:
-        W, K = frame.shape[1], self.num_classes
-        total = int(entries.sum())
-        offset = np.zeros((PARTITIONS, len(entries)), dtype=np.int64)
-        offset.reshape(-1)[1:] = np.cumsum(spread.T.reshape(-1))[:-1]
+    def _merged(self, frame: Frame, at: _Found) -> Observed:
+        K = self.num_classes
+        total = int(at.entries.sum())
+        offset = np.zeros((PARTITIONS, len(at.entries)), dtype=np.int64)
+        offset.reshape(-1)[1:] = np.cumsum(at.spread.T.reshape(-1))[:-1]
         edges = np.append(offset[:, 0], total)
         order = self._room("order", total, np.int64)
-        scatter(key, rows * W, entries, offset, order)
+        scatter(at.key, at.room, at.entries, offset, order)
         voxel = self._room("voxel", total, np.int64)
         merged_key = self._room("merged_key", total, np.int64)
         merged_pixels = self._room("merged_pixels", total, np.int64)
         merged_size = self._room("merged_size", total, np.int64)
         found = np.zeros(PARTITIONS, dtype=np.int64)
-        group(key, count, order, edges, voxel, merged_key, merged_pixels, merged_size, found)
+        group(at.key, at.count, order, edges, voxel, merged_key, merged_pixels, merged_size, found)
         bounds = np.concatenate([[0], np.cumsum(found)])
         n = int(bounds[-1])
         keys, pixels = self._room("keys", n, np.int64), self._room("pixels", n, np.int64)
@@ -120,34 +151,22 @@ class Aggregator:
             out_label = self._room("out_label", total, np.uint16)
             out_weight = self._room("out_weight", total, np.float64)
             kept = np.zeros(PARTITIONS, dtype=np.int64)
-            sort_labels(label, count, order, edges, voxel, merged_size, found, out_label, out_weight, kept)
+            sort_labels(at.label, at.count, order, edges, voxel, merged_size, found, out_label, out_weight, kept)
             entry_bounds = np.concatenate([[0], np.cumsum(kept)])
             m = int(entry_bounds[-1])
             start = self._room("start", n + 1, np.int64)
             labels, weight = self._room("labels", m, np.uint16), self._room("weight", m, np.float64)
             compact(
-                edges,
-                bounds,
-                entry_bounds,
-                merged_key,
-                merged_pixels,
-                merged_size,
-                out_label,
-                out_weight,
-                keys,
-                pixels,
-                start,
-                labels,
-                weight,
-            )
+                edges, bounds, entry_bounds, merged_key, merged_pixels, merged_size, out_label, out_weight,
+                keys, pixels, start, labels, weight,
+            )  # fmt: skip
             return Observed(keys, pixels, start, labels, weight, bounds)
-        base = np.concatenate([[0], np.cumsum(entries)])
+        base = np.concatenate([[0], np.cumsum(at.entries)])
         sums = np.zeros((total, K))
-        sum_scores(_fixed(_widened(frame.scores)), where[: frame.depth.size].reshape(frame.shape), rows, base, sums)
+        where = at.where[: frame.depth.size].reshape(frame.shape)
+        sum_scores(_fixed(_widened(frame.scores)), where, at.rows, base, sums)
         weights = np.zeros((n, K))
-        merge_scores(
-            order, edges, voxel, bounds, rows * W, base, sums, merged_key, merged_pixels, keys, pixels, weights
-        )
+        merge_scores(order, edges, voxel, bounds, at.room, base, sums, merged_key, merged_pixels, keys, pixels, weights)
         start = np.arange(n + 1, dtype=np.int64) * K
         return Observed(keys, pixels, start, np.tile(np.arange(K, dtype=np.uint16), n), weights.reshape(-1), bounds)
 

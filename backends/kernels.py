@@ -91,12 +91,13 @@ def _runs(keys, labels, soft, changes, starts):
 
 @parallel
 def find_entries(
-    depth, labels, ray_x, ray_y, T, size, origin, ignore, soft, rows, row_keys, row_changes, row_runs, slots, key,
-    label, count, where, entries, lost, highest, spread,
+    depth, labels, ray_x, ray_y, T, size, origin, ignore, soft, rows, room, row_keys, row_changes, row_runs, slots,
+    key, label, count, where, entries, lost, highest, spread,
 ):  # fmt: skip
     """Distinct (voxel, label) pairs of each band with their pixel counts, in order of appearance.
 
-    A run's entry is looked for among those of the row above before it is looked up in the table.
+    Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone. A run's entry
+    is looked for among those of the row above before it is looked up in the table.
     """
     H, W = depth.shape
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
@@ -107,11 +108,14 @@ def find_entries(
         starts, above = row_runs[thread, 0], row_runs[thread, 1]
         found, found_above = row_runs[thread, 2], row_runs[thread, 3]
         runs_above = 0
-        first = band * rows * W
+        first = band * room
         mask = 1023
         slot[: mask + 1] = -1
         n = 0
+        full = False
         for v in range(band * rows, min(H, (band + 1) * rows)):
+            if full:
+                break
             lost[band] += _row_keys(depth[v], labels[v], ray_x, ray_y[v], T, size, ox, oy, oz, ignore, keys)
             runs = _runs(keys, labels[v], soft, changes, starts)
             j = 0
@@ -135,6 +139,9 @@ def find_entries(
                         while slot[at] >= 0 and not (key[first + slot[at]] == k and label[first + slot[at]] == lab):
                             at = (at + 1) & mask
                         e = np.int64(slot[at])
+                    if e < 0 and n == room:
+                        full = True
+                        break
                     if e < 0:
                         e = n
                         slot[at] = e
@@ -154,7 +161,7 @@ def find_entries(
             starts, above = above, starts
             found, found_above = found_above, found
             runs_above = runs
-        entries[band] = n
+        entries[band] = -1 if full else n
         for e in range(n):
             spread[band, partition_of(key[first + e])] += 1
 

@@ -11,7 +11,7 @@ import logging
 import math
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numba as nb
 import numpy as np
@@ -22,7 +22,7 @@ from semstab.backends.association import check_frame, check_settings
 from semstab.backends.kernels import PARTITIONS, mix, parallel, serial
 from semstab.backends.updates import js_term, plogp
 from semstab.errors import ConfigError
-from semstab.frames import Frame
+from semstab.frames import Frame, Intrinsics
 from semstab.results import RECURRENT, FrameReport
 from semstab.voxels import VoxelTable, index_columns
 
@@ -53,6 +53,8 @@ class NumbaHash:
     threads   how many to use; all of numba's where not given
     """
 
+    _loaded: ClassVar[bool] = False
+
     def __init__(
         self, voxel_size: float, num_classes: int, evidence: str = "float64", threads: int | None = None
     ) -> None:
@@ -80,6 +82,12 @@ class NumbaHash:
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
         self._sums = np.zeros(2)  # of VSS and of entropy in bits, over the map
         self._recurrent = 0
+        _load_compiled()
+
+    @staticmethod
+    def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
+        """A record, its share of the hash and of the nodes a voxel, and room to grow."""
+        return 200 * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""
@@ -118,7 +126,7 @@ class NumbaHash:
         new = np.zeros(PARTITIONS, dtype=np.int64)
         _look_up(seen.key, seen.bounds, self._slots, row, slot, new)
         base = self._rows + np.concatenate([[0], np.cumsum(new)])
-        self._make_records(int(base[-1]))
+        _grow(self._records, int(base[-1]))
         self._make_nodes(np.diff(seen.start[seen.bounds]))
         sums = np.zeros((PARTITIONS, 3))
         recurrent = np.zeros(PARTITIONS, dtype=np.int64)
@@ -155,12 +163,6 @@ class NumbaHash:
             _rehash(self._slots, slots)
             self._slots = slots
 
-    def _make_records(self, needed: int) -> None:
-        if needed > len(self._records):
-            records = np.empty(max(needed, len(self._records) * 3 // 2), dtype=self._records.dtype)
-            records[: self._rows] = self._records[: self._rows]
-            self._records = records
-
     def _make_nodes(self, entries: Int64) -> None:
         """Give each partition room for a node an entry; what is left of its last stretch is used first."""
         ranges = self._ranges
@@ -172,10 +174,26 @@ class NumbaHash:
             size = max(256, 2 * int(entries[p]))
             ranges[p, 2:] = self._nodes_used, self._nodes_used + size
             self._nodes_used += size
-        if self._nodes_used > len(self._nodes):
-            nodes = np.empty(max(self._nodes_used, len(self._nodes) * 3 // 2), dtype=self._nodes.dtype)
-            nodes[: len(self._nodes)] = self._nodes
-            self._nodes = nodes
+        _grow(self._nodes, self._nodes_used)
+
+
+def _grow(rows: npt.NDArray[Any], needed: int) -> None:
+    """Make room for that many rows: by quarters, and in place, since the system moves large arrays without copying."""
+    if needed > len(rows):
+        rows.resize(max(needed, len(rows) + len(rows) // 4), refcheck=False)
+
+
+def _load_compiled() -> None:
+    """Load what fusing labels needs from numba's cache, or compile it, once a process: no frame waits for it then."""
+    if NumbaHash._loaded:
+        return
+    NumbaHash._loaded = True
+    scratch = NumbaHash(voxel_size=1.0, num_classes=2)
+    labels = np.arange(64, dtype=np.uint8).reshape(8, 8) % 2
+    depth = np.ones((8, 8), dtype=np.float32)
+    scratch.integrate(Frame(index=0, depth=depth, labels=labels, intrinsics=Intrinsics(8, 8, 4, 4), T_wc=np.eye(4)))
+    scratch._make_slots(64)
+    scratch.table()
 
 
 def _is_compiled() -> bool:

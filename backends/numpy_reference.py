@@ -37,6 +37,11 @@ class NumpyReference:
         self._op = np.zeros(0, dtype=np.int64)
         self._means = MapMeans()
 
+    @staticmethod
+    def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
+        """A dictionary's entry and the evidence a voxel; an observation is in the history, and sorted for a table."""
+        return voxels * (300 + 16 * num_classes) + 4 * observations * (8 * num_classes + 24)
+
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""
         started = time.perf_counter()

@@ -65,6 +65,11 @@ class Open3DBlocks:
         voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self._attributes.values())
         self.grid = self._new_grid(max(64, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
+    @staticmethod
+    def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
+        """The attributes of a voxel; of a block about a quarter is seen, and the grid doubles as it grows."""
+        return 10 * voxels * (8 * num_classes + 48)
+
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
         started = time.perf_counter()

@@ -101,7 +101,9 @@ class Frame:
     def valid(self) -> npt.NDArray[np.bool_]:
         """(H, W): depth is valid, and the label is not ignored or the scores are finite and sum to more than 0."""
         usable = self.labels != self.ignore_id if self.labels is not None else _usable_scores(self.scores)
-        valid: npt.NDArray[np.bool_] = np.isfinite(self.depth) & (self.depth > 0) & usable
+        valid: npt.NDArray[np.bool_] = self.depth > 0
+        valid &= self.depth < np.inf
+        valid &= usable
         valid.setflags(write=False)
         return valid
 

@@ -22,6 +22,7 @@ from semstab.config import Config
 from semstab.errors import DataError
 from semstab.frames import Frame
 from semstab.manifest import manifest
+from semstab.memory import require_memory
 from semstab.metrics import compare, flicker_percent, macro_mean, summarise
 from semstab.plan import Plan, Task, make_plan, read, resolve
 from semstab.prefetch import Fetched, prefetch
@@ -145,6 +146,8 @@ def _fuse_frames(
     with contextlib.closing(_decoded(task, config, observers)) as frames:
         for fetched in frames:
             frame = fetched.item
+            if previous is None:
+                require_memory(task, config, frame)
             watch.seconds["read"] += fetched.waited
             with watch("flicker") as flicker_time:
                 flicker = _flicker(previous, frame)

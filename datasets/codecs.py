@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.disk import AGAIN
+from semstab.datasets.png_grey import decode as decode_one_channel
 from semstab.errors import DataError, one_line
 
 MAX_PIXELS = 2**28
@@ -52,11 +53,15 @@ class Png:
 
     def samples(self) -> npt.NDArray[Any]:
         """Samples (H, W) or, in RGB order, (H, W, channels), uint8 or uint16; palettes expanded."""
+        if self.kind == "grey" and (quick := self._quickly()) is not None:
+            return quick
         image = _imdecode(self.path, self._encoded(), "IMREAD_UNCHANGED")
         return image if image.ndim == 2 else image[..., [2, 1, 0, 3][: image.shape[2]]]
 
     def indices(self) -> npt.NDArray[Any]:
         """The stored sample (H, W) of each pixel of a grey or palette image: of palettes the index, not the colour."""
+        if (quick := self._quickly()) is not None:
+            return quick
         image = _imdecode(self.path, self._encoded(as_grey=True), "IMREAD_UNCHANGED")
         if self.bits < 8:  # the decoder stretches 1, 2 and 4 bits to 0..255
             image = image // np.uint8(255 // (2**self.bits - 1))
@@ -65,6 +70,13 @@ class Png:
     def rgb(self) -> npt.NDArray[np.uint8]:
         """Colour (H, W, 3) uint8 of an image of any kind."""
         return np.ascontiguousarray(_imdecode(self.path, self._encoded(), "IMREAD_COLOR")[..., ::-1])
+
+    def _quickly(self) -> npt.NDArray[Any] | None:
+        """The stored samples of a one-channel image of the common kind; None where only the other decoder knows."""
+        width, height, bits, _, compression, filters, interlace = self.header
+        if bits < 8 or compression or filters or interlace:
+            return None
+        return decode_one_channel(width, height, bits, (body for kind, body in self.chunks if kind == b"IDAT"))
 
     def _encoded(self, as_grey: bool = False) -> bytes:
         """A PNG of these chunks; a palette image declared grey decodes to its indices."""

@@ -63,9 +63,9 @@ def main() -> None:
 
 def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", nargs="+", default=["open3d"])
+    parser.add_argument("--backend", nargs="+", default=["numba"])
     parser.add_argument("--size", default="3840x2160")
-    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 10.0], help="of the depth, mm")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2, help="cores for both sides, and decoding threads")

@@ -1,0 +1,102 @@
+"""The estimate of memory: what the maps then hold, cheap where there is no doubt, one line where it is too much."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tiny_scene
+
+import semstab
+from semstab import memory
+from semstab.backends import create, expected_bytes
+from semstab.config import Config
+from semstab.errors import ConfigError
+from semstab.frames import Frame, Intrinsics
+from semstab.memory import available_bytes, estimate, require_memory
+from semstab.plan import Task, load_config, make_plan, read
+
+FRAMES = 30
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=FRAMES)
+
+
+def planned(root, **settings) -> tuple[Task, Config]:
+    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
+    config = load_config(overrides={"dataset": dataset, "voxel_size": 0.25, **settings})
+    return make_plan(config).tasks[0], config
+
+
+def test_the_estimate_is_exact_for_a_steady_flight(root) -> None:
+    task, config = planned(root)
+    table = semstab.run(config).runs[0].table
+    expected = estimate(task, config)
+    assert expected.voxels == table.voxels
+    assert expected.observations == table.observations
+
+
+def test_a_single_frame_has_an_estimate(root) -> None:
+    task, config = planned(root, frames={"count": 1})
+    assert estimate(task, config).voxels == tiny_scene.WIDTH * tiny_scene.HEIGHT
+
+
+def test_what_does_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) -> None:
+    _, config = planned(root, memory_gb=1e-6)
+    said = r"wall, a: about .* million voxels of 0.25 m would take .* GB, and 1e-06 GB is memory_gb; use larger voxels"
+    with pytest.raises(ConfigError, match=said + r".*pixel_stride.*\(numpy\)"):
+        semstab.run(config, out=tmp_path / "run")
+    assert not (tmp_path / "run" / "voxels").exists()
+
+
+def test_the_limit_is_what_is_free_where_none_is_set(root, monkeypatch) -> None:
+    task, config = planned(root)
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
+    with pytest.raises(ConfigError, match="1e-06 GB are free"):
+        require_memory(task, config, read(task, 0))
+
+
+def test_no_further_frame_is_read_where_one_voxel_a_pixel_would_fit(root, monkeypatch) -> None:
+    task, config = planned(root)
+    first = read(task, 0)
+    monkeypatch.setattr(memory, "read", lambda *_: pytest.fail("a frame was read"))
+    require_memory(task, config, first)
+
+
+def test_the_limit_changes_no_number_and_is_not_kept(root) -> None:
+    _, config = planned(root, memory_gb=8)
+    assert "memory_gb" not in config.to_yaml()
+
+
+def test_free_memory_is_some() -> None:
+    assert 1e8 < available_bytes() < 1e15
+
+
+def test_maps_take_what_their_backend_expects() -> None:
+    """Within a factor of three, over a floor with a class a column."""
+    maps = {name: create(name, voxel_size=0.1, num_classes=7) for name in ("numba", "open3d")}
+    side = 300
+    frame = Frame(
+        index=0,
+        depth=np.full((side, side), 30.0),
+        labels=(np.indices((side, side))[1] % 7).astype(np.uint8),
+        intrinsics=Intrinsics(300, 300, 150, 150),
+        T_wc=np.eye(4),
+    )
+    for backend in maps.values():
+        voxels = backend.integrate(frame).voxels
+    assert voxels > 50_000
+    hashed = maps["numba"]
+    held = hashed._records.nbytes + hashed._slots.nbytes + hashed._nodes.nbytes
+    assert held / 3 < expected_bytes("numba", voxels, voxels, 7) < 3 * held
+    grid, attributes = maps["open3d"].grid, maps["open3d"]._attributes
+    held = sum(grid.attribute(name).numpy().nbytes for name in attributes)
+    assert held / 3 < expected_bytes("open3d", voxels, voxels, 7) < 3 * held
+
+
+def test_a_backend_that_does_not_say_counts_as_nothing(monkeypatch) -> None:
+    from semstab.backends import REGISTRY
+
+    monkeypatch.setattr(REGISTRY, "load", lambda name: object)
+    assert expected_bytes("theirs", 10, 10, 3) == 0
