@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,7 +25,7 @@ from semstab.backends.updates import js_term, plogp
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.results import RECURRENT, FrameReport
-from semstab.voxels import VoxelTable, index_columns
+from semstab.voxels import Events, VoxelTable, index_columns
 
 Int64 = npt.NDArray[np.int64]
 
@@ -44,6 +45,29 @@ def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
     return np.dtype(record, align=True), np.dtype(node, align=True)
 
 
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A frame's observations, kept: as `Observed`, with the number of entries of each voxel."""
+
+    frame: int
+    key: Int64
+    pixels: Int64
+    entries: Int64
+    label: npt.NDArray[np.uint16]
+    weight: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, seen: Observed, frame: int) -> _Seen:
+        """A copy of the observations that outlives the next frame."""
+        some = seen.weight > 0
+        entries = np.add.reduceat(some, seen.start[:-1], dtype=np.int64) if len(seen.key) else seen.key
+        return cls(frame, seen.key.copy(), seen.pixels.copy(), entries, seen.label[some], seen.weight[some])
+
+
+def _joined(parts: list[npt.NDArray[Any]], dtype: Any) -> npt.NDArray[Any]:
+    return np.concatenate([np.zeros(0, dtype=dtype), *parts])
+
+
 class NumbaHash:
     """Incremental fusion in compiled code; the same numbers for any number of threads.
 
@@ -51,12 +75,18 @@ class NumbaHash:
 
     evidence  'float64', or 'float32' for half the memory of the evidence
     threads   how many to use; all of numba's where not given
+    history   keep every observation, for `events`; memory then grows with each
     """
 
     _loaded: ClassVar[bool] = False
 
     def __init__(
-        self, voxel_size: float, num_classes: int, evidence: str = "float64", threads: int | None = None
+        self,
+        voxel_size: float,
+        num_classes: int,
+        evidence: str = "float64",
+        threads: int | None = None,
+        history: bool = False,
     ) -> None:
         check_settings(voxel_size, num_classes)
         if evidence not in ("float64", "float32"):
@@ -71,6 +101,7 @@ class NumbaHash:
         self.num_classes = num_classes
         self.threads = threads
         self._pixels = Aggregator(voxel_size, num_classes)
+        self._history: list[_Seen] | None = [] if history else None
         record, node = record_types(np.dtype(evidence))
         self._rows = 0
         self._records = np.zeros(1024, dtype=record)
@@ -100,6 +131,8 @@ class NumbaHash:
             seen = self._pixels.observe(frame)
             observed = time.perf_counter()
             new, drift = self._add(seen, frame.index)
+            if self._history is not None:
+                self._history.append(_Seen.of(seen, frame.index))
             finished = time.perf_counter()
         finally:
             nb.set_num_threads(threads)
@@ -151,8 +184,29 @@ class NumbaHash:
         index = self._pixels.index_of(records["key"][order]) if self._rows else np.zeros((0, 3), dtype=np.int64)
         return VoxelTable(**index_columns(index), **values, evidence=evidence, voxel_size=self.voxel_size)
 
-    def events(self) -> None:
-        """None: the map keeps sums, not the history."""
+    def events(self) -> Events | None:
+        """Every observation in order of integration within a voxel, where `history` is kept; else None."""
+        if self._history is None:
+            return None
+        seen = self._history
+        keys = _joined([frame.key for frame in seen], np.int64)
+        distinct, voxel = np.unique(keys, return_inverse=True)  # packed keys sort like (ix, iy, iz)
+        by_voxel = np.argsort(voxel, kind="stable")
+        pixels = _joined([frame.pixels for frame in seen], np.int64)
+        evidence = np.zeros((len(keys), self.num_classes))
+        row = np.repeat(np.arange(len(keys)), _joined([frame.entries for frame in seen], np.int64))
+        evidence[row, _joined([frame.label for frame in seen], np.uint16)] = (
+            _joined([frame.weight for frame in seen], np.float64) / pixels[row]
+        )
+        index = self._pixels.index_of(distinct) if len(distinct) else np.zeros((0, 3), dtype=np.int64)
+        return Events(
+            **index_columns(index),
+            voxel=voxel[by_voxel],
+            frame=np.repeat([frame.frame for frame in seen], [len(frame.key) for frame in seen])[by_voxel],
+            evidence=evidence[by_voxel],
+            pixels=pixels[by_voxel],
+            voxel_size=self.voxel_size,
+        )
 
     def _make_slots(self, needed: int) -> None:
         size = self._slots.shape[1]

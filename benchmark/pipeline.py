@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.backends import FusionBackend, create
-from semstab.config import Config
+from semstab.backends import FusionBackend, create, takes_option
+from semstab.config import BackendConfig, Config
 from semstab.errors import DataError
 from semstab.frames import Frame
 from semstab.manifest import manifest
@@ -183,12 +183,15 @@ def _flicker(previous: Frame | None, frame: Frame) -> float:
 
 
 def _maps(task: Task, config: Config) -> dict[Unit, FusionBackend]:
-    K = len(task.mapping.target)
-    created = (
-        create(backend.name, voxel_size=config.voxel_size, num_classes=K, **backend.options)
-        for backend in config.fused_by()
-    )
+    created = (new_map(backend, task, config) for backend in config.fused_by())
     return dict(zip(task.units, created, strict=True))
+
+
+def new_map(backend: BackendConfig, task: Task, config: Config) -> FusionBackend:
+    """An empty map; it keeps the history where the run is to write it, or to compute statistics from it."""
+    history = {"history": True} if config.events and takes_option(backend.name, "history") else {}
+    options = history | backend.options
+    return create(backend.name, voxel_size=config.voxel_size, num_classes=len(task.mapping.target), **options)
 
 
 def _require_voxels(task: Task, config: Config, tables: Mapping[Unit, VoxelTable]) -> None:

@@ -35,8 +35,8 @@ def open3d_map(voxel_size, num_classes, initial_bytes=0, **options):
         return backends.create("open3d", voxel_size=voxel_size, num_classes=num_classes, **options)
 
 
-def numba_map(voxel_size, num_classes):
-    return backends.create("numba", voxel_size=voxel_size, num_classes=num_classes)
+def numba_map(voxel_size, num_classes, **options):
+    return backends.create("numba", voxel_size=voxel_size, num_classes=num_classes, **options)
 
 
 class TestNumba(BackendConformance):
@@ -44,6 +44,13 @@ class TestNumba(BackendConformance):
 
     def create(self, voxel_size, num_classes):
         return numba_map(voxel_size, num_classes)
+
+
+class TestNumbaWithHistory(BackendConformance):
+    reach = 2**20
+
+    def create(self, voxel_size, num_classes):
+        return numba_map(voxel_size, num_classes, history=True)
 
 
 class TestNumbaInSinglePrecision(BackendConformance):
@@ -201,8 +208,28 @@ def test_the_reference_keeps_the_history():
     assert events.evidence.tolist() == [[1, 0, 0], [0, 0.5, 0.5], [0, 1, 0]]
 
 
-def test_open3d_keeps_no_history():
-    assert backends.create("open3d", voxel_size=1.0, num_classes=3).events() is None
+@pytest.mark.parametrize("soft", [False, True])
+def test_numba_keeps_the_same_history(soft):
+    frames = [frame for frame in random_frames(seed=11, count=8) if (frame.scores is not None) == soft]
+    assert len(frames) > 1
+    reference, fast = backends.create("numpy", voxel_size=0.3, num_classes=4), numba_map(0.3, 4, history=True)
+    for frame in frames:
+        reference.integrate(frame)
+        fast.integrate(frame)
+    expected, actual = reference.events(), fast.events()
+    for name in ("ix", "iy", "iz", "voxel", "frame", "pixels"):
+        np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name), err_msg=name)
+    np.testing.assert_allclose(actual.evidence, expected.evidence, atol=1e-12)
+
+
+def test_an_empty_history():
+    events = numba_map(1.0, 3, history=True).events()
+    assert (len(events), events.evidence.shape) == (0, (0, 3))
+
+
+@pytest.mark.parametrize("name", ["open3d", "numba"])
+def test_a_fast_map_keeps_no_history_unasked(name):
+    assert backends.create(name, voxel_size=1.0, num_classes=3).events() is None
 
 
 @pytest.mark.parametrize("options", [{"block_resolution": 0}, {"block_resolution": 65}, {"device": "TPU:0"}])
