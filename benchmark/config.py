@@ -69,7 +69,7 @@ class Config(Settings):
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
     )
     memory_gb: float | None = Field(
-        None, gt=0, exclude=True, description="memory that the maps may take, GB; what is free where not given; not kept"
+        None, gt=0, exclude=True, description="memory that maps may take, GB; what is free where not given; not kept"
     )
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
 
