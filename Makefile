@@ -1,31 +1,34 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
 
-.PHONY: help setup bench test lint format clean
+.PHONY: help setup setup-dev bench test lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types, import contract and the whole test suite'
-	@echo 'make setup   the set-up alone: system libraries, .venv, semstab and its tools'
+	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
 	@echo 'make clean   remove .venv and what tools left behind'
 
 setup:
 	@scripts/setup.sh
 
+setup-dev:
+	@scripts/setup.sh dev
+
 bench: setup
 	$(BIN)/semstab-bench --backend open3d
 
-test: setup lint
+test: setup-dev lint
 	$(BIN)/pytest -n auto --maxprocesses 4
 
-lint: setup
+lint: setup-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: setup
+format: setup-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

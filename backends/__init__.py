@@ -30,6 +30,16 @@ REGISTRY = Registry(
             "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",
             install=f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}",
         ),
+        "torch": Entry(
+            "semstab.backends.torch_map:TorchMap",
+            "the fast one on an accelerator: a hash map on a CUDA device, fed from tensors; runs on a CPU too",
+            install="pip install 'semstab[torch]'",
+        ),
+        "open3d-projective": Entry(
+            "semstab.backends.open3d_projective:Open3DProjective",
+            "voxels look up their pixel, as Open3D's integration does; to compare: differs from the others by design",
+            install=f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}",
+        ),
     },
 )
 
@@ -44,6 +54,9 @@ class FusionBackend(Protocol):
         x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
 
     A voxel takes one evidence vector a frame: the mean over the frame's pixels in it.
+
+    A backend that associates pixels and voxels in another way says `pointwise = False`: it is compared with the
+    others, but they need not agree.
     """
 
     def integrate(self, frame: Frame) -> FrameReport:

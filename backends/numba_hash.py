@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,10 +20,11 @@ import numpy.typing as npt
 
 from semstab.backends.aggregator import Aggregator, Observed
 from semstab.backends.association import check_frame, check_settings
-from semstab.backends.kernels import PARTITIONS, mix, parallel, serial
+from semstab.backends.kernels import PARTITIONS, _row_keys, mix, parallel, partition_of, serial
 from semstab.backends.updates import js_term, plogp
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
+from semstab.labels import IGNORE_8BIT
 from semstab.results import RECURRENT, FrameReport
 from semstab.voxels import Events, VoxelTable, index_columns
 
@@ -62,6 +63,36 @@ class _Seen:
         some = seen.weight > 0
         entries = np.add.reduceat(some, seen.start[:-1], dtype=np.int64) if len(seen.key) else seen.key
         return cls(frame, seen.key.copy(), seen.pixels.copy(), entries, seen.label[some], seen.weight[some])
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """What one frame did to each of the n voxels that it saw.
+
+    row            (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation
+    drift          (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before
+    before, after  (n,) uint16 its dominant class; where it was not seen before, both are the one after
+    """
+
+    row: Int64
+    drift: npt.NDArray[np.float32]
+    before: npt.NDArray[np.uint16]
+    after: npt.NDArray[np.uint16]
+
+    @classmethod
+    def room(cls, row: Int64) -> Changes:
+        """To be filled, for the voxels of these rows."""
+        n = len(row)
+        return cls(row, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
+
+
+class NumbaReport(FrameReport):
+    """The report of a frame, which also knows the map it went into; pickled, it is a report like any other."""
+
+    fused_into: NumbaHash
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FrameReport, tuple(getattr(self, field.name) for field in fields(FrameReport))
 
 
 def _joined(parts: list[npt.NDArray[Any]], dtype: Any) -> npt.NDArray[Any]:
@@ -113,6 +144,8 @@ class NumbaHash:
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
         self._sums = np.zeros(2)  # of VSS and of entropy in bits, over the map
         self._recurrent = 0
+        self.changes = Changes.room(np.zeros(0, dtype=np.int64))
+        """What the last frame did to each voxel."""
         _load_compiled()
 
     @staticmethod
@@ -137,7 +170,7 @@ class NumbaHash:
         finally:
             nb.set_num_threads(threads)
         mean = self._sums / self._rows if self._rows else np.full(2, np.nan)
-        return FrameReport(
+        report = NumbaReport(
             frame=frame.index,
             points=int(seen.pixels.sum()),
             voxels=len(seen.key),
@@ -151,6 +184,8 @@ class NumbaHash:
             association_seconds=observed - started,
             update_seconds=finished - observed,
         )
+        object.__setattr__(report, "fused_into", self)
+        return report
 
     def _add(self, seen: Observed, frame: int) -> tuple[int, float]:
         """Add a frame's observations; return the number of new voxels, and the drift caused, bits."""
@@ -163,9 +198,11 @@ class NumbaHash:
         self._make_nodes(np.diff(seen.start[seen.bounds]))
         sums = np.zeros((PARTITIONS, 3))
         recurrent = np.zeros(PARTITIONS, dtype=np.int64)
+        self.changes = changes = Changes.room(row)
         _update(
             seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, self.num_classes,
             row, slot, base, self._slots, self._records, self._nodes, self._ranges, sums, recurrent,
+            changes.drift, changes.before, changes.after,
         )  # fmt: skip
         self._rows = int(base[-1])
         self._used += new
@@ -173,16 +210,42 @@ class NumbaHash:
         self._recurrent += int(recurrent.sum())
         return int(new.sum()), float(sums[:, 2].sum())
 
+    def __len__(self) -> int:
+        """The number of voxels."""
+        return self._rows
+
     def table(self) -> VoxelTable:
         """The map so far."""
-        records = self._records[: self._rows]
-        order = np.argsort(records["key"], kind="stable")
-        evidence = np.zeros((self._rows, self.num_classes))
+        return self.table_of(np.arange(self._rows))
+
+    def table_of(self, rows: Int64) -> VoxelTable:
+        """The voxels of those numbers (n,), distinct ones, as a table; see `Changes.row`."""
+        order = rows[np.argsort(self._records["key"][rows], kind="stable")]
+        records = self._records[order]
+        evidence = np.zeros((len(order), self.num_classes))
         _unchain(self._records, self._nodes, order, evidence)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
-        values: dict[str, Any] = {name: records[name][order] for name in columns}
-        index = self._pixels.index_of(records["key"][order]) if self._rows else np.zeros((0, 3), dtype=np.int64)
+        values: dict[str, Any] = {name: records[name] for name in columns}
+        index = self.index_of(order)
         return VoxelTable(**index_columns(index), **values, evidence=evidence, voxel_size=self.voxel_size)
+
+    def index_of(self, rows: Int64) -> Int64:
+        """Voxel indices (n, 3) of the voxels of those numbers."""
+        return self._pixels.index_of(self._records["key"][rows]) if len(rows) else np.zeros((0, 3), dtype=np.int64)
+
+    def rows_at(self, frame: Frame, stride: int = 1) -> npt.NDArray[np.int32]:
+        """The number of the voxel behind every stride-th pixel of each axis, (H', W'); -1 where there is none.
+
+        There is none where a pixel does not count, or where the map has not seen the place.
+        """
+        H, W = frame.shape
+        camera, pick = frame.intrinsics, np.s_[::stride, ::stride]
+        rays = (np.arange(W)[::stride] - camera.cx) / camera.fx, (np.arange(H)[::stride] - camera.cy) / camera.fy
+        depth = np.where(frame.valid[pick], frame.depth[pick], np.float32(0))
+        rows = np.full(depth.shape, -1, dtype=np.int32)
+        if self._pixels.origin is not None:
+            _find_rows(depth, *rays, np.array(frame.T_wc), self.voxel_size, self._pixels.origin, self._slots, rows)
+        return rows
 
     def events(self) -> Events | None:
         """Every observation in order of integration within a voxel, where `history` is kept; else None."""
@@ -295,19 +358,26 @@ def _rehash(old, new):
 def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
     """Add one observation to a voxel that disagrees with itself, or with the frame.
 
-    s is work space (K,), all 0. Leaves in `out` the change of VSS, that of the entropy in bits, and the drift in bits.
+    s is work space (K,), all 0. Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, and
+    the dominant class before and after.
     """
     for e in range(first, last):
         s[label[e]] = weight[e] / pixels
     before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
     top_before = top_after = plogp_before = plogp_after = drift = 0.0
+    most_before = most_after = -1.0
+    dominant_before = dominant_after = np.int64(0)
     at = np.int64(-2)  # the record itself
     while True:
-        lab = record.label if at == -2 else nodes[at].label
+        lab = np.int64(record.label if at == -2 else nodes[at].label)
         value = np.float64(record.value) if at == -2 else np.float64(nodes[at].value)
+        if value > most_before or (value == most_before and lab < dominant_before):
+            most_before, dominant_before = value, lab
         p = value * before
         value += s[lab]
         s[lab] = 0.0
+        if value > most_after or (value == most_after and lab < dominant_after):
+            most_after, dominant_after = value, lab
         q = value * after
         if at == -2:
             record.value = value
@@ -339,6 +409,9 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
             else:
                 nodes[at].next = node
             at = node
+            lab = np.int64(label[e])
+            if share > most_after or (share == most_after and lab < dominant_after):
+                most_after, dominant_after = share, lab
             q = share * after
             top_after = max(top_after, q)
             plogp_after += plogp(q)
@@ -346,17 +419,21 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
     out[0] = top_after - top_before
     out[1] = plogp_before - plogp_after
     out[2] = min(max(drift, 0.0), 1.0) if op > 0 else 0.0
+    out[3], out[4] = dominant_before, dominant_after
 
 
 @parallel
 def _update(
     key, pixels, start, label, weight, bounds, frame, K, row, slot, base, slots, records, nodes, ranges, sums,
-    recurrent,
+    recurrent, drift_of, dominant_before, dominant_after,
 ):  # fmt: skip
-    """Add the frame's observations; sums (PARTITIONS, 3) takes the changes of VSS and entropy, and the drift."""
+    """Add the frame's observations; sums (PARTITIONS, 3) takes the changes of VSS and entropy, and the drift.
+
+    row, the last three: see `Changes`.
+    """
     for p in nb.prange(PARTITIONS):
         s = np.zeros(K)
-        out = np.zeros(3)
+        out = np.zeros(5)
         own = ranges[p]
         vss = entropy = drift = 0.0
         reached = 0
@@ -365,6 +442,7 @@ def _update(
             r = row[v]
             if r < 0:
                 r = base[p] - r - 1
+                row[v] = r
                 slots[p, slot[v]].row = r
                 new = records[r]
                 new.key = key[v]
@@ -384,16 +462,23 @@ def _update(
                 record.value += 1.0
                 record.self_sum += 1.0
                 vss += 1.0 if op == 0 else 0.0
+                drift_of[v] = 0.0
+                dominant_before[v] = dominant_after[v] = record.label
             else:
                 _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
                 vss += out[0]
                 entropy += out[1]
                 drift += out[2]
                 record.drift_sum += out[2]
+                drift_of[v] = out[2]
+                dominant_before[v], dominant_after[v] = np.uint16(out[3]), np.uint16(out[4])
                 for e in range(first, last):
                     share = weight[e] / pixels[v]
                     record.self_sum += share * share
                     record.frame_entropy_sum -= plogp(share)
+            if op == 0:
+                drift_of[v] = np.nan
+                dominant_before[v] = dominant_after[v]
             record.op = op + 1
             record.pixels += pixels[v]
             record.first_frame = min(record.first_frame, frame)
@@ -401,6 +486,28 @@ def _update(
             reached += 1 if op + 1 == RECURRENT else 0
         sums[p, 0], sums[p, 1], sums[p, 2] = vss, entropy, drift
         recurrent[p] = reached
+
+
+@serial
+def _find_rows(depth, ray_x, ray_y, T, size, origin, slots, rows):
+    """The row of the voxel behind each pixel; `rows` is left as it is where there is none. Depth is 0 where invalid."""
+    H, W = depth.shape
+    mask = np.uint64(slots.shape[1] - 1)
+    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+    labels, keys = np.zeros(W, dtype=np.uint8), np.empty(W, dtype=np.int64)
+    for v in range(H):
+        _row_keys(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, IGNORE_8BIT, keys)
+        for u in range(W):
+            if keys[u] < 0:
+                continue
+            if u > 0 and keys[u] == keys[u - 1]:
+                rows[v, u] = rows[v, u - 1]
+                continue
+            p = partition_of(keys[u])
+            at = np.int64(mix(keys[u]) & mask)
+            while slots[p, at].row != -1 and slots[p, at].key != keys[u]:
+                at = (at + 1) & np.int64(mask)
+            rows[v, u] = slots[p, at].row
 
 
 @parallel

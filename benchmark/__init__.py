@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from semstab import backends, datasets, metrics
+    from semstab import backbones, backends, datasets, metrics
     from semstab.config import Config
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
     from semstab.frames import Frame, Intrinsics
@@ -27,6 +27,7 @@ __all__ = [
     "MissingDependencyError",
     "SemstabError",
     "VoxelTable",
+    "backbones",
     "backends",
     "datasets",
     "metrics",
@@ -50,7 +51,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import the public names when they are first used: `import semstab` stays instant."""
-    if name in ("backends", "datasets", "metrics"):
+    if name in ("backbones", "backends", "datasets", "metrics"):
         return importlib.import_module(f"semstab.{name}")
     if name in _HOMES:
         value = getattr(importlib.import_module(f"semstab.{_HOMES[name]}"), name)

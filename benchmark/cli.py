@@ -11,13 +11,15 @@ import typer
 from typer.core import TyperGroup
 
 from semstab import __version__
-from semstab.errors import ConfigError, SemstabError
+from semstab.errors import ConfigError, DataError, SemstabError
 
 if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.pipeline import Observer
     from semstab.registry import Registry
     from semstab.results import RunResult
+    from semstab.study import StudyConfig, StudyResult
+    from semstab.study.executors import Executor
 
 DISAGREE, INTERRUPTED = 3, 130
 
@@ -103,16 +105,25 @@ def run(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640."),
     ] = None,
+    trust_geometry: Annotated[
+        bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
+    ] = False,
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; runs/TIME by default.")] = None,
     rerun: Annotated[
-        str | None, typer.Option(metavar="FILE|off", help="Recording; RUN/recording.rrd by default.")
+        str | None,
+        typer.Option(
+            metavar="FILE|spawn|connect|URL|serve|off",
+            help="Recording: a file, RUN/recording.rrd by default; and a viewer to start, to connect to, or to serve.",
+        ),
+    ] = None,
+    predict: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[,KEY=VALUE...]", help="Model that makes the labels, nothing on disk; repeatable."),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
-    from semstab.plan import load_config
-
     overrides = _overrides(
         {
             "backends": backend,
@@ -123,6 +134,7 @@ def run(
             "pixel_stride": pixel_stride,
             "check": check,
             "events": events,
+            "check_geometry": False if trust_geometry else None,
         },
         settings or [],
     )
@@ -131,13 +143,157 @@ def run(
         overrides["frames"] = _slice(frames)
     if check in ("none", "off"):
         overrides["check"] = None
-    resolved = load_config(config, overrides)
+    resolved = _load(config, overrides, predict or [])
     if device is not None:
         resolved = _on_device(resolved, device)
     result = _run(resolved, out or _default_out(), rerun, quiet)
     if not result.agrees:
         _say("error: the backends disagree; the agreement table and summary.json say where")
         raise typer.Exit(DISAGREE)
+
+
+@app.command()
+def study(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Study file, or a shipped study: see `list`.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; studies/NAME by default.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="PART", help="A sweep, shared_taxonomy or backends; repeatable.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
+    from semstab.study import DaskCluster, InProcess, LocalProcesses, load_study
+
+    config = load_study(file, _overrides({}, settings or []))
+    if only is not None:
+        config = config.only(only)
+    if scheduler is not None and jobs > 1:
+        raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
+    executor = DaskCluster(scheduler) if scheduler is not None else LocalProcesses(jobs) if jobs > 1 else InProcess()
+    out = out or Path("studies") / config.name
+    result = _study(config, out, executor, quiet)
+    if result.failures:
+        raise typer.Exit(2)
+    if not all(row.agrees for row in result.agreement):
+        _say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
+        raise typer.Exit(DISAGREE)
+
+
+@app.command()
+def predict(
+    backbone: Annotated[str, typer.Option("--backbone", "-m", help="Model, as named by `semstab-bench list`.")],
+    images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
+    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
+    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
+    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder above labels/ and scores/; the scene's own by default.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="What the predictions are called; the model's name here.")] = None,
+    model: Annotated[str | None, typer.Option(help="Folder that save_pretrained wrote, or a hub id.")] = None,
+    revision: Annotated[str | None, typer.Option(help="Branch, tag or commit on the hub.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16; float32 by default.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")
+    ] = None,
+    batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
+    mapping: Annotated[str | None, typer.Option(help="strict, or lenient: near classes count as well.")] = None,
+    scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.KEY=VALUE."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
+    from semstab.predict import command
+
+    named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
+    size = None if image_size is None else _image_size(image_size)
+    options = _overrides({**named, "image_size": size}, settings or [])
+    chosen: dict[str, Any] = {}
+    _select_dataset(chosen, dataset, data, None)
+    said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
+    command.run(
+        predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
+        options=options,
+        images=images,
+        dataset=chosen.get("dataset"),
+        scenes=None if scene == ["all"] else scene,
+        frames={} if frames is None else _slice(frames),
+        out=out,
+        batch=batch,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+
+
+@app.command("check")
+def check_(
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
+    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
+    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
+    backbone: Annotated[
+        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
+    ] = None,
+    voxel_size: Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")] = None,
+    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000."),
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
+    named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
+    problems = _check(_selection(config, named, settings, dataset, data, frames), json_file, quiet)
+    if problems:
+        first, *more = problems
+        raise DataError(f"{first}" + (f" (and {len(more)} more, see above)" if more else ""))
+
+
+@app.command()
+def convert(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder in which each scene becomes a folder.")],
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
+    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
+    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
+    backbone: Annotated[
+        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
+    ] = None,
+    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.root=FOLDER."),
+    ] = None,
+    depth_error: Annotated[
+        float, typer.Option(min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")
+    ] = 0.0,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+) -> None:
+    """Write any dataset as posed folders. Goes on where it was."""
+    _convert(
+        _selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames),
+        out,
+        depth_error,
+        quiet,
+    )
 
 
 @app.command()
@@ -148,27 +304,33 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     recording = run / "recording.rrd" if run.is_dir() else run
     if not recording.exists():
         raise ConfigError(f"{recording}: there is no recording; run again without --rerun off")
-    raise typer.Exit(subprocess.run([sys.executable, "-m", "rerun", str(recording)], check=False).returncode)
+    # Through a pipe: the viewer's catalog, which opens files, refuses a recording with a large layout (many scenes).
+    with recording.open("rb") as stream:
+        command = [sys.executable, "-m", "rerun", "-"]
+        raise typer.Exit(subprocess.run(command, stdin=stream, check=False).returncode)
 
 
 @app.command("list")
 def list_() -> None:
-    """Backends, datasets and taxonomies, each with 'ready' or what to install."""
+    """Backends, datasets, backbones, taxonomies and studies, each with 'ready' or what to install."""
     from rich.console import Console
     from rich.table import Table
 
-    from semstab import backends, datasets
+    from semstab import backbones, backends, datasets
     from semstab.labels import LabelSpace, shipped_taxonomies
+    from semstab.study import load_study, shipped_studies
 
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "what it is"):
         table.add_column(name)
-    for registry in (backends.REGISTRY, datasets.REGISTRY):
+    for registry in (backends.REGISTRY, datasets.REGISTRY, backbones.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
             table.add_row(registry.kind, name, _ready(registry, name), entry.summary)
     for name in shipped_taxonomies():
         space = LabelSpace.load(name)
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
+    for name in shipped_studies():
+        table.add_row("study", name, "[green]ready", load_study(name).description)
     Console().print(table)
 
 
@@ -191,25 +353,124 @@ def _run(config: Config, out: Path, rerun: str | None, quiet: bool) -> RunResult
 
     progress = ProgressBar(Console(stderr=True, quiet=quiet))
     observers: list[Observer] = [progress]
-    recording = None if rerun == "off" else Path(rerun) if rerun is not None else out / "recording.rrd"
     closing: list[Any] = [progress]
-    if recording is not None:
-        from semstab.recording import Recording
+    recording = None
+    if rerun != "off":
+        from semstab.recording import Recording, Target
 
-        observers.append(watching := Recording(recording))
-        closing.append(watching)
+        recording = Recording(Target.parse(rerun, out / "recording.rrd"), run=out)
+        observers.append(recording)
+        closing.append(recording)
     try:
         result = pipeline.run(config, out=out, observers=observers, command=sys.argv)
+        if not quiet:
+            console = Console()
+            print_summary(result, console)
+            console.print(f"run folder: {out}", soft_wrap=True)
+            if recording is not None:
+                file = recording.target.file
+                shown = out if file == out / "recording.rrd" else file
+                console.print(f"recording: semstab-bench view {shown}", soft_wrap=True)
+        if recording is not None:
+            recording.serve()
     finally:
         for observer in closing:
             observer.close()
+    return result
+
+
+def _study(config: StudyConfig, out: Path, executor: Executor, quiet: bool) -> StudyResult:
+    from rich.console import Console
+
+    from semstab.plots import write_figures
+    from semstab.report import write_report
+    from semstab.study import run_study
+    from semstab.study.progress import StudyProgress, failure_lines
+    from semstab.tables import write_tables
+    from semstab.terminal import print_summary
+
+    progress = StudyProgress(Console(stderr=True, quiet=quiet))
+    try:
+        result = run_study(config, out, executor=executor, observers=[progress], command=sys.argv)
+    finally:
+        progress.close()
+    for line in failure_lines(result):
+        _say(f"error: {line}")
+    if result.records:
+        for write in (write_tables, write_figures, write_report):
+            write(result, out)
     if not quiet:
         console = Console()
-        print_summary(result, console)
-        console.print(f"run folder: {out}", soft_wrap=True)
-        if recording is not None:
-            console.print(f"recording: semstab-bench view {out if rerun is None else recording}", soft_wrap=True)
+        if result.select():
+            print_summary(result.base_runs(), console)
+        console.print(f"study folder: {out}", soft_wrap=True)
     return result
+
+
+def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> Config:
+    """The configuration; with models whose predictions take the place of the dataset's labels."""
+    if not predict:
+        from semstab.plan import load_config
+
+        return load_config(path, overrides)
+    from semstab.predict import parse_predictor, predicted_config
+
+    return predicted_config([parse_predictor(text) for text in predict], path, overrides)
+
+
+def _image_size(text: str) -> int | list[int]:
+    """'512' as a number, '512x896' as height and width."""
+    sides = text.lower().split("x")
+    if len(sides) > 2 or not all(side.isdigit() for side in sides):
+        raise ConfigError(f"--image-size {text}: write the shorter side, for example 512, or HEIGHTxWIDTH")
+    return int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]
+
+
+def _check(config: Config, json_file: Path | None, quiet: bool) -> list[str]:
+    """Check and print scene by scene; what is wrong, one line each."""
+    from rich.console import Console
+
+    from semstab.check import SCHEMA, check
+    from semstab.check.display import print_check
+    from semstab.files import write_json
+
+    console, found = Console(quiet=quiet), []
+    for checked in check(config):
+        print_check(checked, console)
+        found.append(checked)
+    if json_file is not None:
+        write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in found]})
+    return [f"{checked.scene}: {problem}" for checked in found for problem in checked.problems]
+
+
+def _convert(config: Config, out: Path, depth_error: float, quiet: bool) -> None:
+    from rich.console import Console
+
+    from semstab.convert import convert
+    from semstab.convert.display import FrameBar, print_converted
+
+    console = Console(quiet=quiet)
+    with FrameBar(Console(stderr=True, quiet=quiet)) as bar:
+        for converted in convert(config, out, depth_error=depth_error, progress=bar):
+            print_converted(converted, console)
+
+
+def _selection(
+    file: Path | None,
+    named: dict[str, Any],
+    settings: list[str] | None,
+    dataset: str | None,
+    data: Path | None,
+    frames: str | None,
+) -> Config:
+    """The resolved configuration of a file and options that select data."""
+    from semstab.plan import load_config, resolve
+
+    overrides = _overrides(named, settings or [])
+    _select_dataset(overrides, dataset, data, None)
+    if frames is not None:
+        overrides["frames"] = _slice(frames)
+    return resolve(load_config(file, overrides))
 
 
 def _overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from semstab.errors import ConfigError
 from semstab.files import parse_yaml
@@ -36,17 +37,103 @@ class BackendConfig(Settings):
     options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
 
 
+Deviation = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+Indices = list[int]
+"""Frames of a sequence, counted from 0, in ascending order."""
+
+
 class FrameSelection(Settings):
-    """Which frames of a sequence: start, start + stride, ... before stop, at most count of them."""
+    """Which frames of a sequence: those of a list; or each stride-th from start to before stop, in a range of time.
+
+    Of these at most `count`: the first ones, or with `spacing: even` evenly spaced ones, the first and last included.
+    """
 
     start: int = Field(0, ge=0)
     stop: int | None = Field(None, ge=1)
     stride: int = Field(1, ge=1)
     count: int | None = Field(None, ge=1)
+    spacing: Literal["stride", "even"] = Field(
+        "stride", description="which `count` frames: stride, the first ones; even, from the first to the last one"
+    )
+    list: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+        None, min_length=1, description="these frames, ascending from 0, and no others"
+    )
+    from_time: float | None = Field(None, allow_inf_nan=False, description="seconds on the scene's own clock")
+    to_time: float | None = Field(None, allow_inf_nan=False, description="seconds on the scene's own clock, included")
 
-    def indices(self, length: int) -> list[int]:
-        """The selected indices of a sequence of that length."""
-        return list(range(length))[self.start : self.stop : self.stride][: self.count]
+    @model_validator(mode="after")
+    def _one_way_to_say_it(self) -> Self:
+        said = [name for name, field in type(self).model_fields.items() if getattr(self, name) != field.default]
+        if self.list is not None and said != ["list"]:
+            raise ValueError(f"list says which frames; leave out {', '.join(said[:-1])}")
+        if self.list is not None and any(a >= b for a, b in itertools.pairwise(self.list)):
+            raise ValueError("the frames of a list must ascend, each once")
+        if self.spacing == "even" and self.count is None:
+            raise ValueError("spacing: even needs count, the number of frames")
+        if self.from_time is not None and self.to_time is not None and self.from_time > self.to_time:
+            raise ValueError("from_time lies after to_time")
+        return self
+
+    @property
+    def needs_time(self) -> bool:
+        """Whether frames are chosen by the time they were taken at."""
+        return self.from_time is not None or self.to_time is not None
+
+    def indices(self, length: int, timestamps: Sequence[float] | None = None) -> Indices:
+        """The selected indices of a sequence of that length, whose frames were taken at `timestamps` (seconds).
+
+        A frame whose time is not known (NaN) lies in no range of time. Raises ConfigError for a listed frame that is
+        not there, or a range of time where the sequence has none.
+        """
+        if self.list is not None:
+            if self.list[-1] >= length:
+                raise ConfigError(f"frames.list: there is no frame {self.list[-1]}; the sequence has {length}, from 0")
+            return [*self.list]
+        extent = [*range(length)][self.start : self.stop]
+        if self.needs_time:
+            extent = self._in_time(extent, timestamps)
+        chosen = extent[:: self.stride]
+        return chosen[: self.count] if self.spacing == "stride" else _evenly(chosen, self.count or len(chosen))
+
+    def _in_time(self, extent: Indices, timestamps: Sequence[float] | None) -> Indices:
+        if timestamps is None:
+            raise ConfigError("frames: from_time and to_time need time stamps, which this sequence has not; use start")
+        first = -math.inf if self.from_time is None else self.from_time
+        last = math.inf if self.to_time is None else self.to_time
+        return [index for index in extent if first <= timestamps[index] <= last]
+
+
+def _evenly(items: Indices, count: int) -> Indices:
+    """At most `count` of the items, the first and the last included, at equal distances to within one."""
+    count, last = min(count, len(items)), len(items) - 1
+    return [items[round(k * last / max(1, count - 1))] for k in range(count)]
+
+
+class Perturbation(Settings):
+    """Noise added to depth and poses, to see what geometry alone does to the numbers; see `semstab.perturbation`.
+
+    Standard deviations, of each axis where there are three. 0 adds nothing.
+    """
+
+    depth_noise: Deviation = Field(0.0, description="of depth, relative to it, of each pixel by itself")
+    translation_noise: Deviation = Field(0.0, description="of the camera's position, metres, anew in every frame")
+    rotation_noise: Deviation = Field(0.0, description="of the camera's rotation, degrees, anew in every frame")
+    translation_drift: Deviation = Field(0.0, description="of a step of the position's random walk, metres a frame")
+    rotation_drift: Deviation = Field(0.0, description="of a step of the rotation's random walk, degrees a frame")
+    seed: int = Field(0, ge=0, description="of all of them")
+
+    @property
+    def adds_noise(self) -> bool:
+        """Whether it changes a frame at all."""
+        return any(value for name, value in self if name != "seed")
+
+
+class Exclusion(Settings):
+    """What is left out of fusion because it moves; see `semstab.exclusion`."""
+
+    classes: tuple[str, ...] = Field((), description="classes, by their name in a backbone's or in the run's taxonomy")
+    masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
 
 
 class Config(Settings):
@@ -64,12 +151,20 @@ class Config(Settings):
     voxel_size: float = Field(0.2, gt=0, allow_inf_nan=False, description="edge of a voxel, metres")
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
     frames: FrameSelection = FrameSelection()
+    exclude: Exclusion = Exclusion()
+    perturbation: Perturbation | None = Field(None, description="noise added to depth and poses; null for none")
     strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
     threads: int | None = Field(
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
     )
     memory_gb: float | None = Field(
-        None, gt=0, exclude=True, description="memory that maps may take, GB; what is free where not given; not kept"
+        None,
+        gt=0,
+        exclude=True,
+        description="memory that maps may take, GB; what is free where not given; not kept",
+    )
+    check_geometry: bool = Field(
+        True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
     )
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
 
@@ -86,6 +181,12 @@ class Config(Settings):
         if len({backend.name for backend in value}) < len(value):
             raise ValueError("each backend can be named once")
         return value
+
+    @field_validator("perturbation")
+    @classmethod
+    def _noise_or_none(cls, value: Perturbation | None) -> Perturbation | None:
+        """Settings that add no noise are none, so that they are compared as such."""
+        return value if value is not None and value.adds_noise else None
 
     @field_validator("strata")
     @classmethod

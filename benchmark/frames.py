@@ -69,6 +69,8 @@ class Frame:
     labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; or
     scores      (H, W, K) float, non-negative; normalised per pixel where they are used
     color       (H, W, 3) uint8 RGB, optional
+    mask        (H, W) bool, True where a thing moves that is not to be fused, optional; see `semstab.exclusion`
+    left_out    (H, W) bool, the pixels that were left out of fusion for what they show, optional
     timestamp   seconds, optional
     files       which file each field came from ('depth', 'pose', 'labels', ...); error messages name it
 
@@ -82,6 +84,8 @@ class Frame:
     labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | None = None
     scores: npt.NDArray[np.floating[Any]] | None = None
     color: npt.NDArray[np.uint8] | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+    left_out: npt.NDArray[np.bool_] | None = None
     timestamp: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -96,6 +100,9 @@ class Frame:
             self._set("scores", self._checked_scores(np.asarray(self.scores)))
         if self.color is not None:
             self._set("color", self._checked_color(np.asarray(self.color)))
+        for name in ("mask", "left_out"):
+            if (marked := getattr(self, name)) is not None:
+                self._set(name, self._checked_mask(name, np.asarray(marked)))
 
     @cached_property
     def valid(self) -> npt.NDArray[np.bool_]:
@@ -133,9 +140,14 @@ class Frame:
         return self.depth.shape[0], self.depth.shape[1]
 
     @property
+    def left_out_pixels(self) -> int:
+        """How many pixels were left out of fusion for what they show."""
+        return 0 if self.left_out is None else int(np.count_nonzero(self.left_out))
+
+    @property
     def nbytes(self) -> int:
         """Bytes of its images, the mask of valid pixels included."""
-        images = (self.depth, self.labels, self.scores, self.color)
+        images = (self.depth, self.labels, self.scores, self.color, self.mask, self.left_out)
         return self.depth.size + sum(image.nbytes for image in images if image is not None)
 
     def every(self, stride: int) -> Frame:
@@ -150,6 +162,8 @@ class Frame:
             labels=None if self.labels is None else self.labels[pick],
             scores=None if self.scores is None else self.scores[pick],
             color=None if self.color is None else self.color[pick],
+            mask=None if self.mask is None else self.mask[pick],
+            left_out=None if self.left_out is None else self.left_out[pick],
         )
 
     def where(self, what: str) -> str:
@@ -188,6 +202,12 @@ class Frame:
         if np.linalg.det(R) < 0:
             raise DataError(f"{where}: the rotation mirrors (determinant -1), {_in_line(R)}; check camera_axes")
         return T
+
+    def _checked_mask(self, name: str, mask: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+        if mask.dtype != np.bool_:
+            raise DataError(f"{self.where(name)}: the {name} is {mask.dtype}; use bool, True where pixels are left out")
+        self._same_size(name, mask.shape)
+        return mask
 
     def _checked_labels(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if labels.dtype not in (np.uint8, np.uint16):

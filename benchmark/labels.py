@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,13 @@ class LabelMapping:
             raise ConfigError(
                 f"taxonomy {self.target.name}: every class of {self.source.name} is ignored; nothing is left"
             )
+
+    def named(self, names: Iterable[str]) -> tuple[int, ...]:
+        """Positions of the source classes that have one of these names, or become a class that has."""
+        wanted = {_key(name) for name in names}
+        rows = {row for row, name in enumerate(self.target.classes) if _key(name) in wanted}
+        pairs = zip(self.source.classes, self.rows, strict=True)
+        return tuple(k for k, (name, row) in enumerate(pairs) if _key(name) in wanted or row in rows)
 
     def labels(
         self, labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], where: str

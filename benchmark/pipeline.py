@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from semstab.backends import FusionBackend, create, takes_option
+from semstab.check import Verdict, require_sound
 from semstab.config import BackendConfig, Config
 from semstab.errors import DataError
 from semstab.frames import Frame
@@ -38,6 +39,9 @@ class Observer:
 
     def run_started(self, plan: Plan) -> None:
         """The plan is made, nothing is fused yet."""
+
+    def geometry_checked(self, task: Task, verdict: Verdict) -> None:
+        """Depth and poses of the task's scene were compared, and do not contradict each other."""
 
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """A frame went into a unit's map; `frame` holds labels in the run's label space."""
@@ -71,12 +75,14 @@ def run(
     for observer in observers:
         observer.run_started(plan)
     groups: list[GroupResult] = []
+    geometry: dict[str, Verdict] = {}
     for task in plan.tasks:
-        groups.append(_run_task(task, config, folder, observers, watch))
+        groups.append(_run_task(task, config, folder, observers, watch, geometry))
         if folder is not None:
             folder.save_summary(RunResult(tuple(groups)))
             inputs = {f"{t.scene.name}/{t.backbone}": t.digest for t in plan.tasks[: len(groups)]}
-            folder.save_manifest(manifest(config, inputs, watch.seconds, command))
+            checked = {"geometry": {scene: verdict.summary() for scene, verdict in geometry.items()}}
+            folder.save_manifest(manifest(config, inputs, watch.seconds, command) | checked)
     result = RunResult(tuple(groups))
     for observer in observers:
         observer.run_finished(result)
@@ -84,17 +90,27 @@ def run(
 
 
 def _run_task(
-    task: Task, config: Config, folder: RunFolder | None, observers: Sequence[Observer], watch: Stopwatch
+    task: Task,
+    config: Config,
+    folder: RunFolder | None,
+    observers: Sequence[Observer],
+    watch: Stopwatch,
+    geometry: dict[str, Verdict],
 ) -> GroupResult:
-    if folder is None:
-        return _fuse(task, config, None, observers, watch)
-    kept = _kept(task, config, folder, watch)
+    kept = None if folder is None else _kept(task, config, folder, watch)
     if kept is not None:
         for observer in observers:
             observer.group_kept(task, kept)
         return kept
+    if config.check_geometry and task.scene.name not in geometry:
+        with watch("check"):
+            verdict = require_sound(task.scene, task.indices, task.backbone, config.dataset.options)
+        geometry[task.scene.name] = verdict
+        for observer in observers:
+            observer.geometry_checked(task, verdict)
     result = _fuse(task, config, folder, observers, watch)
-    folder.save_group(task.scene.name, task.backbone, _key(task, config, watch), result)
+    if folder is not None:
+        folder.save_group(task.scene.name, task.backbone, _key(task, config, watch), result)
     return result
 
 
@@ -118,11 +134,12 @@ def _fuse(
     with watch("measure"):
         classes = task.mapping.target.classes
         tables = {unit: dataclasses.replace(backend.table(), classes=classes) for unit, backend in maps.items()}
-        _require_voxels(task, config, tables)
-        summaries = {unit: _summary(task, config, tables[unit], unit, rows[unit]) for unit in maps}
+        require_voxels(task, config, tables)
+        summaries = {unit: unit_summary(task, config, tables[unit], unit, rows[unit]) for unit in maps}
+        alike = [unit for unit, backend in maps.items() if getattr(backend, "pointwise", True)]
         agreement = tuple(
             compare(tables[a], tables[b], (a, b), tolerance=config.tolerance)
-            for a, b in itertools.combinations(maps, 2)
+            for a, b in itertools.combinations(alike, 2)
         )
     with watch("write"):
         for unit, backend in maps.items():
@@ -150,11 +167,14 @@ def _fuse_frames(
                 require_memory(task, config, frame)
             watch.seconds["read"] += fetched.waited
             with watch("flicker") as flicker_time:
-                flicker = _flicker(previous, frame)
+                flicker = flicker_between(previous, frame)
             for unit, backend in maps.items():
                 with watch(f"fuse {unit.backend}"):
                     report = backend.integrate(frame)
-                row = FrameRow(report, frame.timestamp, flicker, fetched.seconds, fetched.waited, flicker_time.seconds)
+                row = FrameRow(
+                    report, frame.timestamp, flicker, fetched.seconds, fetched.waited, flicker_time.seconds,
+                    left_out=frame.left_out_pixels,
+                )  # fmt: skip
                 with watch("observe") as logging_time:
                     for observer in observers:
                         observer.frame_fused(unit, frame, row)
@@ -175,7 +195,7 @@ def _decoded(task: Task, config: Config, observers: Sequence[Observer]) -> Gener
     return prefetch(decode, task.indices, threads=config.threads, size=lambda frame: frame.nbytes)
 
 
-def _flicker(previous: Frame | None, frame: Frame) -> float:
+def flicker_between(previous: Frame | None, frame: Frame) -> float:
     """Flicker against the frame before; undefined for the first one, and where the image size changes."""
     if previous is None or previous.shape != frame.shape:
         return math.nan
@@ -194,7 +214,8 @@ def new_map(backend: BackendConfig, task: Task, config: Config) -> FusionBackend
     return create(backend.name, voxel_size=config.voxel_size, num_classes=len(task.mapping.target), **options)
 
 
-def _require_voxels(task: Task, config: Config, tables: Mapping[Unit, VoxelTable]) -> None:
+def require_voxels(task: Task, config: Config, tables: Mapping[Unit, VoxelTable]) -> None:
+    """Raise DataError, which says what is missing in the first frame, where every map is empty."""
     if any(len(table) for table in tables.values()):
         return
     frame = read(task, task.indices[0], config.pixel_stride)
@@ -206,7 +227,8 @@ def _require_voxels(task: Task, config: Config, tables: Mapping[Unit, VoxelTable
     )
 
 
-def _summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows: list[FrameRow]) -> UnitSummary:
+def unit_summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows: list[FrameRow]) -> UnitSummary:
+    """What is reported of a unit, from its map and its time series."""
     return UnitSummary(
         unit=unit,
         taxonomy=task.mapping.target.name,
@@ -215,6 +237,7 @@ def _summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows: li
         flicker_percent=macro_mean([row.flicker_percent for row in rows]),
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms=_stages_ms(rows),
+        left_out=sum(row.left_out for row in rows),
     )
 
 

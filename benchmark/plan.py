@@ -14,11 +14,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from semstab.backends import create
-from semstab.config import Config, explain, merge, read_yaml
+from semstab.config import Config, Exclusion, Perturbation, explain, merge, read_yaml
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, options_model
+from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
+from semstab.exclusion import leave_out
 from semstab.frames import Frame
 from semstab.labels import LabelMapping, LabelSpace
+from semstab.perturbation import perturb
 from semstab.results import Unit
 
 
@@ -31,6 +34,8 @@ class Task:
     indices: list[int]
     mapping: LabelMapping
     backends: tuple[str, ...]
+    perturbation: Perturbation | None = None
+    exclude: Exclusion = dataclasses.field(default_factory=Exclusion)
 
     @property
     def units(self) -> list[Unit]:
@@ -54,11 +59,15 @@ class Plan:
 def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
     """The configuration of a file with overrides on top, over what ships for its dataset in configs/datasets/."""
     content = merge(read_yaml(path) if path is not None else {}, overrides or {})
+    return Config.build(merge(dataset_defaults(content), content), str(path or "configuration"))
+
+
+def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that ship for the dataset which the content names, or for the built-in one."""
     dataset = content.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else dataset
     shipped = importlib.resources.files("semstab.configs") / "datasets" / f"{name or 'city'}.yaml"
-    base = read_yaml(Path(str(shipped))) if shipped.is_file() else {}
-    return Config.build(merge(base, content), str(path or "configuration"))
+    return read_yaml(Path(str(shipped))) if shipped.is_file() else {}
 
 
 def resolve(config: Config) -> Config:
@@ -79,27 +88,45 @@ def make_plan(config: Config) -> Plan:
     for backend in config.fused_by():  # an engine that is missing is said before anything is computed
         create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
     dataset = open_dataset(config.dataset.name, config.dataset.options)
-    names = _selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
-    tasks = [task for name in names for task in _tasks_of(dataset.scene(name), config)]
+    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
+    tasks = [task for name in names for task in tasks_of(dataset.scene(name), config)]
     return Plan(config, tuple(tasks))
 
 
-def _tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
-    indices = config.frames.indices(len(scene))
-    if not indices:
-        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
+def tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
+    """The configuration's backbones on an open scene, checked; no image is read."""
+    indices = frame_indices(scene, config)
     extra = (GROUND_TRUTH,) if scene.ground_truth else ()
-    names = _selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
+    names = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
     if not names:
         raise DataError(f"{scene.name}: there are no label maps; add them in labels/BACKBONE/, or choose with --scene")
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         fused_by = tuple(backend.name for backend in config.fused_by())
-        yield Task(scene, backbone, indices, source.mapping_to(target), fused_by)
+        mapping = source.mapping_to(target)
+        _require_classes(config.exclude.classes, mapping, scene.name)
+        yield Task(scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude)
 
 
-def _selected(
+def _require_classes(names: Sequence[str], mapping: LabelMapping, where: str) -> None:
+    for name in names:
+        if not mapping.named([name]):
+            known = [*dict.fromkeys((*mapping.source.classes, *mapping.target.classes))]
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there is {', '.join(known)}"
+            raise ConfigError(f"{where}: exclude.classes: no class '{name}'; {hint}")
+
+
+def frame_indices(scene: Scene, config: Config) -> list[int]:
+    """The frames of a scene that the configuration selects. Raises ConfigError where there is none."""
+    indices = select_frames(scene, config.frames)
+    if not indices:
+        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
+    return indices
+
+
+def selected(
     wanted: list[str] | None, known: Sequence[str], extra: Sequence[str], kind: str, where: str
 ) -> Sequence[str]:
     """The wanted names, all known ones where none are named; `extra` ones only by name."""
@@ -112,12 +139,28 @@ def _selected(
 
 
 def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) -> Frame:
-    """A frame of the task with its labels as rows 0..K-1 of the run's label space, colour only where it is wanted."""
-    frame = task.scene.frame(index, task.backbone, color=color)
-    if frame.labels is not None:
-        labels = task.mapping.labels(frame.labels, frame.where("labels"))
-        frame = dataclasses.replace(frame, labels=labels)
-    else:
-        assert frame.scores is not None
-        frame = dataclasses.replace(frame, scores=task.mapping.scores(frame.scores, frame.where("scores")))
+    """A frame of the task, ready to fuse; colour only where it is wanted."""
+    return prepare(task, task.scene.frame(index, task.backbone, color=color), pixel_stride)
+
+
+def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
+    """The scene's frame without what moves, its labels as rows 0..K-1 of the run's label space, noise, pixel stride."""
+    frame = in_label_space(task.mapping, _still(task, frame))
+    if task.perturbation is not None:
+        frame = perturb(frame, task.perturbation, task.scene.name)
     return frame.every(pixel_stride)
+
+
+def _still(task: Task, frame: Frame) -> Frame:
+    classes = task.mapping.named(task.exclude.classes)
+    if frame.labels is not None:
+        classes = tuple(task.mapping.source.ids[k] for k in classes)
+    return leave_out(frame, classes, masks=task.exclude.masks)
+
+
+def in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
+    """The frame with its labels as rows 0..K-1 of the mapping's target, or its scores (H, W, K) for them."""
+    if frame.labels is not None:
+        return dataclasses.replace(frame, labels=mapping.labels(frame.labels, frame.where("labels")))
+    assert frame.scores is not None
+    return dataclasses.replace(frame, scores=mapping.scores(frame.scores, frame.where("scores")))

@@ -114,7 +114,11 @@ class TableSummary:
 
 @dataclass(frozen=True)
 class UnitSummary:
-    """One entry of 'runs' in summary.json; stages_ms has mean milliseconds a frame by stage, see `STAGES`."""
+    """One entry of 'runs' in summary.json.
+
+    stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
+    fusion because what they show moves.
+    """
 
     unit: Unit
     taxonomy: str
@@ -123,12 +127,16 @@ class UnitSummary:
     flicker_percent: float
     fuse_ms_per_frame: float
     stages_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    left_out: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object; `from_dict` reads it back."""
         rest = {name: getattr(self, name) for name in _UNIT_FIELDS}
         return (
-            dataclasses.asdict(self.unit) | rest | {"stages_ms": dict(self.stages_ms)} | dataclasses.asdict(self.table)
+            dataclasses.asdict(self.unit)
+            | rest
+            | {"stages_ms": dict(self.stages_ms), "left_out": self.left_out}
+            | dataclasses.asdict(self.table)
         )
 
     @classmethod
@@ -146,6 +154,7 @@ class UnitSummary:
             table=TableSummary(**table | groups),
             **{name: content[name] for name in _UNIT_FIELDS},
             stages_ms=_defined(content.get("stages_ms", {})),  # runs of earlier versions have none
+            left_out=content.get("left_out", 0),
         )
 
 

@@ -24,7 +24,7 @@ from semstab.voxels import Events, VoxelTable
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
     "map_entropy", "map_recurrent", "fuse_ms",
-    "decode_ms", "wait_ms", "association_ms", "update_ms",
+    "decode_ms", "wait_ms", "association_ms", "update_ms", "left_out",
 )  # fmt: skip
 """The time series RUN/frames/*.csv: one row a frame; drift in bits; an undefined number is an empty field."""
 
@@ -33,7 +33,8 @@ FRAME_COLUMNS = (
 class FrameRow:
     """One row of a unit's time series: the backend's report, what the frame itself tells, and seconds by stage.
 
-    logging_seconds is known once the observers have seen the row.
+    left_out counts the pixels that were left out of fusion because what they show moves. logging_seconds is known once
+    the observers have seen the row.
     """
 
     report: FrameReport
@@ -43,6 +44,7 @@ class FrameRow:
     wait_seconds: float = math.nan
     flicker_seconds: float = math.nan
     logging_seconds: float = math.nan
+    left_out: int = 0
 
     def stage_ms(self) -> dict[str, float]:
         """Milliseconds of each of `STAGES`; NaN where it is not known."""
@@ -54,6 +56,7 @@ class FrameRow:
         row = dataclasses.asdict(self.report) | {
             "timestamp": self.timestamp,
             "flicker_percent": self.flicker_percent,
+            "left_out": self.left_out,
             "drift": self.report.drift,
             "fuse_ms": self.report.seconds * 1e3,
             **{f"{stage}_ms": value for stage, value in self.stage_ms().items()},
@@ -96,8 +99,7 @@ class RunFolder:
 
     def save_unit(self, unit: Unit, table: VoxelTable, events: Events | None, rows: list[FrameRow]) -> None:
         """Write a unit's voxels, its time series and, where given, its log of observations."""
-        measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
-        table.save(self.voxels_path(unit), measures)
+        save_voxels(table, self.voxels_path(unit))
         text = io.StringIO()
         writer = csv.DictWriter(text, FRAME_COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -133,6 +135,12 @@ class RunFolder:
             return
         if changed := _first_change(read_yaml(present), yaml.safe_load(config.to_yaml())):
             raise ConfigError(f"{self.path}: holds a run with other settings ({changed}); choose another folder")
+
+
+def save_voxels(table: VoxelTable, path: Path) -> None:
+    """Write a voxel table together with its measures."""
+    measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
+    table.save(path, measures)
 
 
 def group_key(config: Config, scene: str, backbone: str, digest: str) -> str:

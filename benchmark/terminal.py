@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from semstab.check import Verdict
 from semstab.frames import Frame
 from semstab.metrics import macro_mean, pool
 from semstab.pipeline import Observer
@@ -27,11 +28,17 @@ class ProgressBar(Observer):
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
         self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
         self.work = self.bar.add_task("starting", total=None)
+        self.notes: list[str] = []
 
     def run_started(self, plan: Plan) -> None:
         """Show the bar: every unit's frames are its total."""
         self.bar.update(self.work, total=sum(len(task.indices) * len(task.backends) for task in plan.tasks))
         self.bar.start()
+
+    def geometry_checked(self, task: Task, verdict: Verdict) -> None:
+        """Remember, until the run is through, what could not be told."""
+        if verdict.state == "unclear":
+            self.notes.append(f"{task.scene.name}: {verdict.text}")
 
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """One frame further."""
@@ -43,8 +50,10 @@ class ProgressBar(Observer):
         self.bar.console.print(f"kept from before: {task.scene.name}, {task.backbone}", style="dim")
 
     def run_finished(self, result: RunResult) -> None:
-        """Take the bar away."""
+        """Take the bar away, and say what could not be told."""
         self.close()
+        for note in self.notes:
+            self.bar.console.print(note, style="dim", soft_wrap=True)
 
     def close(self) -> None:
         """Take the bar away, also where the run was interrupted."""

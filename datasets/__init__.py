@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,25 @@ REGISTRY = Registry(
             "semstab.datasets.posed_folder:PosedFolder",
             "folders depth/, pose/, labels/BACKBONE/ and intrinsics.txt, one file a frame",
         ),
+        "predicted": Entry(
+            "semstab.predict.live:PredictedDataset",
+            "another dataset with labels that models make while it is fused: `run --predict`",
+        ),
+        "uavid3d": Entry(
+            "semstab.datasets.uavid3d:Uavid3d",
+            "UAVid-3D-Scenes: UAV scenes with metric depth; every path and format is an option",
+        ),
+        "scannet": Entry("semstab.datasets.scannet:ScanNet", "ScanNet as its SensReader exports it"),
+        "replica": Entry("semstab.datasets.replica:Replica", "Replica in the export of NICE-SLAM or Semantic-NeRF"),
+        "tum": Entry("semstab.datasets.tum:Tum", "TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt by time stamp"),
+        "seven_scenes": Entry("semstab.datasets.seven_scenes:SevenScenes", "7-Scenes: frame-NNNNNN.depth.png, ..."),
+        "transforms_json": Entry(
+            "semstab.datasets.transforms_json:TransformsJson",
+            "transforms.json of nerfstudio or instant-ngp, with depth maps",
+        ),
+        "colmap": Entry("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
+        "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
+        "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },
 )
 
@@ -63,6 +82,25 @@ class Scene(Protocol):
 
     def digest(self, indices: list[int], backbone: str) -> str:
         """A hash of the content behind those frames: the same digest means the same numbers."""
+        ...
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """A scene that knows when its frames were taken, so that they can be chosen by time."""
+
+    @property
+    def timestamps(self) -> npt.NDArray[np.float64] | None:
+        """(len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
+        ...
+
+
+@runtime_checkable
+class Tracked(Protocol):
+    """A scene whose tracking may have been lost in some frames, which are left out then."""
+
+    def tracked(self, index: int) -> bool:
+        """Whether the frame has a pose. Reads no image."""
         ...
 
 

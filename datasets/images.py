@@ -20,6 +20,7 @@ DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 SCORE_SUFFIXES = (".npz", ".npy")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
@@ -91,6 +92,18 @@ def read_scores(
     if found[layout] != size and found[other] == size:
         raise DataError(f"{path}: scores of shape {scores.shape} are not {layout}; set scores_layout: {other}")
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
+
+
+def read_mask(path: Path, read: Read = read_bytes) -> npt.NDArray[np.bool_]:
+    """Mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
+
+    Raises DataError where it is no one-channel PNG, or damaged.
+    """
+    png = parse_png(path, read(path))
+    if png.kind not in ("grey", "palette"):
+        raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
+    mask: npt.NDArray[np.bool_] = png.indices() == 0
+    return mask
 
 
 def read_color(path: Path) -> npt.NDArray[np.uint8]:

@@ -11,19 +11,23 @@ from typing import Literal
 
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.disk import files_by_stem, natural, subfolders
-from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, LABEL_SUFFIXES, SCORE_SUFFIXES
+from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
 
 MAX_LISTED = 5
 
-Kind = Literal["depth", "pose", "color", "labels", "scores"]
+LABEL_SPACE_FILE = "label_space.yaml"
+"""In a folder of label maps or scores: their classes, where they are not the scene's; a taxonomy file."""
+
+Kind = Literal["depth", "pose", "color", "mask", "labels", "scores"]
 
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "depth": DEPTH_SUFFIXES,
     "pose": (".txt",),
     "color": COLOR_SUFFIXES,
+    "mask": MASK_SUFFIXES,
     "labels": LABEL_SUFFIXES,
     "scores": SCORE_SUFFIXES,
 }
@@ -60,6 +64,7 @@ class SceneFiles:
         self.depth = FrameFiles.of("depth", folder / "depth")
         self.pose = FrameFiles.of("pose", folder / "pose")
         self.color = FrameFiles.of("color", folder / "color")
+        self.mask = FrameFiles.of("mask", folder / "mask")
         self.sources = _sources(folder)
         truth = folder / "labels" / GROUND_TRUTH
         self.ground_truth = FrameFiles.of("labels", truth) if truth.is_dir() else None
@@ -74,12 +79,12 @@ class SceneFiles:
             raise ConfigError(f"{self.folder}: backbone '{backbone}' is not there; {hint}")
         return known[backbone]
 
-    def complete(self, incomplete: Literal["error", "skip"]) -> list[str]:
-        """Names of the frames with depth, a pose and labels of every backbone, in natural order.
+    def complete(self, incomplete: Literal["error", "skip"], needs: Literal["labels", "color"] = "labels") -> list[str]:
+        """Names of the frames with depth, a pose and labels of every backbone (or colour), in natural order.
 
         Raises DataError that lists missing files, unless such frames are to be skipped, or where no frame is complete.
         """
-        needed = [self.depth, self.pose, *self.sources.values()]
+        needed = [self.depth, self.pose, *(self.sources.values() if needs == "labels" else [self.color])]
         names = sorted({name for part in needed for name in part.files}, key=natural)
         missing = {name: [path for part in needed for path in part.missing(name)] for name in names}
         complete = [name for name in names if not missing[name]]
@@ -89,7 +94,7 @@ class SceneFiles:
                 f"{self.folder}: {listed(lost)}; add them, or set incomplete: skip to leave such frames out"
             )
         if not complete:
-            raise DataError(f"{self.folder}: no frame has depth, pose and labels ({listed(lost)})")
+            raise DataError(f"{self.folder}: no frame has depth, pose and {needs} ({listed(lost)})")
         if lost:
             logger.warning(
                 "%s: %d of %d frames left out: %s", self.folder, len(names) - len(complete), len(names), listed(lost)

@@ -35,6 +35,9 @@ class SceneSettings(Settings):
     depth_scale: float | None = Field(
         None, gt=0, allow_inf_nan=False, description="depth units per metre; 1000 for PNG, 1 for float files"
     )
+    depth_kind: Literal["planar", "ray"] | None = Field(
+        None, description="depth along the optical axis (planar, the default), or along the ray through the pixel"
+    )
     pose_convention: Literal["camera_to_world", "world_to_camera"] | None = Field(
         None, description="what the matrices in pose/ map; camera_to_world where not given"
     )

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Make .venv with everything that semstab and its tests need, system libraries of Open3D included.
-# Quick where there is nothing to do; run it through `make setup`.
+# Make .venv with semstab and what it needs, system libraries of Open3D included; `setup.sh dev`: and with what its tests
+# and checks need, PyTorch and transformers among it. Quick where there is nothing to do; run it through make.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -51,9 +51,11 @@ if ! .venv/bin/python -c '' 2>/dev/null; then
 fi
 
 # The strict editable install links files one by one, so it is renewed when files come or go.
-wanted=$( (cat setup.cfg pyproject.toml && find benchmark backends datasets configs -type f ! -path '*/__pycache__/*' | sort) | sha256sum)
-if [ "$(cat .venv/semstab-setup 2>/dev/null)" != "$wanted" ]; then
-    echo "setup: installing semstab into .venv"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' || stop "pip could not install semstab"
-    echo "$wanted" >.venv/semstab-setup
+extras=${1:+[$1]}
+wanted=$( (cat setup.cfg pyproject.toml && find benchmark backends backbones datasets configs -type f ! -path '*/__pycache__/*' | sort) | sha256sum)
+installed=$(cat .venv/semstab-setup 2>/dev/null || true)
+if [ "$installed" != "$wanted $extras" ] && [ "$installed" != "$wanted [dev]" ]; then
+    echo "setup: installing semstab$extras into .venv"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".$extras" || stop "pip could not install semstab"
+    echo "$wanted $extras" >.venv/semstab-setup
 fi

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.errors import DataError
 from semstab.frames import Frame
+from semstab.warp import DEPTH_TOLERANCE, correspond
 
 
 def flicker_percent(previous: Frame, current: Frame) -> float:
@@ -22,6 +25,38 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
             f"{current.where('depth')}: frames {previous.index} and {current.index} differ in size ({sizes})"
         )
     both = previous.valid & current.valid
-    changed = np.count_nonzero(both & (previous.predicted != current.predicted))
-    total = np.count_nonzero(both)
-    return 100.0 * changed / total if total else math.nan
+    return _share(both & (previous.predicted != current.predicted), both, whole=100.0)
+
+
+@dataclass(frozen=True)
+class CompensatedFlicker:
+    """Flicker between two views of the same surface points.
+
+    flicker_percent  of the co-visible pixels, those whose label differs; NaN where no pixel is co-visible
+    share            co-visible pixels, of the current frame's valid ones, 0 to 1; NaN where none is valid
+    """
+
+    flicker_percent: float
+    share: float
+
+
+def compensated_flicker(
+    previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE
+) -> CompensatedFlicker:
+    """Flicker after the previous frame's labels are warped into the current one, so that camera motion is not counted.
+
+    A pixel is co-visible where it is valid, the previous camera saw the same surface point (`semstab.warp.correspond`
+    with its occlusion test), and the pixel that saw it was valid too. Soft scores count by their largest class; the
+    frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
+
+    Raises ConfigError where depth_tolerance is not above 0 and below 1.
+    """
+    seen = correspond(current, previous, depth_tolerance=depth_tolerance)
+    covisible = current.valid & seen.bring(previous.valid, fill=False)
+    changed = covisible & (seen.bring(previous.predicted) != current.predicted)
+    return CompensatedFlicker(_share(changed, covisible, whole=100.0), _share(covisible, current.valid))
+
+
+def _share(part: npt.NDArray[np.bool_], of: npt.NDArray[np.bool_], whole: float = 1.0) -> float:
+    n = int(np.count_nonzero(of))
+    return whole * int(np.count_nonzero(part)) / n if n else math.nan

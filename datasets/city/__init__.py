@@ -75,6 +75,11 @@ class CityScene:
     def __len__(self) -> int:
         return self._options.frames
 
+    @cached_property
+    def timestamps(self) -> npt.NDArray[np.float64]:
+        """(len,) seconds since the flight began."""
+        return np.array([self._share(index) * self._flight.seconds for index in range(len(self))])
+
     @property
     def intrinsics(self) -> Intrinsics:
         """Of every frame: square pixels, the optical axis in the middle of the image."""
@@ -112,7 +117,7 @@ class CityScene:
             labels=labels,
             scores=scores,
             color=rendered.color,
-            timestamp=self._share(index) * self._flight.seconds,
+            timestamp=float(self.timestamps[index]),
             files={what: f"{where}, {what}" for what in ("depth", "pose", "labels", "scores", "color")},
         )
 

@@ -1,0 +1,191 @@
+"""How a scene's files are read: the configured way, the ways that people mistake for it, and what sets them."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from semstab.datasets.file_scene import FileScene
+from semstab.datasets.posed_folder import PosedScene
+from semstab.datasets.scene_settings import CAMERA_AXES, SETTINGS_FILE
+from semstab.frames import Frame
+
+Size = tuple[int, int]
+Ratio = tuple[float, float]
+
+POSES = ("camera_to_world", "world_to_camera")
+AXES = tuple(CAMERA_AXES)
+KINDS = ("planar", "ray")
+
+KNOWN_SCALES = (256.0, 1000.0, 4000.0, 5000.0, 6553.5, *(10.0**k for k in range(-6, 7)))
+"""Units of depth in a metre that datasets use."""
+
+SNAP = 0.1
+"""A depth scale that was found from the data may be a known one that is this close to it."""
+
+OPTION = "dataset.options."
+"""What the path of a dataset's option begins with."""
+
+RATIOS = (0.25, 0.5, 2.0, 4.0)
+"""Sizes that intrinsics are for, relative to the depth image, where they were not scaled with it; others come from the
+colour image, and from twice the principal point."""
+
+SAME_RATIO = 0.15
+"""Ratios nearer to each other, or to 1, are one: a principal point may lie off the middle."""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """One way to read a scene's files.
+
+    pose    what the pose matrices map
+    axes    the camera's axes in them
+    depth   planar, along the optical axis, or along the pixel's ray
+    factor  on depth, relative to the configured reading
+    ratio   size of the image that the intrinsics are for, relative to the configured one: width, height
+    """
+
+    pose: str = "camera_to_world"
+    axes: str = "opencv"
+    depth: str = "planar"
+    factor: float = 1.0
+    ratio: Ratio = (1.0, 1.0)
+
+    def differs_in(self, other: Convention) -> tuple[str, ...]:
+        """Names of the fields in which two conventions differ."""
+        names = (field.name for field in dataclasses.fields(self))
+        return tuple(name for name in names if getattr(self, name) != getattr(other, name))
+
+
+def alternatives(configured: Convention, ratios: tuple[Ratio, ...]) -> Iterator[Convention]:
+    """Every combination of pose, axes and kind of depth; with other intrinsics only planar or ray as configured.
+
+    The configured convention comes first; factors are searched for each of them.
+    """
+    yield configured
+    for pose, axes, depth in itertools.product(POSES, AXES, KINDS):
+        changed = dataclasses.replace(configured, pose=pose, axes=axes, depth=depth)
+        if changed != configured:
+            yield changed
+    for ratio, pose, axes in itertools.product(ratios, POSES, AXES):
+        yield dataclasses.replace(configured, pose=pose, axes=axes, ratio=ratio)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What is configured, and how a change of it is written down.
+
+    said     values by name of setting, those of scene.yaml and the dataset's options together
+    options  names and values of the dataset's options
+    size     (width, height) of the depth images
+    ratios   sizes that the intrinsics may be for, relative to what is said
+    file     the scene.yaml that says what no option does, where the dataset has one
+
+    depth_scale is units of stored depth in a metre, None where only the dataset's own files know.
+    """
+
+    said: Mapping[str, Any]
+    options: Mapping[str, Any]
+    size: Size
+    ratios: tuple[Ratio, ...]
+    file: str | None
+    depth_scale: float | None
+
+    @property
+    def convention(self) -> Convention:
+        """The configured convention."""
+        names = {"pose": "pose_convention", "axes": "camera_axes", "depth": "depth_kind"}
+        return Convention(**{field: self.said[name] for field, name in names.items() if name in self.said})
+
+    def usual_factor(self, factor: float) -> float:
+        """The factor that leads to a depth scale which datasets use, if one is near; else to one of three digits."""
+        now = 1.0 if self.depth_scale is None else self.depth_scale
+        near = min(KNOWN_SCALES, key=lambda known: abs(known * factor / now - 1))
+        return now / (near if abs(near * factor / now - 1) <= SNAP else float(f"{now / factor:.3g}"))
+
+    def size_after(self, ratio: Ratio) -> list[int]:
+        """[width, height] of the image that the intrinsics are for, where it is `ratio` times the configured one."""
+        said = self.said.get("intrinsics_size", self.size)
+        return [round(side * share) for side, share in zip(said, ratio, strict=True)]
+
+    def lines(self, convention: Convention) -> tuple[str, ...]:
+        """The lines of configuration that make the files be read that way: of scene.yaml, or of the options."""
+        said = {
+            "pose": ("pose_convention", convention.pose),
+            "axes": ("camera_axes", convention.axes),
+            "depth": ("depth_kind", convention.depth),
+            "factor": ("depth_scale", self._scale_after(convention.factor)),
+            "ratio": ("intrinsics_size", f"{self.size_after(convention.ratio)}"),
+        }
+        return tuple(self._line(*said[field]) for field in convention.differs_in(self.convention))
+
+    def _scale_after(self, factor: float) -> str:
+        if self.depth_scale is None:
+            return f"{1 / factor:.4g} times the present one"
+        return f"{self.depth_scale / factor:.5g}"
+
+    def advice(self, convention: Convention) -> str:
+        """Where the lines are to be written, and what else may be wrong."""
+        where, factor = self._where(self.lines(convention)), convention.factor
+        if factor == 1:
+            return where
+        times = f"{factor:.4g} times too short" if factor > 1 else f"{1 / factor:.4g} times too long"
+        poses = self.said.get("metres_per_unit")
+        unit = "the poses are not in metres" if poses is None else f"metres_per_unit is {poses / factor:.4g}"
+        return f"{where}; depth is {times}, or {unit}"
+
+    def _where(self, lines: tuple[str, ...]) -> str:
+        """Where such lines are to be written."""
+        them = "it" if len(lines) == 1 else "them"
+        names = {line.removeprefix(OPTION).partition(":")[0] for line in lines}
+        if any(not line.startswith(OPTION) for line in lines):
+            return f"set {them} in {self.file}"
+        if names <= set(self.options):
+            return f"set {them} in the configuration"
+        return "the dataset has no such option: convert it, then write it into the scene.yaml"
+
+    def _line(self, name: str, value: str) -> str:
+        in_file = self.file is not None and self.options.get(name) is None
+        return f"{'' if in_file else OPTION}{name}: {value}"
+
+
+def reading(
+    scene: Any, frame: Frame, options: Mapping[str, Any], color_shape: tuple[int, ...] | None = None
+) -> Reading:
+    """How a scene is configured. `frame` is one of its own; the shape (H, W, 3) of its colour suggests intrinsics."""
+    said = dict(options)
+    if isinstance(scene, PosedScene):
+        said |= scene.settings.model_dump()
+    elif isinstance(scene, FileScene):
+        said |= scene.options.model_dump()
+    height, width = frame.shape
+    return Reading(
+        said={name: value for name, value in said.items() if value is not None},
+        options=options,
+        size=(width, height),
+        ratios=tuple(_ratios(frame, color_shape)),
+        file=str(scene.folder / SETTINGS_FILE) if isinstance(scene, PosedScene) else None,
+        depth_scale=scene.depth_scale if isinstance(scene, PosedScene) else said.get("depth_scale"),
+    )
+
+
+def _ratios(frame: Frame, color_shape: tuple[int, ...] | None) -> Iterator[Ratio]:
+    """Sizes that the intrinsics may be for, relative to the depth image's."""
+    height, width = frame.shape
+    camera = frame.intrinsics
+    possible = [(one, one) for one in RATIOS]
+    if color_shape is not None:
+        possible.insert(0, (color_shape[1] / width, color_shape[0] / height))
+    possible.append(((2 * camera.cx + 1) / width, (2 * camera.cy + 1) / height))
+    kept: list[Ratio] = [(1.0, 1.0)]
+    for ratio in possible:
+        if min(ratio) > 0 and all(_apart(ratio, other) for other in kept):
+            kept.append(ratio)
+    yield from kept[1:]
+
+
+def _apart(ratio: Ratio, other: Ratio) -> bool:
+    return max(abs(a / b - 1) for a, b in zip(ratio, other, strict=True)) > SAME_RATIO

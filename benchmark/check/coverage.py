@@ -1,0 +1,258 @@
+"""What the frames of a scene share, how noisy their depth is, and what voxels that carries."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends import create
+from semstab.check.reprojection import Sample
+from semstab.check.views import Float64, Pair, View
+from semstab.frames import Frame
+from semstab.labels import IGNORE_8BIT
+
+CONSISTENT = 0.05
+"""A point that is seen again is taken for the same surface where the two depths differ by at most this share."""
+
+FUSED_FRAMES = 24
+"""Frames that are fused for the distribution of OP, evenly spaced over the selected ones."""
+
+FUSED_PIXELS = 2**18
+"""Pixels of each that are fused; of a larger image every n-th of each axis."""
+
+SIZES = tuple(m * 10.0**e for e in range(-3, 3) for m in (1, 2, 5))
+"""Voxel sizes that are suggested, metres."""
+
+STAYS = 0.5
+"""The suggested voxel size is the smallest in which this share of the points fall into the same voxel seen again."""
+
+PIXELS_ACROSS = 2
+"""The suggested pixel stride leaves this many pixels along a voxel's edge, at the far end of the depths."""
+
+SHARED = 0.6
+"""The suggested frame stride leaves this share of a frame's points in view of the next one."""
+
+BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
+"""Distances between frames that are told together."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What frames see of each other that lie `apart` selected frames apart, from the first to the last number.
+
+    in_view     share of a frame's points that lie in the other image
+    covisible   share of them that have depth there, too
+    error       median relative depth error of those
+    agreement   share of those on the same surface whose labels agree, NaN without labels
+    """
+
+    apart: tuple[int, int]
+    pairs: int
+    in_view: float
+    covisible: float
+    error: float
+    agreement: float
+
+
+@dataclass(frozen=True)
+class Persistence:
+    """The distribution of OP at a voxel size, from frames that were fused.
+
+    shares  of the voxels by stratum: OP = 1, OP = 2, 3 to 5, more
+    stays   share of the points that fall into the same voxel when another frame sees them
+    """
+
+    voxel_size: float
+    voxels: int
+    mean_op: float
+    shares: tuple[float, ...]
+    stays: float
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Of depth, metres: a point seen again is off by `between`, pixels of one frame by `within`; medians.
+
+    footprint  what a pixel covers at the median depth, metres
+    """
+
+    between: float
+    within: float
+    footprint: float
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Settings that suit the data, each with the reason; None where nothing can be said."""
+
+    voxel_size: float | None
+    voxel_size_reason: str
+    pixel_stride: int | None
+    pixel_stride_reason: str
+    frame_stride: int | None
+    frame_stride_reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Points of one view that another one sees on the same surface.
+
+    offset  (N,) metres between the two depths
+    first, second  (N, 3) the point, and the point of the pixel that sees it, in the world
+    agree   whether their labels agree, for those that have one in both
+    """
+
+    offset: Float64
+    first: Float64
+    second: Float64
+    agree: npt.NDArray[np.bool_]
+
+
+class Coverage:
+    """What the views of a sample share under the configured convention."""
+
+    def __init__(self, sample: Sample) -> None:
+        self.sample = sample
+        one = np.array([1.0])
+        self._matches = {pair: sample.matched(pair, sample.configured, one) for pair in sample.pairs}
+        self._seen = {pair: self._same_surface(pair) for pair in sample.pairs}
+
+    def overlaps(self) -> list[Overlap]:
+        """One row a distance between frames."""
+        rows = []
+        for low, high in BINS:
+            pairs = [(a, b) for a, b in self.sample.pairs if low <= abs(a - b) <= high]
+            if pairs:
+                rows.append(self._overlap((low, high), pairs))
+        return rows
+
+    def noise(self) -> Noise:
+        """How far depth is off, between frames and within one."""
+        offsets = [seen.offset for seen in self._seen.values()]
+        views = self.sample.views.values()
+        footprints = [view.depth[view.v, view.u] / view.camera.fx for view in views]
+        return Noise(
+            between=_median(np.concatenate(offsets)) if offsets else math.nan,
+            within=_median(np.concatenate([plane_residuals(view) for view in views])),
+            footprint=_median(np.concatenate(footprints)),
+        )
+
+    def stays(self, voxel_size: float) -> float:
+        """Share of the points that fall into the same voxel when another frame sees them; NaN where none does."""
+        seen = self._seen.values()
+        first, second = ([getattr(one, name) for one in seen] for name in ("first", "second"))
+        if not first:
+            return math.nan
+        same = np.floor(np.concatenate(first) / voxel_size) == np.floor(np.concatenate(second) / voxel_size)
+        return _mean(np.all(same, axis=1))
+
+    def _overlap(self, apart: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
+        matches = [self._matches[pair] for pair in pairs]
+        errors = np.concatenate([match.error[0] for match in matches])
+        agree = np.concatenate([self._seen[pair].agree for pair in pairs])
+        return Overlap(
+            apart=apart,
+            pairs=len(pairs),
+            in_view=_mean(np.concatenate([match.inside[0] for match in matches])),
+            covisible=_mean(np.isfinite(errors)),
+            error=_median(errors[np.isfinite(errors)]),
+            agreement=_mean(agree),
+        )
+
+    def _same_surface(self, pair: Pair) -> Seen:
+        a, b = self.sample.views[pair[0]], self.sample.views[pair[1]]
+        match = self._matches[pair]
+        same = match.error[0] <= CONSISTENT
+        u, v, depth = match.u[0][same], match.v[0][same], match.depth[0][same]
+        agree = np.empty(0, dtype=np.bool_)
+        if a.labels is not None and b.labels is not None:
+            first, second = a.labels[a.v[same], a.u[same]], b.labels[v, u]
+            agree = (first == second)[(first != a.ignore_id) & (second != b.ignore_id)]
+        return Seen(
+            offset=np.abs(depth - match.z[0][same]),
+            first=world_points(a, a.u[same], a.v[same]),
+            second=world_points(b, u, v),
+            agree=agree,
+        )
+
+
+def world_points(view: View, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]) -> Float64:
+    """(N, 3) world coordinates of kept pixels, metres."""
+    K = view.camera.every(view.stride)
+    depth = view.depth[v, u].astype(np.float64)
+    points = np.stack([(u - K.cx) / K.fx * depth, (v - K.cy) / K.fy * depth, depth], axis=1)
+    world: Float64 = points @ view.T_wc[:3, :3].T + view.T_wc[:3, 3]
+    return world
+
+
+def plane_residuals(view: View) -> Float64:
+    """Distance in metres of sampled depths from the plane through their two neighbours in the row, along the ray.
+
+    Inverse depth is linear in pixels on a plane: its second difference is noise, or the surface's curvature.
+    """
+    inner = (view.u > 0) & (view.u < view.depth.shape[1] - 1)
+    u, v = view.u[inner], view.v[inner]
+    with np.errstate(all="ignore"):
+        before, here, after = (1 / view.depth[v, u + step].astype(np.float64) for step in (-1, 0, 1))
+        residuals = np.abs((before + after) / 2 - here) / here**2
+    found: Float64 = residuals[np.isfinite(residuals)]
+    return found
+
+
+def persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, pixel_stride: int) -> Persistence:
+    """Fuse the views, every n-th pixel of them, and count how often each voxel is seen.
+
+    Raises DataError where a point lies further out than voxels of that size are counted.
+    """
+    backend = create("numba", voxel_size=voxel_size, num_classes=2)
+    for view in views:
+        backend.integrate(_without_labels(view, pixel_stride))
+    op = backend.table().op
+    edges = [0, 1, 2, 5, np.inf]
+    shares = tuple(_mean((low < op) & (op <= high)) for low, high in itertools.pairwise(edges))
+    return Persistence(voxel_size, len(op), _mean(op), shares, coverage.stays(voxel_size))
+
+
+def fused_stride(size: tuple[int, int], pixel_stride: int) -> int:
+    """The pixel stride at which frames of that (width, height) are fused: the run's, or a larger one."""
+    return max(pixel_stride, math.ceil(math.sqrt(size[0] * size[1] / FUSED_PIXELS)))
+
+
+def _without_labels(view: View, pixel_stride: int) -> Frame:
+    step = max(1, fused_stride(view.size, pixel_stride) // view.stride)
+    labels = np.where((view.depth > 0) & (view.depth < np.inf), 0, IGNORE_8BIT).astype(np.uint8)
+    return Frame(view.index, view.depth, view.camera.every(view.stride), view.T_wc, labels=labels).every(step)
+
+
+def suggest(coverage: Coverage, overlaps: Sequence[Overlap], stride: int) -> Suggestion:
+    """Voxel size, pixel stride and frame stride that suit the data; `stride` is the selected frames' own."""
+    voxel_size = next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
+    views = coverage.sample.views.values()
+    far = float(np.percentile(np.concatenate([view.depth[view.v, view.u] for view in views]), 95))
+    footprint = far / min(view.camera.fx for view in views)
+    pixels = None if voxel_size is None else max(1, int(voxel_size / (PIXELS_ACROSS * footprint)))
+    frames = max((row.apart[0] for row in overlaps if row.in_view >= SHARED), default=1)
+    near = overlaps[0].in_view if overlaps else math.nan
+    shared = {row.apart[0]: row.in_view for row in overlaps}.get(frames, near)
+    return Suggestion(
+        voxel_size=voxel_size,
+        voxel_size_reason=f"the smallest in which {STAYS:.0%} of the points fall again when another frame sees them",
+        pixel_stride=pixels,
+        pixel_stride_reason=f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m",
+        frame_stride=stride * frames,
+        frame_stride_reason=f"successive frames then share {shared:.0%} of their view",
+    )
+
+
+def _mean(values: npt.NDArray[Any]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def _median(values: npt.NDArray[Any]) -> float:
+    return float(np.median(values)) if len(values) else math.nan

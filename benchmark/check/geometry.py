@@ -1,0 +1,402 @@
+"""Do depth, poses and intrinsics agree, and if not, under which other convention would they?
+
+Every convention is judged by the median relative depth error of points that one frame sees again in another, and by
+the share of points that it sees again at all: an alternative with little overlap is no evidence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from semstab.check.conventions import Convention, Reading, alternatives
+from semstab.check.reprojection import Sample, median_of_seen
+from semstab.check.views import Float64
+
+DECADES: Float64 = np.power(10.0, np.arange(-5, 6))
+FINE: Float64 = np.power(10.0, np.arange(-30, 31) / 6)
+"""Factors on depth that are tried; the outermost decades only to see whether the ones inside are told apart."""
+
+LARGEST_FACTOR = 1e4
+"""Factors from 1 / this to this are reported."""
+
+MIN_POINTS = 100
+MIN_SHARE = 0.03
+"""A convention under which fewer points are seen again, in number or share, has no evidence for or against it."""
+
+LEAST_OF_OTHER = 0.2
+"""Nor has one that sees again less than this part of what the configured convention sees."""
+
+BETTER = 0.75
+MIN_GAIN = 0.001
+"""An error is clearly lower where it is at most this part of the other one, and lower by this (0.1 points)."""
+
+WON_PAIRS = 0.8
+"""An alternative must also be better in this share of the pairs of frames that both see, of those with ..."""
+
+PAIR_POINTS = 20
+"""... at least as many points seen again."""
+
+GOOD = 0.05
+"""A convention with a larger error is not proposed, and as configured it is not called sound."""
+
+STRIKING = 0.02
+"""Where the configured convention has no evidence, only an error as low as this refutes it, ..."""
+
+CONTRAST = 1 / 3
+"""... and only where it is at most this part of the error of every other convention."""
+
+HOPELESS_ERROR = 0.1
+HOPELESS_SHARE = 0.3
+HOPELESS_POINTS = 1000
+"""Where the configured error is larger at that much overlap, the data are unsound though nothing explains it."""
+
+SCALE_APART = 2.5
+"""Factors nearer to each other than this are one hypothesis about the unit, measured twice."""
+
+LEAST_SCALE_ERROR = 1.1
+"""Depth that is too long or too short by less is measurement, not a wrong unit."""
+
+MOST_RIVALS = 3
+"""Alternatives that are named beside the best one, where they fit as well."""
+
+SIMPLER = 1.1
+"""Of conventions whose errors differ by less than this factor, the one with the fewest changes is taken."""
+
+HARDLY_MOVES = 0.01
+HARDLY_TURNS = 1.0
+HARDLY_DEEP = 1.05
+"""Below these a reason is given for what frames cannot tell: motion as a share of the depth, degrees, and the ratio of
+the 90th to the 10th percentile of depth."""
+
+State = Literal["sound", "unsound", "unclear"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well depth reprojects under a convention.
+
+    error   median relative depth error of the points that are seen again; NaN where none is
+    share   of the sampled points that are seen again, 0 to 1
+    points  their number
+    """
+
+    convention: Convention
+    error: float
+    share: float
+    points: int
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether enough is seen again to judge by the error."""
+        return self.points >= MIN_POINTS and self.share >= MIN_SHARE
+
+    def clearly_beats(self, other: Fit) -> bool:
+        """Whether its error is clearly lower; one with enough overlap beats one with too little."""
+        if not other.has_evidence or other.share < LEAST_OF_OTHER * self.share:
+            return True
+        return self.error <= min(BETTER * other.error, other.error - MIN_GAIN)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a check of the geometry found.
+
+    state         sound; unsound; or unclear, where the frames do not tell
+    text          why, in one line
+    mend          lines of configuration that would mend it, where they are known
+    error, share  of the configured convention, see `Fit`
+    frames, pairs how many were looked at
+    undetermined  what these frames cannot tell, because an alternative fits as well, and the reason where it is known
+    fits          the configured convention and the alternatives of interest, by name
+    """
+
+    state: State
+    text: str
+    mend: tuple[str, ...] = ()
+    error: float = math.nan
+    share: float = 0.0
+    frames: int = 0
+    pairs: int = 0
+    undetermined: tuple[str, ...] = ()
+    reason: str = ""
+    fits: tuple[tuple[str, Fit], ...] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """What a run's manifest keeps."""
+        return {name: getattr(self, name) for name in ("state", "text", "error", "share", "frames", "pairs")}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object."""
+        rows = [{"name": name, **dataclasses.asdict(fit)} for name, fit in self.fits]
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {"fits": rows}
+
+
+def judge(sample: Sample, reading: Reading, *, thorough: bool) -> Verdict:
+    """Compare the configured convention with the alternatives; thorough: each with every factor on depth."""
+    return Judgement(sample, reading, thorough).verdict()
+
+
+class Judgement:
+    """The fits of every convention that was tried, and what they say together."""
+
+    def __init__(self, sample: Sample, reading: Reading, thorough: bool) -> None:
+        self.sample, self.reading = sample, reading
+        self.fits = list(_all_fits(sample, reading, thorough))
+        self.configured = next(fit for fit in self.fits if fit.convention == sample.configured)
+        self.fits += self._measured_scale(self.configured)
+
+    def verdict(self) -> Verdict:
+        """The verdict in words."""
+        if (best := self._best()) is not None:
+            return self._refuted(best)
+        return self._as(*(self._without_evidence() or self._unexplained() or self._in_agreement()))
+
+    def _without_evidence(self) -> tuple[State, str] | None:
+        mine = self.configured
+        if not any(len(view.u) for view in self.sample.views.values()):
+            return "unclear", "no pixel of the sampled frames has valid depth"
+        if not mine.has_evidence:
+            return "unclear", (
+                f"{mine.share:.1%} of the sampled points ({mine.points}) are seen again by another frame: too few to"
+                " tell whether depth and poses agree"
+            )
+        return None
+
+    def _unexplained(self) -> tuple[State, str] | None:
+        mine = self.configured
+        if mine.error > HOPELESS_ERROR and mine.share >= HOPELESS_SHARE and mine.points >= HOPELESS_POINTS:
+            return "unsound", (
+                f"depth reprojects with {mine.error:.0%} error, and no other convention explains it; do poses, depth"
+                " and intrinsics belong together, frame by frame?"
+            )
+        if mine.error > GOOD:
+            return "unclear", (
+                f"depth reprojects with {mine.error:.1%} error, and no other convention explains it; are poses and"
+                " depth this imprecise?"
+            )
+        return None
+
+    def _in_agreement(self) -> tuple[State, str]:
+        mine = self.configured
+        text = f"depth reprojects with {mine.error:.2%} median error, {mine.share:.0%} co-visible"
+        if all(self._is_undetermined(fit) for fit in self._single_changes() if _is_of_poses(fit, mine)):
+            return "unclear", f"{text}, but so it does under every other convention of the poses"
+        return "sound", text
+
+    def _as(self, state: State, text: str, mend: tuple[str, ...] = (), best: Fit | None = None) -> Verdict:
+        undetermined = self._undetermined() if state != "unsound" and self.configured.has_evidence else ()
+        return Verdict(
+            state=state,
+            text=text,
+            mend=mend,
+            error=self.configured.error,
+            share=self.configured.share,
+            frames=len(self.sample.views),
+            pairs=len(self.sample.pairs),
+            undetermined=undetermined,
+            reason=_reason(self.sample) if undetermined else "",
+            fits=tuple(self._shown(best)),
+        )
+
+    # --- another convention ------------------------------------------------------------------------------------------
+
+    def _best(self) -> Fit | None:
+        """The alternative that clearly beats the configured convention; where there are several, see `_rivals`."""
+        return self._refuting[0] if self._refuting else None
+
+    @cached_property
+    def _refuting(self) -> list[Fit]:
+        """The alternatives that show that the configured convention is wrong: the best one, then those as good."""
+        possible = sorted((fit for fit in self.fits if self._may_refute(fit)), key=lambda fit: fit.error)
+        best: Fit | None = None
+        found: list[Fit] = []
+        for fit in possible:
+            if best is not None and best.clearly_beats(fit):
+                break
+            if not any(_one_hypothesis(fit, other) for other in found) and self._is_confirmed(fit):
+                found.append(fit)
+                best = best or fit
+        return sorted(
+            map(self._rounded, found), key=lambda fit: (fit.error > SIMPLER * found[0].error, *self._changes(fit))
+        )
+
+    def _changes(self, fit: Fit) -> tuple[int, float]:
+        return len(fit.convention.differs_in(self.sample.configured)), fit.error
+
+    def _rounded(self, fit: Fit) -> Fit:
+        """The fit with its factor measured, then at the unit that datasets use where that is near and fits as well."""
+        if fit.convention.factor == 1:
+            return fit
+        measured = min([fit, *self._measured_scale(fit)], key=lambda one: one.error)
+        factor = self.reading.usual_factor(measured.convention.factor)
+        (known,) = _fits(self.sample, fit.convention, np.array([factor]))
+        return measured if measured.clearly_beats(known) else known
+
+    def _may_refute(self, fit: Fit) -> bool:
+        """Whether a fit has what it takes to refute the configured one, as far as that costs nothing to see."""
+        mine, factor = self.configured, fit.convention.factor
+        size = max(factor, 1 / factor)
+        if fit is mine or not fit.has_evidence or fit.share < LEAST_OF_OTHER * mine.share:
+            return False
+        if not mine.has_evidence and _one_hypothesis(fit, mine):
+            return False
+        if factor != 1 and not LEAST_SCALE_ERROR <= size <= 1.001 * LARGEST_FACTOR:
+            return False
+        return fit.clearly_beats(mine) and fit.error <= (GOOD if mine.has_evidence else STRIKING)
+
+    def _is_confirmed(self, fit: Fit) -> bool:
+        if fit.convention.factor != 1 and not self._scale_is_told(fit):
+            return False
+        return self._wins_pairs(fit) if self.configured.has_evidence else self._stands_out(fit)
+
+    def _scale_is_told(self, fit: Fit) -> bool:
+        """Whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
+        others = _fits(self.sample, fit.convention, fit.convention.factor * np.array([0.1, 10]))
+        return all(fit.clearly_beats(other) for other in others)
+
+    def _stands_out(self, fit: Fit) -> bool:
+        """Whether every convention with another motion between the frames fits far worse."""
+        near = (other for other in self.fits if other.has_evidence and other.error * CONTRAST < fit.error)
+        same_depth = (
+            dataclasses.replace(one, convention=dataclasses.replace(one.convention, depth=fit.convention.depth))
+            for one in near
+        )
+        return all(_one_hypothesis(fit, other) or self._moves_alike(fit, other) for other in same_depth)
+
+    def _wins_pairs(self, fit: Fit) -> bool:
+        """Whether the alternative is the better one pair by pair, too."""
+        errors = [
+            self.sample.errors(one.convention, np.array([one.convention.factor])) for one in (fit, self.configured)
+        ]
+        rows = [[(float(median_of_seen(e)[0]), int(np.isfinite(e).sum())) for e in es] for es in errors]
+        both = [(a, b) for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
+        return bool(both) and sum(a < b for a, b in both) >= WON_PAIRS * len(both)
+
+    def _moves_alike(self, fit: Fit, other: Fit) -> bool:
+        """Whether two conventions give the same motion between the frames; then they make the same map, but turned."""
+        if fit.convention.ratio != other.convention.ratio or fit.convention.depth != other.convention.depth:
+            return False
+        f, g = fit.convention.factor, other.convention.factor
+        motions = zip(self.sample.motions(fit.convention), self.sample.motions(other.convention), strict=True)
+        tolerance = 0.005 * _typical(self.sample, lambda depths: float(np.median(depths)))
+        return all(np.abs(R - Q).max() < 0.01 and np.abs(s / f - t / g).max() < tolerance for (R, s), (Q, t) in motions)
+
+    def _measured_scale(self, near: Fit) -> list[Fit]:
+        """Fits of the same convention with factors around a given one: between those of the search, then nearer."""
+        coarse = _fits(self.sample, near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
+        best = min(coarse, key=lambda fit: (math.isnan(fit.error), fit.error)).convention
+        fine = _fits(self.sample, best, best.factor * np.power(10.0, np.arange(-10, 11) / 720))
+        return [fit for fit in (*coarse, *fine) if fit.convention != near.convention]
+
+    def _refuted(self, best: Fit) -> Verdict:
+        mine, lines = self.configured, self.reading.lines(best.convention)
+        error = f"{mine.error:.1%} error" if mine.has_evidence else f"{mine.share:.1%} of the points seen again"
+        text = (
+            f"depth reprojects with {error} as configured, with {best.error:.2%} error under {', '.join(lines)}"
+            f" ({self.reading.advice(best.convention)})"
+        )
+        if rivals := [self._name(fit) for fit in self._refuting[1:]][:MOST_RIVALS]:
+            text += f"; these frames cannot tell it from {' or '.join(rivals)}"
+        return self._as("unsound", text, lines, best)
+
+    # --- what cannot be told -----------------------------------------------------------------------------------------
+
+    def _single_changes(self) -> Iterator[Fit]:
+        """The fits that differ from the configured convention in one thing; of factors only ten and a tenth."""
+        for fit in self.fits:
+            changed = fit.convention.differs_in(self.sample.configured)
+            decade = math.isclose(abs(math.log10(fit.convention.factor)), 1, abs_tol=1e-9)
+            if len(changed) == 1 and (changed != ("factor",) or decade):
+                yield fit
+
+    def _is_undetermined(self, fit: Fit) -> bool:
+        return not self.configured.clearly_beats(fit)
+
+    def _undetermined(self) -> tuple[str, ...]:
+        """Settings that could be otherwise; of scales and sizes the setting alone, of the others the value."""
+        names = []
+        for fit in filter(self._is_undetermined, self._single_changes()):
+            (changed,) = fit.convention.differs_in(self.sample.configured)
+            name = self._name(fit)
+            if changed in ("factor", "ratio"):
+                name = name.partition(":")[0]
+            elif changed != "depth" and self._moves_alike(self.configured, fit):
+                name += " (the same motion: the map is only turned)"
+            names.append(name)
+        return tuple(dict.fromkeys(names))
+
+    def _name(self, fit: Fit) -> str:
+        return ", ".join(self.reading.lines(fit.convention)) or "as configured"
+
+    def _shown(self, best: Fit | None) -> Iterator[tuple[str, Fit]]:
+        """The configured convention, the best one, and those that differ in one thing."""
+        yield "as configured", self.configured
+        if best is not None:
+            yield self._name(best), best
+        for fit in self._single_changes():
+            if best is None or fit.convention != best.convention:
+                yield self._name(fit), fit
+
+
+def _all_fits(sample: Sample, reading: Reading, thorough: bool) -> Iterator[Fit]:
+    one = np.array([1.0])
+    for convention in alternatives(sample.configured, reading.ratios):
+        known_camera = convention.ratio == (1.0, 1.0)
+        factors = (FINE if thorough or convention == sample.configured else DECADES) if known_camera else one
+        yield from _fits(sample, convention, factors)
+
+
+def _fits(sample: Sample, convention: Convention, factors: Float64) -> list[Fit]:
+    errors = sample.errors(convention, factors)
+    pooled = np.concatenate(errors, axis=1) if errors else np.empty((len(factors), 0))
+    points = np.isfinite(pooled).sum(axis=1)
+    medians = median_of_seen(pooled) if pooled.size else np.full(len(factors), np.nan)
+    return [
+        Fit(dataclasses.replace(convention, factor=f), median, n / max(1, pooled.shape[1]), n)
+        for f, median, n in zip(factors.tolist(), medians.tolist(), points.tolist(), strict=True)
+    ]
+
+
+def _one_hypothesis(fit: Fit, other: Fit) -> bool:
+    """Whether two conventions differ in no more than how exactly the unit of depth is known."""
+    a, b = fit.convention, other.convention
+    return 1 / SCALE_APART < a.factor / b.factor < SCALE_APART and set(a.differs_in(b)) <= {"factor"}
+
+
+def _is_of_poses(fit: Fit, mine: Fit) -> bool:
+    """Whether a fit differs from another one in what the poses mean, or in the unit."""
+    return set(fit.convention.differs_in(mine.convention)) <= {"pose", "axes", "factor"}
+
+
+def shifts_and_turns(sample: Sample) -> tuple[Float64, Float64]:
+    """For each pair how far the camera moves, as a share of the depth, and turns, in degrees."""
+    motions = sample.motions(sample.configured)
+    depth = _typical(sample, lambda depths: float(np.median(depths)))
+    shifts = np.array([np.linalg.norm(t) / depth for _, t in motions])
+    cosines = np.array([(np.trace(R) - 1) / 2 for R, _ in motions])
+    return shifts, np.rad2deg(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def _typical(sample: Sample, measure: Callable[[Float64], float]) -> float:
+    """The median over the views of a measure of their sampled depths; NaN where none has any."""
+    values = [measure(view.depth[view.v, view.u].astype(np.float64)) for view in sample.views.values() if len(view.u)]
+    return float(np.median(values)) if values else math.nan
+
+
+def _reason(sample: Sample) -> str:
+    """Why frames may not tell conventions apart, as far as their motion and depth show it."""
+    shifts, turns = shifts_and_turns(sample)
+    spread = _typical(sample, lambda depths: float(np.divide(*np.percentile(depths, (90, 10)))))
+    reasons = {
+        "the camera hardly moves": shifts.max() < HARDLY_MOVES,
+        "the camera hardly turns": turns.max() < HARDLY_TURNS,
+        "all depths are alike": spread < HARDLY_DEEP,
+    }
+    return " and ".join(reason for reason, holds in reasons.items() if holds)

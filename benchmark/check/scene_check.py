@@ -1,0 +1,310 @@
+"""The check of a scene: geometry, overlap, noise, persistence and labels, from a bounded sample of its frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semstab.check.conventions import Reading, reading
+from semstab.check.coverage import (
+    FUSED_FRAMES,
+    Coverage,
+    Noise,
+    Overlap,
+    Persistence,
+    Suggestion,
+    fused_stride,
+    persistence,
+    suggest,
+)
+from semstab.check.geometry import Verdict, judge, shifts_and_turns
+from semstab.check.histogram import Histogram, Tally
+from semstab.check.reprojection import Sample
+from semstab.check.views import View, clusters, evenly, label_source, pairs_within, reader
+from semstab.config import Config
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
+from semstab.datasets.file_scene import FileScene
+from semstab.datasets.posed_folder import PosedScene
+from semstab.datasets.selection import select_frames
+from semstab.errors import ConfigError, DataError
+from semstab.frames import Frame
+from semstab.labels import LabelSpace
+from semstab.plan import selected
+from semstab.prefetch import prefetch
+
+SCHEMA = 1
+"""Version of the file that --json writes."""
+
+CLUSTERS = 4
+POINTS = 8000
+LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
+"""About so many points are reprojected, from neighbouring frames at so many places of the sequence."""
+
+QUICK_POINTS = 2400
+CONFIRMING_CLUSTERS = 3
+"""The quick check looks at one place, and before it refuses data at so many."""
+
+LABELLED_FRAMES = 8
+"""Frames in which the labels of every backbone but the first are counted."""
+
+VOXEL_FACTORS = (0.5, 1.0, 2.0)
+"""Voxel sizes for which the distribution of OP is told, relative to the configured one."""
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Of the sampled frames: share of valid pixels, and percentiles of their depth, metres."""
+
+    valid: float
+    p5: float
+    p50: float
+    p95: float
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far the camera moves between the compared frames, smallest and largest: share of the depth, and degrees."""
+
+    shift: tuple[float, float]
+    turn: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """All that is known about a scene from its sample; `verdict` alone is about geometry.
+
+    Where the geometry is unsound nothing is said about overlap, noise and voxels.
+    """
+
+    scene: str
+    frames: int
+    selected: int
+    size: tuple[int, int]
+    depth: Depth
+    motion: Motion | None
+    verdict: Verdict
+    labels: tuple[Histogram, ...]
+    overlaps: tuple[Overlap, ...] = ()
+    noise: Noise | None = None
+    fused_frames: int = 0
+    fused_stride: int = 1
+    persistence: tuple[Persistence, ...] = ()
+    suggestion: Suggestion | None = None
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What makes the scene unsound, one line each."""
+        geometry = [self.verdict.text] if self.verdict.state == "unsound" else []
+        if self.depth.valid == 0:
+            geometry.append("no pixel of the sampled frames has valid depth; check the files and depth_scale")
+        return tuple(geometry) + tuple(labels.problem for labels in self.labels if labels.problem is not None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object."""
+        content = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        return content | {"problems": list(self.problems), "sound": not self.problems}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Verdict):
+        return value.to_dict()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def check(config: Config) -> Iterator[SceneCheck]:
+    """Check the scenes that a resolved configuration selects, one by one.
+
+    Raises ConfigError or DataError where there is no such scene or a file cannot be read.
+    """
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
+        yield check_scene(dataset.scene(name), config)
+
+
+def check_scene(scene: Scene, config: Config) -> SceneCheck:
+    """Check one scene under the configuration's selection of frames, backbones, taxonomy, voxel size and stride."""
+    indices = select_frames(scene, config.frames)
+    if not indices:
+        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
+    extra = (GROUND_TRUTH,) if scene.ground_truth else ()
+    backbones = list(selected(config.backbones, scene.backbones, extra, "backbone", scene.name))
+    first = backbones[0] if backbones else label_source(scene)
+    look = Look(scene, indices, (first,), clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True)
+    sample, how = look.sample(config.dataset.options), look.reading(config.dataset.options)
+    verdict = judge(sample, how, thorough=True)
+    checked = SceneCheck(
+        scene=scene.name,
+        frames=len(scene),
+        selected=len(indices),
+        size=how.size,
+        depth=look.depth(),
+        motion=_motion(sample),
+        verdict=verdict,
+        labels=tuple(_labels(scene, name, indices, config, look) for name in backbones),
+    )
+    return checked if verdict.state == "unsound" else _with_coverage(checked, look, sample, config)
+
+
+def quick_check(
+    scene: Scene, indices: Sequence[int], backbone: str, options: Mapping[str, Any] | None = None
+) -> Verdict:
+    """Do depth and poses of a scene agree? Reads four frames, and only before it calls them unsound some more.
+
+    `options` are the dataset's, for the advice. A frame that cannot be read is passed over: whoever needs it says so.
+    """
+    sources = _cheap_sources(scene, backbone)
+    verdict = Verdict("unclear", "it takes two frames to tell whether depth and poses agree")
+    for count in (1, CONFIRMING_CLUSTERS):
+        look = Look(scene, indices, sources, clusters(len(indices), count), QUICK_POINTS, passing_over=True)
+        if len(look.views) < 2:
+            continue
+        verdict = judge(look.sample(options or {}), look.reading(options or {}), thorough=False)
+        if verdict.state != "unsound":
+            break
+    return verdict
+
+
+def require_sound(
+    scene: Scene, indices: Sequence[int], backbone: str, options: Mapping[str, Any] | None = None
+) -> Verdict:
+    """The verdict of `quick_check`. Raises DataError where depth and poses contradict each other."""
+    verdict = quick_check(scene, indices, backbone, options)
+    if verdict.state == "unsound":
+        raise DataError(
+            f"{scene.name}: {verdict.text}; `semstab-bench check` tells more, --trust-geometry fuses it as it is"
+        )
+    return verdict
+
+
+def _cheap_sources(scene: Scene, backbone: str) -> tuple[str | None, ...]:
+    """Label sources with which frames are read for their depth alone, the cheapest first; None reads no labels."""
+    if isinstance(scene, PosedScene | FileScene):
+        return (None,)
+    return (GROUND_TRUTH, backbone) if scene.ground_truth else (backbone,)
+
+
+class Look:
+    """The frames of a scene that a check reads, thinned as they come in.
+
+    sources       label sources to read frames with, the next one where that fails; None reads no labels
+    groups        positions in `indices` of frames that are compared with each other
+    points        about how many points are reprojected in all
+    fused         number of frames, evenly spaced, that are kept for fusing, too
+    passing_over  leave out frames that cannot be read, instead of raising what reading them raises
+    with_color    also look at the size of a colour image: intrinsics may be for that
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        indices: Sequence[int],
+        sources: Sequence[str | None],
+        groups: Sequence[Sequence[int]],
+        points: int,
+        *,
+        fused: int = 0,
+        passing_over: bool = False,
+        with_color: bool = False,
+    ) -> None:
+        self.scene = scene
+        self.tally = Tally(sources[0] or "")
+        self.views: dict[int, View] = {}
+        self.fused = evenly(len(indices), fused)
+        self._first: Frame | None = None
+        self._pairs = pairs_within(groups)
+        self._compared = {position for group in groups for position in group}
+        self._points = min(MOST_POINTS_A_VIEW, max(LEAST_POINTS_A_VIEW, points // max(1, len(self._pairs))))
+        self._labelled = sources[0] is not None
+        self._color_shape = _color_shape(scene, indices[0]) if with_color else None
+        self._read(indices, [reader(scene, source) for source in sources], passing_over)
+
+    def _read(self, indices: Sequence[int], readers: Sequence[Callable[[int], Frame]], passing_over: bool) -> None:
+        def attempt(index: int) -> Frame | None:
+            for read in readers:
+                try:
+                    return read(index)
+                except DataError:
+                    if not passing_over:
+                        raise
+            return None
+
+        positions = sorted(self._compared | set(self.fused))
+        for position, fetched in zip(positions, prefetch(attempt, [indices[p] for p in positions]), strict=True):
+            if (frame := fetched.item) is not None:
+                self._first = self._first or frame
+                self.tally.add(frame)
+                self.views[position] = View.of(frame, self._points, labelled=self._labelled)
+
+    def reading(self, options: Mapping[str, Any]) -> Reading:
+        """How the scene is configured."""
+        assert self._first is not None
+        return reading(self.scene, self._first, options, self._color_shape)
+
+    def sample(self, options: Mapping[str, Any]) -> Sample:
+        """The frames that are compared."""
+        views = {position: view for position, view in self.views.items() if position in self._compared}
+        pairs = [pair for pair in self._pairs if pair[0] in views and pair[1] in views]
+        return Sample(views, pairs, self.reading(options).convention)
+
+    def depth(self) -> Depth:
+        """Of all frames that were read."""
+        valid = [np.mean((view.depth > 0) & (view.depth < np.inf)) for view in self.views.values()]
+        depths = np.concatenate([view.depth[view.v, view.u] for view in self.views.values()])
+        p5, p50, p95 = np.percentile(depths, (5, 50, 95)) if len(depths) else (np.nan,) * 3
+        return Depth(float(np.mean(valid)), float(p5), float(p50), float(p95))
+
+
+def _color_shape(scene: Scene, index: int) -> tuple[int, ...] | None:
+    """(H, W, 3) of a frame's colour image, where it has one of its own size."""
+    color = scene.color(index) if isinstance(scene, PosedScene | FileScene) else None
+    return None if color is None else color.shape
+
+
+def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Config) -> SceneCheck:
+    """What can be said about overlap, noise and voxels, where depth and poses may agree."""
+    coverage = Coverage(sample)
+    overlaps = coverage.overlaps()
+    noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
+    views = [look.views[position] for position in look.fused]
+    stride = fused_stride(checked.size, config.pixel_stride)
+    sizes = [config.voxel_size * factor for factor in VOXEL_FACTORS]
+    return dataclasses.replace(
+        checked,
+        overlaps=tuple(overlaps),
+        noise=noise,
+        fused_frames=len(views),
+        fused_stride=stride,
+        persistence=tuple(persistence(views, coverage, size, stride) for size in sizes),
+        suggestion=None if noise is None else suggest(coverage, overlaps, config.frames.stride),
+    )
+
+
+def _motion(sample: Sample) -> Motion | None:
+    """How far the camera moves and turns from one compared frame to another."""
+    if not sample.pairs:
+        return None
+    shifts, turns = shifts_and_turns(sample)
+    return Motion((float(shifts.min()), float(shifts.max())), (float(turns.min()), float(turns.max())))
+
+
+def _labels(scene: Scene, backbone: str, indices: Sequence[int], config: Config, look: Look) -> Histogram:
+    """The labels of a backbone: of the frames that were read already, or of a few read for it."""
+    tally = look.tally
+    if backbone != tally.backbone:
+        tally = Tally(backbone)
+        chosen = [indices[position] for position in evenly(len(indices), LABELLED_FRAMES)]
+        for fetched in prefetch(reader(scene, backbone), chosen):
+            tally.add(fetched.item)
+    try:
+        space = scene.label_space(backbone)
+    except DataError as error:
+        return tally.histogram(None, str(error))
+    if config.taxonomy is not None:
+        space.mapping_to(LabelSpace.load(config.taxonomy))
+    return tally.histogram(space)

@@ -1,0 +1,132 @@
+"""Label maps and scores of a scene wherever they stand: which sources there are, and the file of each frame."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from semstab.datasets import GROUND_TRUTH
+from semstab.datasets.file_options import FileOptions
+from semstab.datasets.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
+from semstab.datasets.scene_files import LABEL_SPACE_FILE
+from semstab.datasets.templates import Folders, Template, inside, matching_folders
+from semstab.errors import ConfigError
+from semstab.labels import LabelSpace
+
+logger = logging.getLogger("semstab")
+
+Kind = Literal["labels", "scores"]
+SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES}
+DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
+SEPARATE = "{scene}/{backbone}/{name}"
+"""The template of label maps in a folder of their own."""
+
+
+@dataclass(frozen=True)
+class LabelSource:
+    """One label source of a scene: the path of each frame, and the file that is there."""
+
+    kind: Kind
+    expected: Mapping[str, Path]
+    files: Mapping[str, Path]
+
+    def missing(self, name: str) -> list[str]:
+        """Nothing, or the path that the file of that frame would have."""
+        if name in self.files:
+            return []
+        path = self.expected[name]
+        return [str(path if path.suffix.lower() in SUFFIXES[self.kind] else f"{path}{SUFFIXES[self.kind][0]}")]
+
+
+@dataclass(frozen=True)
+class ScenePlace:
+    """A scene's name, its folder, and its path below root, which {scene} in templates stands for."""
+
+    name: str
+    folder: Path
+    below_root: str
+
+
+def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> dict[str, LabelSource]:
+    """The label sources of a scene whose frames have these names; `gt` is the ground truth.
+
+    labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
+    else is there. A folder without a file of any frame is left out with a warning.
+    Raises ConfigError for a template that cannot be used, or a labels_root that is not there, DataError for a folder
+    that cannot be listed.
+    """
+    folders, found = Folders(), {}
+    base = place.folder if options.labels_root is None else options.labels_root
+    if not base.is_dir():
+        raise ConfigError(f"{base}: there is no such folder; mend labels_root")
+    for kind in ("labels", "scores"):
+        for backbone, template in _templates(kind, options, place, base).items():
+            source = _source(kind, base, template, names, folders)
+            name = f"{backbone}-scores" if kind == "scores" and not isinstance(options.scores, dict) else backbone
+            if name in found:
+                raise ConfigError(f"{place.folder}: two label sources are called '{name}'; rename one")
+            if source.files:
+                found[name] = source
+            elif names:
+                logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(names[0])[0])
+    if not found and (options.labels or options.scores or options.labels_root):
+        logger.warning("%s: no label maps in %s fit the options labels and scores", place.name, base)
+    if options.ground_truth and GROUND_TRUTH not in found:
+        truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
+        source = _source("labels", place.folder, truth.filled(scene=place.below_root), names, folders)
+        found |= {GROUND_TRUTH: source} if source.files else {}
+    return found
+
+
+def find_masks(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> Mapping[str, Path]:
+    """The mask of each frame that has one, by the frame's name; none without the option."""
+    if options.masks is None:
+        return {}
+    template = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=place.below_root)
+    folders = Folders()
+    paths = {name: inside(place.folder, place.folder, template.replace("{name}", name), "masks") for name in names}
+    found = {name: folders.one_of(path, MASK_SUFFIXES) for name, path in paths.items()}
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) -> dict[str, str]:
+    """By backbone, a template in which only {name} is left."""
+    said = options.labels if kind == "labels" else options.scores
+    if isinstance(said, dict):
+        templates = {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in said.items()}
+        return {key: template.filled(scene=place.below_root) for key, template in templates.items()}
+    if said is None and options.labels_root is not None:
+        if kind == "scores":
+            return {}
+        said = SEPARATE
+    template = Template(
+        kind, DEFAULTS[kind] if said is None else said, ("scene", "backbone", "name"), ("backbone", "name")
+    )
+    return matching_folders(base, template, "backbone", scene=place.below_root)
+
+
+def _source(kind: Kind, base: Path, template: str, names: Iterable[str], folders: Folders) -> LabelSource:
+    """The files of one source, by the frames' names."""
+    expected = {name: inside(base, base, template.replace("{name}", name), str(base)) for name in names}
+    found = ((name, folders.one_of(path, SUFFIXES[kind])) for name, path in expected.items())
+    return LabelSource(kind, expected, {name: path for name, path in found if path is not None})
+
+
+def label_spaces(options: FileOptions, sources: Mapping[str, LabelSource]) -> dict[str, LabelSpace | None]:
+    """The label space of each source: that of option taxonomies, else of a label_space.yaml beside its maps, else that
+    of all; None where nothing says it. Raises ConfigError for one that cannot be used.
+    """
+    shared: LabelSpace | None = None
+    if options.classes is not None:
+        shared = LabelSpace(name="classes of the dataset", classes=options.classes)
+    elif options.taxonomy is not None:
+        shared = LabelSpace.load(options.taxonomy)
+    spaces = {}
+    for name, source in sources.items():
+        beside = next(iter(source.files.values())).parent / LABEL_SPACE_FILE
+        own = options.taxonomies.get(name, beside if beside.is_file() else None)
+        spaces[name] = shared if own is None else LabelSpace.load(own)
+    return spaces

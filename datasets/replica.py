@@ -1,0 +1,119 @@
+"""Replica in its two exports: that of NICE-SLAM (results/, traj.txt) and that of Semantic-NeRF (rgb/, depth/, ...).
+
+Sources: Zhu et al., NICE-SLAM, CVPR 2022; Zhi et al., Semantic-NeRF, ICCV 2021; Straub et al., Replica, 2019.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from semstab.datasets.cameras import Camera, camera_of
+from semstab.datasets.file_options import (
+    CameraAxes,
+    FileOptions,
+    FourIntrinsics,
+    GroundTruth,
+    PoseConvention,
+    UpAxis,
+    VoidIds,
+    zero_is_void,
+)
+from semstab.datasets.file_scene import FrameSource
+from semstab.datasets.json_files import number, read_object
+from semstab.datasets.scene_search import FileDataset, files_named, require_equal
+from semstab.datasets.templates import Folders
+from semstab.datasets.text_tables import read_table
+from semstab.errors import DataError
+
+
+@dataclass(frozen=True)
+class Export:
+    """Where one of the two exports has its files, and its camera where no file says it."""
+
+    trajectory: str
+    depth: str
+    color: str
+    depth_scale: float
+    intrinsics: tuple[float, float, float, float]
+    size: tuple[int, int]
+
+
+NICE_SLAM = Export("traj.txt", "results/depth", "results/frame", 6553.5, (600, 600, 599.5, 339.5), (1200, 680))
+SEMANTIC_NERF = Export("traj_w_c.txt", "depth/depth_", "rgb/rgb_", 1000, (320, 320, 319.5, 239.5), (640, 480))
+EXPORTS = (NICE_SLAM, SEMANTIC_NERF)
+
+
+class ReplicaOptions(FileOptions):
+    """What the formats say, and may be said otherwise; the depth scale is 6553.5 or 1000, by export."""
+
+    pose_convention: PoseConvention = "camera_to_world"
+    camera_axes: CameraAxes = "opencv"
+    up_axis: UpAxis = "z"
+    intrinsics: FourIntrinsics = None
+    ground_truth: GroundTruth = "semantic_class/semantic_class_{name}.png"
+    void_ids: VoidIds = Field(default_factory=zero_is_void)
+
+
+class Replica(FileDataset[ReplicaOptions]):
+    """{name} is the number in the file's name: 000012 of results/frame000012.jpg, 12 of rgb/rgb_12.png."""
+
+    Options: type[BaseModel] = ReplicaOptions
+    looks_like = "results/ and traj.txt (NICE-SLAM's export), or depth/ and traj_w_c.txt (Semantic-NeRF's)"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether the trajectory of one of the exports is there."""
+        return _export(folder) is not None
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a depth image. Raises DataError where there are not as many poses."""
+        export = _export(folder)
+        assert export is not None
+        path, folders = folder / export.trajectory, Folders()
+        poses = read_table(path, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
+        where, _, before = export.depth.rpartition("/")
+        images = files_named(folder / where, before, ".png")
+        require_equal(path, len(poses), len(images), "depth images")
+        camera, scale = self._camera(folder, export)
+        return [
+            FrameSource(
+                name=name,
+                depth=depth,
+                pose=pose,
+                pose_file=path,
+                camera=camera,
+                color=folders.one_of(folder / f"{export.color}{name}", (".jpg", ".png")),
+                depth_scale=scale,
+            )
+            for (name, depth), pose in zip(images.items(), poses, strict=True)
+        ]
+
+    def _camera(self, folder: Path, export: Export) -> tuple[Camera, float]:
+        """The camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""
+        numbers, size, scale = export.intrinsics, export.size, export.depth_scale
+        path = next((path for path in (folder, folder.parent) if (path / "cam_params.json").is_file()), None)
+        if path is not None:
+            numbers, size, scale = _cam_params(path / "cam_params.json")
+        return camera_of(self.options.intrinsics, numbers, size), scale
+
+
+def _export(folder: Path) -> Export | None:
+    there = (e for e in EXPORTS if (folder / e.trajectory).is_file() and (folder / e.depth).parent.is_dir())
+    return next(there, None)
+
+
+def _cam_params(path: Path) -> tuple[tuple[float, float, float, float], tuple[int, int], float]:
+    """fx fy cx cy, (width, height) and the depth scale of cam_params.json."""
+    camera: Any = read_object(path).get("camera")
+    if not isinstance(camera, Mapping):
+        raise DataError(f"{path}: there is no 'camera' in it; download it again, or set intrinsics")
+    fx, fy, cx, cy, width, height, scale = (
+        number(camera, key, str(path)) for key in ("fx", "fy", "cx", "cy", "w", "h", "scale")
+    )
+    if not (width >= 1 and height >= 1 and scale > 0):
+        raise DataError(f"{path}: w, h and scale must be positive, got {width:g}, {height:g}, {scale:g}")
+    return (fx, fy, cx, cy), (int(width), int(height)), scale

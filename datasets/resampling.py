@@ -1,0 +1,71 @@
+"""Label maps and scores brought to the pixels of the depth image: nearest for ids, linear for scores."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.datasets.images import Labels
+from semstab.frames import Intrinsics
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+
+TIE = 1e-6
+"""Pixels by which a position between two pixels is moved on, so that ties do not depend on rounding."""
+
+FAR = 2.0**40
+"""Pixels from which a position is anyway outside of any image, and still a whole number when it is rounded."""
+
+
+def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Labels:
+    """The label map as a camera with K_depth and an image (H, W) sees it: of each pixel the nearest label.
+
+    K is that of the label map. Both images share centre and axes. What K does not see is ignored.
+    """
+    v, u = _positions(K, K_depth, shape)
+    rows, columns = (np.floor(x + 0.5 + TIE).astype(np.intp) for x in (v, u))
+    H, W = labels.shape
+    fitted: Labels = labels[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
+    outside = ~(_within(rows, H)[:, None] & _within(columns, W))
+    fitted[outside] = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+    return fitted
+
+
+def fit_scores(
+    scores: npt.NDArray[np.floating[Any]], K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]
+) -> npt.NDArray[np.floating[Any]]:
+    """Scores (H', W', K) as a camera with K_depth and an image (H, W) sees them: linear between pixel centres.
+
+    Beyond the outer centres the outer pixels hold. Pixels that K does not see get scores of 0, which no one uses.
+    """
+    v, u = _positions(K, K_depth, shape)
+    wide = scores.astype(np.result_type(scores.dtype, np.float32), copy=False)
+    fitted = _linear(_linear(wide, v, axis=0), u, axis=1)
+    inside = (_within(v, scores.shape[0])[:, None]) & _within(u, scores.shape[1])
+    return np.where(inside[..., None], fitted, wide.dtype.type(0))
+
+
+def _positions(
+    K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Row of each row, column of each column of the depth image in the other one, in pixels."""
+    v = K.fy * (np.arange(shape[0], dtype=np.float64) - K_depth.cy) / K_depth.fy + K.cy
+    u = K.fx * (np.arange(shape[1], dtype=np.float64) - K_depth.cx) / K_depth.fx + K.cx
+    return v.clip(-FAR, FAR), u.clip(-FAR, FAR)
+
+
+def _within(positions: npt.NDArray[Any], length: int) -> npt.NDArray[np.bool_]:
+    """Whether positions lie on the area of the pixels 0 to length - 1."""
+    return (positions >= -0.5 - TIE) & (positions < length - 0.5 + TIE)
+
+
+def _linear(values: npt.NDArray[Any], at: npt.NDArray[np.float64], axis: int) -> npt.NDArray[Any]:
+    """Values between the pixel centres of one axis."""
+    last = values.shape[axis] - 1
+    x = at.clip(0, last)
+    low = np.floor(x).astype(np.intp)
+    share = (x - low).astype(values.dtype).reshape([-1 if k == axis else 1 for k in range(values.ndim)])
+    below, above = values.take(low, axis), values.take(np.minimum(low + 1, last), axis)
+    mixed: npt.NDArray[Any] = np.where(share == 0, below, below * (1 - share) + above * share)
+    return mixed

@@ -1,0 +1,125 @@
+"""ScanNet as its SensReader exports it: color/, depth/, pose/, intrinsic/, and label-filt/.
+
+Source: Dai et al., ScanNet, CVPR 2017, and SensReader/python (github.com/ScanNet/ScanNet).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, Field
+
+from semstab.datasets import GROUND_TRUTH
+from semstab.datasets.cameras import Camera
+from semstab.datasets.disk import read_bytes
+from semstab.datasets.file_options import (
+    CameraAxes,
+    DepthScale,
+    FileOptions,
+    GroundTruth,
+    PoseConvention,
+    Size,
+    UpAxis,
+    VoidIds,
+    zero_is_void,
+)
+from semstab.datasets.file_scene import NO_ID, FrameSource
+from semstab.datasets.scene_search import FileDataset, files_named
+from semstab.datasets.templates import Folders
+from semstab.datasets.text_files import read_intrinsics
+from semstab.errors import DataError
+from semstab.labels import IGNORE_16BIT
+
+Which = Literal["depth", "color"]
+
+
+class ScanNetOptions(FileOptions):
+    """What the format says, and may be said otherwise."""
+
+    depth_scale: DepthScale = 1000
+    pose_convention: PoseConvention = "camera_to_world"
+    camera_axes: CameraAxes = "opencv"
+    up_axis: UpAxis = "z"
+    ground_truth: GroundTruth = "label-filt/{name}.png"
+    void_ids: VoidIds = Field(default_factory=zero_is_void)
+    intrinsics: Which = Field("depth", description="whose intrinsics the depth images have: those of depth or colour")
+    label_camera: Which = Field("color", description="whose field of view label maps have: that of colour or depth")
+    color_size: Size = (1296, 968)
+    class_table: Path | None = Field(
+        None, description="scannetv2-labels.combined.tsv: translates the ids of the ground truth"
+    )
+    class_column: str = Field("nyu40id", description="column of that table with the ids of the taxonomy")
+
+
+class ScanNet(FileDataset[ScanNetOptions]):
+    """{name} is the frame's number: 120. A frame whose pose is -inf has lost tracking."""
+
+    Options: type[BaseModel] = ScanNetOptions
+    looks_like = "depth/, pose/ and intrinsic/intrinsic_depth.txt"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether depth/, pose/ and the intrinsics of the depth are there."""
+        return (folder / "depth").is_dir() and (folder / "pose").is_dir() and _matrix_file(folder, "depth").is_file()
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a depth image."""
+        folders = Folders()
+        camera = self._camera(folder, self.options.intrinsics)
+        label_camera = None
+        if self.options.label_camera != self.options.intrinsics and _matrix_file(folder, "color").is_file():
+            label_camera = self._camera(folder, self.options.label_camera)
+        return [
+            FrameSource(
+                name=name,
+                depth=depth,
+                pose=folder / f"pose/{name}.txt",
+                pose_file=folder / f"pose/{name}.txt",
+                camera=camera,
+                label_camera=label_camera,
+                color=folders.one_of(folder / f"color/{name}", (".jpg", ".png")),
+            )
+            for name, depth in files_named(folder / "depth", "", ".png").items()
+        ]
+
+    def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
+        """The ids of the ground truth as those of the class table's column, where a table is given."""
+        table = self.options.class_table
+        return {} if table is None else {GROUND_TRUTH: read_class_table(table, self.options.class_column)}
+
+    def _camera(self, folder: Path, which: Which) -> Camera:
+        size = self.options.color_size if which == "color" else None
+        return Camera(read_intrinsics(_matrix_file(folder, which)), size)
+
+
+def read_class_table(path: Path, column: str) -> npt.NDArray[np.uint16]:
+    """(65536,) the column's id for each ScanNet id; `IGNORE_16BIT` where the column is empty, `NO_ID` where no row is.
+
+    Raises DataError for a file without the columns, or an id that is no whole number.
+    """
+    lines = read_bytes(path).decode("utf-8-sig", errors="replace").splitlines()
+    header = lines[0].split("\t") if lines else []
+    if "id" not in header or column not in header:
+        raise DataError(f"{path}: there are no columns 'id' and '{column}'; set class_column to one it has")
+    table = np.full(1 << 16, NO_ID, dtype=np.uint16)
+    table[[0, IGNORE_16BIT]] = 0, IGNORE_16BIT
+    for number, line in enumerate(lines[1:], start=2):
+        row = dict(zip(header, line.split("\t"), strict=False))
+        table[_id(row.get("id"), path, number)] = _id(row[column], path, number) if row.get(column) else IGNORE_16BIT
+    return table
+
+
+def _id(text: str | None, path: Path, line: int) -> int:
+    if text is None or not (text.isascii() and text.isdecimal() and len(text) < 6 and int(text) < NO_ID):
+        raise DataError(f"{path}: line {line} has the id {str(text)[:20]!r}; not a table of classes of ScanNet")
+    return int(text)
+
+
+def _matrix_file(folder: Path, which: Which) -> Path:
+    """Of SensReader's export, or of the export of 25,000 frames."""
+    path = folder / f"intrinsic/intrinsic_{which}.txt"
+    other = folder / f"intrinsics_{which}.txt"
+    return other if not path.is_file() and other.is_file() else path

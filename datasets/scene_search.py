@@ -1,0 +1,124 @@
+"""The scenes below a folder, and the dataset of files that opens them."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.datasets.disk import natural, subfolders
+from semstab.datasets.file_options import FileOptions
+from semstab.datasets.file_scene import FileScene, FrameSource
+from semstab.datasets.label_source import ScenePlace
+from semstab.datasets.scene_files import nearest
+from semstab.errors import ConfigError, DataError
+
+DEEPEST = 3
+"""Levels of folders below root that are searched for scenes."""
+
+
+Options = TypeVar("Options", bound=FileOptions)
+
+
+class FileDataset(ABC, Generic[Options]):
+    """Scenes of files below a root. A reader says what a scene's folder looks like, and lists its frames.
+
+    Raises DataError where there is no scene.
+    """
+
+    looks_like: str
+    """What a scene's folder holds, as errors say it."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        places = find_scenes(options.root, self.is_scene, self.looks_like)
+        self._places = {place.name: place for place in places}
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes, in natural order: their paths below root, with - between folders."""
+        return tuple(self._places)
+
+    def scene(self, name: str) -> FileScene:
+        """Open one. Raises ConfigError for a name that is not there, and what `FileScene` raises."""
+        return self._open(name, self.options)
+
+    def images(self, name: str) -> FileScene:
+        """Open one for prediction, whatever label maps there are or lack."""
+        return self._open(name, self.options.model_copy(update={"labels": {}, "scores": {}}))
+
+    def _open(self, name: str, options: Options) -> FileScene:
+        if name not in self._places:
+            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self._places)}")
+        place = self._places[name]
+        frames = self.frames(place.folder)
+        if not frames:
+            raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
+        return FileScene(place, frames, options, self.class_ids())
+
+    def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
+        """By label source, a table (65536,) from the ids of its files to those of its taxonomy, where they differ."""
+        return {}
+
+    @abstractmethod
+    def is_scene(self, folder: Path) -> bool:
+        """Whether a folder is a scene of this format."""
+
+    @abstractmethod
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """The frames of a scene's folder, in order, each with a name of its own. Raises DataError with the file."""
+
+
+def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -> list[ScenePlace]:
+    """The root where it is a scene itself, else the scenes below it in natural order; one holds no other.
+
+    Raises DataError where there is none, or two would have one name.
+    """
+    if not root.is_dir():
+        raise DataError(f"{root}: there is no such folder; set root to a scene or to the folder above scenes")
+    if is_scene(root):
+        name = root.resolve().name or "scene"
+        return [ScenePlace(name, root, name)]
+    found = [path.relative_to(root).parts for path in _below(root, is_scene, DEEPEST)]
+    if not found:
+        raise DataError(f"{root}: no scene here, nor {DEEPEST} folders deep; one holds {looks_like}")
+    places = [ScenePlace("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in found]
+    names = [place.name for place in places]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise DataError(f"{root}: two scenes would be called '{repeated[0]}'; rename one, or set root deeper")
+    return places
+
+
+def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
+    """The files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
+
+    Raises DataError where the folder cannot be listed.
+    """
+    try:
+        entries = os.listdir(folder)  # noqa: PTH208  names, not paths
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
+    fitting = (entry for entry in entries if entry.startswith(before) and entry.endswith(after))
+    names = (entry[len(before) : len(entry) - len(after)] for entry in fitting if not entry.startswith("."))
+    return {name: folder / f"{before}{name}{after}" for name in sorted(names, key=natural) if name}
+
+
+def require_equal(path: Path, poses: int, files: int, what: str) -> None:
+    """Raises DataError where a trajectory has another number of poses than there are files."""
+    if poses != files:
+        raise DataError(f"{path}: has {poses} poses, but there are {files} {what}; they must be as many")
+
+
+def _below(folder: Path, is_scene: Callable[[Path], bool], levels: int) -> Iterator[Path]:
+    for name in subfolders(folder) if levels else ():
+        if is_scene(folder / name):
+            yield folder / name
+        else:
+            yield from _below(folder / name, is_scene, levels - 1)

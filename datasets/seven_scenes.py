@@ -1,0 +1,73 @@
+"""7-Scenes: frame-NNNNNN.color.png, .depth.png in millimetres, .pose.txt, in one folder a sequence.
+
+Source: Shotton et al., Scene Coordinate Regression Forests, CVPR 2013, and the dataset's page.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from semstab.datasets.cameras import Camera, camera_of
+from semstab.datasets.file_options import (
+    CameraAxes,
+    DepthScale,
+    FileOptions,
+    FourIntrinsics,
+    InvalidDepth,
+    PoseConvention,
+    Size,
+)
+from semstab.datasets.file_scene import FrameSource
+from semstab.datasets.scene_search import FileDataset, files_named
+from semstab.datasets.templates import Folders
+from semstab.frames import Intrinsics
+
+IMAGE_SIZE = (640, 480)
+USUAL = (585.0, 585.0, 320.0, 240.0)
+
+
+class SevenScenesOptions(FileOptions):
+    """What the format says, and may be said otherwise; the camera of all sequences is 585 585 320 240."""
+
+    depth_scale: DepthScale = 1000
+    invalid_depth: InvalidDepth = (65535,)
+    pose_convention: PoseConvention = "camera_to_world"
+    camera_axes: CameraAxes = "opencv"
+    intrinsics: FourIntrinsics = None
+    color_intrinsics: FourIntrinsics = None
+    color_size: Size = IMAGE_SIZE
+
+
+class SevenScenes(FileDataset[SevenScenesOptions]):
+    """{name} is the file's name without .depth.png: frame-000000.
+
+    Depth and colour are not registered to each other. Label maps that were predicted on colour are looked up with
+    `color_intrinsics` where they are given, else taken as registered.
+    """
+
+    Options: type[BaseModel] = SevenScenesOptions
+    looks_like = "files frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether the first frame's pose is there, or that of any frame."""
+        return (folder / "frame-000000.pose.txt").is_file() or any(folder.glob("frame-*.pose.txt"))
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a depth image."""
+        folders, color = Folders(), self.options.color_intrinsics
+        camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
+        label_camera = None if color is None else Camera(Intrinsics(*color), self.options.color_size)
+        return [
+            FrameSource(
+                name=name,
+                depth=depth,
+                pose=folder / f"{name}.pose.txt",
+                pose_file=folder / f"{name}.pose.txt",
+                camera=camera,
+                label_camera=label_camera,
+                color=folders.one_of(folder / f"{name}.color", (".png", ".jpg")),
+            )
+            for name, depth in files_named(folder, "", ".depth.png").items()
+        ]

@@ -1,0 +1,78 @@
+"""TartanAir: image_left/, depth_left/ (.npy, metres), seg_left/, pose_left.txt, in a folder a trajectory.
+
+Source: Wang et al., TartanAir, IROS 2020, and data_type.md (github.com/castacks/tartanair_tools).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from semstab.datasets.cameras import camera_of
+from semstab.datasets.file_options import (
+    CameraAxes,
+    FileOptions,
+    FourIntrinsics,
+    MaxDepth,
+    PoseConvention,
+    UpAxis,
+)
+from semstab.datasets.file_scene import FrameSource
+from semstab.datasets.poses import from_quaternions
+from semstab.datasets.scene_search import FileDataset, files_named, require_equal
+from semstab.datasets.templates import Folders
+from semstab.datasets.text_tables import read_table
+
+IMAGE_SIZE = (640, 480)
+USUAL = (320.0, 320.0, 320.0, 240.0)
+
+
+class TartanAirOptions(FileOptions):
+    """What the format says, and may be said otherwise; the intrinsics are 320 320 320 240."""
+
+    camera: Literal["left", "right"] = Field("left", description="camera of the stereo pair")
+    max_depth: MaxDepth = 1000
+    pose_convention: PoseConvention = "camera_to_world"
+    camera_axes: CameraAxes = "ned"
+    up_axis: UpAxis = "-z"
+    intrinsics: FourIntrinsics = None
+
+
+class TartanAir(FileDataset[TartanAirOptions]):
+    """{name} is the frame's number: 000012. The ground truth are the mesh ids of seg_left/."""
+
+    Options: type[BaseModel] = TartanAirOptions
+    looks_like = "depth_left/ and pose_left.txt (or _right)"
+
+    def __init__(self, options: TartanAirOptions) -> None:
+        side = options.camera
+        truth = options.ground_truth or f"seg_{side}/{{name}}_{side}_seg.npy"
+        super().__init__(options.model_copy(update={"ground_truth": truth}))
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether the camera's poses and depth are there."""
+        side = self.options.camera
+        return (folder / f"pose_{side}.txt").is_file() and (folder / f"depth_{side}").is_dir()
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a depth map. Raises DataError where there are not as many poses."""
+        side, folders = self.options.camera, Folders()
+        path = folder / f"pose_{side}.txt"
+        numbers = read_table(path, 7, "tx ty tz qx qy qz qw")
+        poses = from_quaternions(numbers[:, :3], numbers[:, 3:], path)
+        maps = files_named(folder / f"depth_{side}", "", f"_{side}_depth.npy")
+        require_equal(path, len(poses), len(maps), "depth maps")
+        camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
+        return [
+            FrameSource(
+                name=name,
+                depth=depth,
+                pose=pose,
+                pose_file=path,
+                camera=camera,
+                color=folders.one_of(folder / f"image_{side}/{name}_{side}", (".png",)),
+            )
+            for (name, depth), pose in zip(maps.items(), poses, strict=True)
+        ]

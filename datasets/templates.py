@@ -1,0 +1,115 @@
+"""Path templates such as 'labels/{backbone}/{name}.png', and paths that stay inside a folder."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from semstab.datasets.disk import natural, subfolders
+from semstab.errors import ConfigError, DataError
+
+LONGEST = 400
+"""Characters of a path inside a dataset."""
+PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+UNSAFE = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029\ud800-\udfff]")
+
+
+@dataclass(frozen=True)
+class Template:
+    """A path, relative to a folder and inside it, with {placeholders}.
+
+    Raises ConfigError, which names the option, for an absolute path, '..', or a placeholder that is not known.
+    """
+
+    option: str
+    text: str
+    known: tuple[str, ...]
+    required: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = PLACEHOLDER.findall(self.text)
+        for name in names:
+            if name not in self.known:
+                raise ConfigError(f"{self._says}: unknown {{{name}}}; known: {_listed(self.known)}")
+        for name in self.required:
+            if name not in names:
+                raise ConfigError(f"{self._says}: needs {{{name}}}")
+        if any(brace in PLACEHOLDER.sub("", self.text) for brace in "{}"):
+            raise ConfigError(f"{self._says}: a brace is not closed; placeholders are {_listed(self.known)}")
+        path = PurePosixPath(self.text)
+        if path.is_absolute() or ".." in path.parts or UNSAFE.search(self.text) or not path.parts:
+            raise ConfigError(
+                f"{self._says}: leaves its folder; write a path inside it, and set root, or labels_root for labels that"
+                " stand elsewhere"
+            )
+
+    def filled(self, **values: str) -> str:
+        """The path with the placeholders that are given replaced."""
+        return PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), self.text)
+
+    @property
+    def _says(self) -> str:
+        return f"{self.option}: {self.text[:200]!r}"
+
+
+def _listed(names: Collection[str]) -> str:
+    return ", ".join(f"{{{name}}}" for name in names) or "none"
+
+
+def matching_folders(base: Path, template: Template, placeholder: str, **values: str) -> dict[str, str]:
+    """The folders on disk that fit the part of a template with `placeholder`: its value to the template with it.
+
+    Raises ConfigError where the placeholder is not in the name of a folder, or after one that is still open.
+    """
+    parts = PurePosixPath(template.filled(**values)).parts
+    hole = f"{{{placeholder}}}"
+    k = next(k for k, part in enumerate(parts) if hole in part)
+    if k == len(parts) - 1 or any(PLACEHOLDER.search(part) for part in parts[:k]):
+        raise ConfigError(f"{template.option}: {hole} must be in the name of a folder, before the other placeholders")
+    before, _, after = parts[k].partition(hole)
+    pattern = re.compile(f"{re.escape(before)}(?P<value>.+){re.escape(after.replace(hole, ''))}")
+    matches = (pattern.fullmatch(name) for name in subfolders(base.joinpath(*parts[:k])))
+    found = sorted((match["value"] for match in matches if match), key=natural)
+    return {value: "/".join(parts).replace(hole, value) for value in found}
+
+
+def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
+    """`folder / relative`, which must lie in `root`.
+
+    Raises DataError with `where` (the file that names the path) where it does not, or no path can be called so.
+    """
+    if UNSAFE.search(relative) or len(relative) > LONGEST:
+        raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
+    path = folder / relative
+    if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):  # noqa: PTH100  symlinks may lead out
+        raise DataError(
+            f"{where}: the path {relative[:200]!r} leaves {root}; set root to the folder that holds all files"
+        )
+    return path if ".." not in path.parts else Path(os.path.normpath(path))
+
+
+class Folders:
+    """What lies in folders, each listed when it is first asked for."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, frozenset[str]] = {}
+
+    def has(self, path: Path) -> bool:
+        """Whether there is a file or folder of that path."""
+        parent, name = os.path.split(path)
+        if parent not in self._names:
+            try:
+                self._names[parent] = frozenset(os.listdir(parent or "."))  # noqa: PTH208  names, not paths
+            except OSError:
+                self._names[parent] = frozenset()
+        return name in self._names[parent]
+
+    def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
+        """The path where it has one of the suffixes, else that with the first suffix there is a file of."""
+        if path.suffix.lower() in suffixes:
+            return path if self.has(path) else None
+        candidates = (path.with_name(path.name + suffix) for suffix in suffixes)
+        return next((candidate for candidate in candidates if self.has(candidate)), None)

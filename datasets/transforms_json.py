@@ -1,0 +1,163 @@
+"""transforms.json of nerfstudio and instant-ngp, with depth maps.
+
+Sources: Tancik et al., Nerfstudio, SIGGRAPH 2023, its data conventions and its dataparser; Müller et al., Instant
+Neural Graphics Primitives, SIGGRAPH 2022, and its nerf_loader.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import ChainMap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from semstab.datasets.cameras import Camera
+from semstab.datasets.disk import natural
+from semstab.datasets.file_options import CameraAxes, FileOptions, PixelCentre, PoseConvention
+from semstab.datasets.file_scene import FrameSource
+from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
+from semstab.datasets.json_files import matrix, number, read_object
+from semstab.datasets.scene_search import FileDataset
+from semstab.datasets.templates import Folders, Template, inside
+from semstab.errors import DataError
+from semstab.frames import Intrinsics
+
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
+"""Camera models that do not distort where the coefficients are zero."""
+
+
+class TransformsOptions(FileOptions):
+    """What the format says, and may be said otherwise; the depth scale is the file's own, else 1000."""
+
+    pose_convention: PoseConvention = "camera_to_world"
+    camera_axes: CameraAxes = "opengl"
+    pixel_centre: PixelCentre = 0.5
+    transforms: str = Field("transforms.json", description="file of the cameras in the scene's folder")
+    depth: str | None = Field(
+        None, description="template of depth maps with {name}, for frames without depth_file_path or depth_path"
+    )
+
+
+class TransformsJson(FileDataset[TransformsOptions]):
+    """{name} is the image's name without suffix, from the folder that all images share: frame_00012.
+
+    Depth is read as the programs do: integers and floats are millimetres, unless the file has integer_depth_scale or
+    depth_unit_scale_factor (metres in a unit). Frames go in the natural order of their images.
+    """
+
+    Options: type[BaseModel] = TransformsOptions
+    looks_like = "transforms.json"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether the file of the cameras is there."""
+        return inside(self.options.root, folder, self.options.transforms, "option transforms").is_file()
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One an entry of 'frames'. Raises what `read_transforms` raises."""
+        path = inside(self.options.root, folder, self.options.transforms, "option transforms")
+        depth = self.options.depth
+        template = None if depth is None else Template("depth", depth, ("name",), ("name",))
+        return read_transforms(path, self.options.root, folder, template)
+
+
+def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None = None) -> list[FrameSource]:
+    """The frames of a transforms.json, whose paths are relative to it and stay in root.
+
+    `depth` says, relative to `folder`, where depth maps are that the file does not name.
+    Raises DataError that names the file and the frame for missing or damaged values, distortion, or no depth.
+    """
+    content, folders = read_object(path), Folders()
+    entries = content.get("frames")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise DataError(f"{path}: 'frames' must be a list with an entry for each image")
+    wheres = [f"{path}: frame {k}" for k in range(len(entries))]
+    images = [_named(entry, ("file_path",), path, root, where) for entry, where in zip(entries, wheres, strict=True)]
+    shared = Path(os.path.commonpath([image.parent for image in images if image is not None] or [path.parent]))
+    scale, frames = _depth_scale(content, path), []
+    for entry, image, where in zip(entries, images, wheres, strict=True):
+        if image is None:
+            raise DataError(f"{where}: 'file_path' is missing; add it")
+        name = os.path.splitext(image.relative_to(shared).as_posix())[0]  # noqa: PTH122  dots in names are kept
+        stated = _named(entry, ("depth_file_path", "depth_path"), path, root, where)
+        if stated is None and depth is not None:
+            stated = inside(root, folder, depth.filled(name=name), where)
+        if stated is None:
+            raise DataError(f"{where}: has no depth_file_path; add it, or set depth: 'depth/{{name}}.png'")
+        frames.append(
+            FrameSource(
+                name=name,
+                depth=folders.one_of(stated, DEPTH_SUFFIXES) or stated,
+                pose=matrix(entry.get("transform_matrix"), f"{where}: transform_matrix"),
+                pose_file=path,
+                camera=_camera(ChainMap(entry, content), where),
+                color=folders.one_of(image, COLOR_SUFFIXES),
+                depth_scale=scale,
+            )
+        )
+    return sorted(frames, key=lambda frame: natural(frame.name))
+
+
+def _named(entry: Mapping[str, Any], keys: tuple[str, ...], path: Path, root: Path, where: str) -> Path | None:
+    """The path that the first of the keys holds; None where there is none."""
+    value = next((entry[key] for key in keys if entry.get(key) is not None), None)
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value:
+        raise DataError(f"{where}: {keys[0]} is {repr(value)[:40]}; expected a path")
+    return inside(root, path.parent, value.replace("\\", "/"), where)
+
+
+def _camera(values: Mapping[str, Any], where: str) -> Camera:
+    """The camera of a frame; its own values go before those of the file."""
+    model = values.get("camera_model")
+    coefficients = [number(values, key, where) for key in DISTORTION if values.get(key) is not None]
+    if model not in PINHOLES or any(coefficients):
+        what = repr(model)[:40] if model not in PINHOLES else "with k1, k2, ..."
+        raise DataError(f"{where}: the camera ({what}) distorts; undistort the images and remove its coefficients")
+    fx, fy = _focal(values, "x", where), _focal(values, "y", where)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        raise DataError(f"{where}: 'fl_x' is missing; add it, or camera_angle_x with w and h")
+    size = (_pixels(values, "w", where), _pixels(values, "h", where)) if "w" in values and "h" in values else None
+    cx = size[0] / 2 if size and "cx" not in values else number(values, "cx", where)
+    cy = size[1] / 2 if size and "cy" not in values else number(values, "cy", where)
+    try:
+        return Camera(Intrinsics(fx, fy, cx, cy), size)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+
+
+def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
+    """Focal length in pixels, from fl_x or the angle of the field of view; None where neither is given."""
+    if values.get(f"fl_{axis}") is not None:
+        return number(values, f"fl_{axis}", where)
+    if values.get(f"camera_angle_{axis}") is None:
+        return None
+    side = _pixels(values, "w" if axis == "x" else "h", where)
+    angle = number(values, f"camera_angle_{axis}", where)
+    if not 0 < angle < math.pi:
+        raise DataError(f"{where}: 'camera_angle_{axis}' is {angle:g}; expected radians between 0 and pi")
+    return side / (2 * math.tan(angle / 2))
+
+
+def _pixels(values: Mapping[str, Any], key: str, where: str) -> int:
+    value = number(values, key, where)
+    if not 1 <= value <= 2**24:
+        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
+    return int(value)
+
+
+def _depth_scale(content: Mapping[str, Any], path: Path) -> float:
+    """Units in a metre."""
+    key = next((k for k in ("integer_depth_scale", "depth_unit_scale_factor") if content.get(k) is not None), None)
+    if key is None:
+        return MILLIMETRES
+    metres = number(content, key, str(path))
+    if metres <= 0 or math.isinf(1 / metres):
+        raise DataError(f"{path}: '{key}' is {metres:g}; expected the metres in a unit of depth")
+    return 1 / metres

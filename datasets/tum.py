@@ -1,0 +1,165 @@
+"""TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, tied to each other by time stamps.
+
+Source: Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012, and the dataset's page.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, Field
+
+from semstab.datasets.cameras import camera_of
+from semstab.datasets.file_options import (
+    CameraAxes,
+    DepthScale,
+    FileOptions,
+    FourIntrinsics,
+    PoseConvention,
+    Positive,
+    UpAxis,
+)
+from semstab.datasets.file_scene import FrameSource
+from semstab.datasets.poses import at_times, from_quaternions
+from semstab.datasets.scene_search import FileDataset
+from semstab.datasets.templates import inside
+from semstab.datasets.text_tables import read_table, records, to_number
+from semstab.errors import DataError
+
+logger = logging.getLogger("semstab")
+
+IMAGE_SIZE = (640, 480)
+CAMERAS = {
+    "freiburg1": (517.306408, 516.469215, 318.643040, 255.313989),
+    "freiburg2": (520.908620, 521.007327, 325.141442, 249.701764),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+"""Calibrated intrinsics of the colour camera, to which depth is registered, by what the sequence's name holds."""
+USUAL = (525.0, 525.0, 319.5, 239.5)
+
+
+class TumOptions(FileOptions):
+    """What the format says, and may be said otherwise."""
+
+    depth_scale: DepthScale = 5000
+    pose_convention: PoseConvention = "camera_to_world"
+    camera_axes: CameraAxes = "opencv"
+    up_axis: UpAxis = "z"
+    intrinsics: FourIntrinsics = None
+    max_difference: Positive = Field(0.02, description="seconds by which things of one frame may differ")
+    poses: Literal["interpolate", "nearest"] = Field(
+        "interpolate", description="the pose at a depth image's time: between its two neighbours, or the nearest"
+    )
+    trajectory: str = Field("groundtruth.txt", description="file of the poses: t tx ty tz qx qy qz qw")
+
+
+class Tum(FileDataset[TumOptions]):
+    """{name} is the colour image's name without suffix, 1305031102.175304; of the depth's where there is no rgb.txt.
+
+    A depth image and a colour image form a frame where each is the other's nearest in time. Intrinsics not given are
+    those of the sequence's name (freiburg1, 2, 3), else the usual ones of a Kinect.
+    """
+
+    Options: type[BaseModel] = TumOptions
+    looks_like = "depth.txt, groundtruth.txt and rgb.txt"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether depth.txt is there."""
+        return (folder / "depth.txt").is_file()
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a depth image that has a colour image; where no pose is near, its pose is NaN.
+
+        Raises DataError for time stamps that do not ascend, or where nothing fits together in time.
+        """
+        trajectory = inside(self.options.root, folder, self.options.trajectory, "option trajectory")
+        numbers = read_table(trajectory, 8, "timestamp tx ty tz qx qy qz qw")
+        _require_ascending(trajectory, numbers[:, 0])
+        times, depths = self._listed(folder, "depth.txt")
+        colors = self._colors(folder, times)
+        kept = np.array([color is not None for color in colors]) if colors else np.ones(len(times), dtype=np.bool_)
+        if not kept.any():
+            limit = self.options.max_difference
+            raise DataError(f"{folder}: no depth image is within {limit:g} s of a colour image; set max_difference")
+        if not kept.all():
+            logger.warning("%s: %d depth images have no colour image; left out", folder, np.count_nonzero(~kept))
+        poses = at_times(
+            times=numbers[:, 0],
+            poses=from_quaternions(numbers[:, 1:4], numbers[:, 4:], trajectory),
+            wanted=times,
+            max_gap=self.options.max_difference,
+            method=self.options.poses,
+        )
+        camera = camera_of(self.options.intrinsics, _calibrated(folder), IMAGE_SIZE)
+        return [
+            FrameSource(
+                name=(colors[k] or depths[k]).stem if colors else depths[k].stem,
+                depth=depths[k],
+                pose=poses[k],
+                pose_file=trajectory,
+                camera=camera,
+                color=colors[k] if colors else None,
+                timestamp=float(times[k]),
+            )
+            for k in np.flatnonzero(kept)
+        ]
+
+    def _colors(self, folder: Path, times: npt.NDArray[np.float64]) -> list[Path | None]:
+        """The colour image of each depth image; none at all where there is no rgb.txt."""
+        if not (folder / "rgb.txt").is_file():
+            return []
+        color_times, colors = self._listed(folder, "rgb.txt")
+        partners = mutual_nearest(times, color_times, self.options.max_difference)
+        return [None if partner < 0 else colors[partner] for partner in partners]
+
+    def _listed(self, folder: Path, name: str) -> tuple[npt.NDArray[np.float64], list[Path]]:
+        """Time stamps and paths of a list of images."""
+        path = folder / name
+        times, paths = [], []
+        for line, text in records(path):
+            words = text.replace(",", " ").split(maxsplit=1)
+            if len(words) != 2:
+                raise DataError(f"{path}: line {line} is {text[:40]!r}; expected 'timestamp filename'")
+            times.append(to_number(words[0], path, line))
+            paths.append(inside(self.options.root, folder, words[1], f"{path}: line {line}"))
+        if not paths:
+            raise DataError(f"{path}: lists no image; expected lines of 'timestamp filename'")
+        stamps = np.array(times, dtype=np.float64)
+        _require_ascending(path, stamps)
+        return stamps, paths
+
+
+def mutual_nearest(
+    times: npt.NDArray[np.float64], others: npt.NDArray[np.float64], max_difference: float
+) -> npt.NDArray[np.intp]:
+    """For each of the ascending times the index of the other one where each is the other's nearest; -1 for none."""
+    to_other, back = _nearest(times, others), _nearest(others, times)
+    mutual = (back[to_other] == np.arange(len(times))) & (np.abs(others[to_other] - times) <= max_difference)
+    return np.where(mutual, to_other, -1)
+
+
+def _nearest(times: npt.NDArray[np.float64], others: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
+    """For each time the index of the nearest of the ascending others; of two as near the earlier one."""
+    after = np.searchsorted(others, times).clip(max=len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+
+
+def _require_ascending(path: Path, times: npt.NDArray[np.float64]) -> None:
+    if not np.isfinite(times).all():
+        raise DataError(f"{path}: the time stamp of record {np.flatnonzero(~np.isfinite(times))[0] + 1} is not finite")
+    if (late := np.diff(times) <= 0).any():
+        k = np.flatnonzero(late)[0]
+        raise DataError(
+            f"{path}: time stamps must ascend, but record {k + 2} ({times[k + 1]:.6f}) is not after record {k + 1}"
+            f" ({times[k]:.6f}); sort the file"
+        )
+
+
+def _calibrated(folder: Path) -> tuple[float, float, float, float]:
+    name = folder.resolve().name
+    return next((camera for key, camera in CAMERAS.items() if key in name), USUAL)

@@ -1,0 +1,140 @@
+"""UAVid-3D-Scenes, whose layout is not published: every path and format is an option, with a guess as default.
+
+Source: Florea and Nedevschi, TanDepth, J-STARS 2025 (github.com/hrflr/uavid-3d-scenes): undistorted frames of UAVid
+by scene, with metric depth maps from scaled COLMAP reconstructions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+from semstab.datasets.cameras import Camera
+from semstab.datasets.colmap_model import has_model, image_name, read_model
+from semstab.datasets.file_options import (
+    CameraAxes,
+    FileOptions,
+    FourIntrinsics,
+    GroundTruth,
+    PixelCentre,
+    PoseConvention,
+)
+from semstab.datasets.file_scene import FrameSource
+from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from semstab.datasets.poses import Poses
+from semstab.datasets.scene_search import FileDataset, files_named
+from semstab.datasets.templates import Folders, Template, inside
+from semstab.datasets.text_files import read_intrinsics
+from semstab.datasets.transforms_json import read_transforms
+from semstab.errors import ConfigError
+from semstab.frames import Intrinsics
+
+TAXONOMY = "uavid8"
+"""Of the label maps, unless the options say otherwise: the colours of UAVid's ground truth."""
+
+PoseFormat = Literal["colmap", "transforms", "matrix"]
+
+FORMATS: Mapping[PoseFormat, dict[str, Any]] = {
+    "colmap": {"pose_convention": "world_to_camera", "camera_axes": "opencv", "pixel_centre": 0.5},
+    "transforms": {"pose_convention": "camera_to_world", "camera_axes": "opengl", "pixel_centre": 0.5},
+    "matrix": {"pose_convention": "camera_to_world", "camera_axes": "opencv", "pixel_centre": 0.0},
+}
+"""What each format of poses means, unless the options say otherwise."""
+
+
+class Uavid3dOptions(FileOptions):
+    """Paths are templates relative to the scene's folder; {name} is the frame's name.
+
+    pose_convention, camera_axes and pixel_centre are those of the pose format unless they are given; the taxonomy is
+    uavid8.
+    """
+
+    images: str = Field("images/{name}", description="template of the colour images")
+    depth: str = Field("depth/{name}", description="template of the depth maps")
+    pose_format: PoseFormat = Field(
+        "colmap", description="a COLMAP model, a transforms.json, or a 4x4 matrix a frame as text"
+    )
+    model: str = Field("sparse", description="folder of the COLMAP model, text or binary")
+    transforms: str = Field("transforms.json", description="file of the cameras")
+    pose: str = Field("pose/{name}.txt", description="template of the matrices")
+    intrinsics: FourIntrinsics = None
+    intrinsics_file: str = Field("intrinsics.txt", description="3x3 matrix, beside matrices of poses")
+    ground_truth: GroundTruth = "Labels/{name}.png"
+    pose_convention: PoseConvention = None
+    camera_axes: CameraAxes = None
+    pixel_centre: PixelCentre = None
+
+
+class Uavid3d(FileDataset[Uavid3dOptions]):
+    """{name} is the image's name without suffix as the COLMAP model or transforms.json has it, or the matrix file's."""
+
+    Options: type[BaseModel] = Uavid3dOptions
+
+    def __init__(self, options: Uavid3dOptions) -> None:
+        means = {key: value for key, value in FORMATS[options.pose_format].items() if getattr(options, key) is None}
+        if options.classes is None and options.taxonomy is None:
+            means["taxonomy"] = TAXONOMY
+        self._depth, self._images, self._pose = (
+            Template(key, getattr(options, key), ("name",), ("name",)) for key in ("depth", "images", "pose")
+        )
+        if "{" in self._pose.text.rpartition("/")[0] or self._pose.text.count("{name}") > 1:
+            raise ConfigError(f"pose: {self._pose.text!r}: {{name}} must be once, in the name of the file")
+        self.looks_like = {
+            "colmap": f"a COLMAP model in {options.model}/ (options pose_format, model)",
+            "transforms": f"{options.transforms} (options pose_format, transforms)",
+            "matrix": f"{options.pose} (options pose_format, pose)",
+        }[options.pose_format]
+        super().__init__(options.model_copy(update=means))
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether the poses are there, in the format that the options say."""
+        if self.options.pose_format == "colmap":
+            return has_model(self._inside(folder, self.options.model))
+        if self.options.pose_format == "transforms":
+            return self._inside(folder, self.options.transforms).is_file()
+        return self._inside(folder, self._pose.text).parent.is_dir()
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a pose. Raises what `read_model` or `read_transforms` raises."""
+        if self.options.pose_format == "transforms":
+            path = self._inside(folder, self.options.transforms)
+            return read_transforms(path, self.options.root, folder, self._depth)
+        return self._of_model(folder) if self.options.pose_format == "colmap" else self._of_matrices(folder)
+
+    def _of_model(self, folder: Path) -> list[FrameSource]:
+        path, images = read_model(self._inside(folder, self.options.model))
+        folders = Folders()
+        return [
+            self._frame(folder, image_name(image.name), image.T_cw, path, image.camera, folders) for image in images
+        ]
+
+    def _of_matrices(self, folder: Path) -> list[FrameSource]:
+        before, _, after = self._pose.text.partition("{name}")
+        where, _, before = before.rpartition("/")
+        stated = self.options.intrinsics
+        K = Intrinsics(*stated) if stated else read_intrinsics(self._inside(folder, self.options.intrinsics_file))
+        folders = Folders()
+        return [
+            self._frame(folder, name, path, path, Camera(K), folders)
+            for name, path in files_named(folder / where, before, after).items()
+        ]
+
+    def _frame(
+        self, folder: Path, name: str, pose: Poses | Path, pose_file: Path, camera: Camera, folders: Folders
+    ) -> FrameSource:
+        depth = self._inside(folder, self._depth.filled(name=name))
+        color = self._inside(folder, self._images.filled(name=name))
+        return FrameSource(
+            name=name,
+            depth=folders.one_of(depth, (*DEPTH_SUFFIXES, ".bin")) or depth,
+            pose=pose,
+            pose_file=pose_file,
+            camera=camera,
+            color=folders.one_of(color, COLOR_SUFFIXES),
+        )
+
+    def _inside(self, folder: Path, relative: str) -> Path:
+        return inside(self.options.root, folder, relative, "the options of uavid3d")

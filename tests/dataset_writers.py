@@ -1,0 +1,319 @@
+"""Small files in the true format of every dataset, from frames of the built-in city shrunk to the size of a room."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from semstab.backends import create
+from semstab.datasets import open_dataset
+from semstab.frames import Frame
+from semstab.voxels import VoxelTable
+
+W, H, COUNT, SHRUNK = 48, 32, 4, 10
+CLASSES = ["clutter", "building", "road", "static car", "tree", "low vegetation", "human", "moving car"]
+SIDES = {"opencv": ([0, 1, 2], [1, 1, 1]), "opengl": ([0, 1, 2], [1, -1, -1]), "ned": ([2, 0, 1], [1, 1, 1])}
+"""For each convention of camera axes, which OpenCV axis each of its axes is, and with which sign."""
+
+
+@functools.cache
+def city() -> tuple[Frame, ...]:
+    """Neighbouring frames of the city, a tenth of its size, with labels of a backbone that errs, and colour."""
+    scene = open_dataset("city", {"width": W, "height": H, "frames": 15 * COUNT}).scene("scene0")
+    return tuple(shrunk(scene.frame(index, "sim-flicker")) for index in range(COUNT))
+
+
+def shrunk(frame: Frame) -> Frame:
+    T = frame.T_wc.copy()
+    T[:3, 3] /= SHRUNK
+    return dataclasses.replace(frame, depth=frame.depth / SHRUNK, T_wc=T, files={})
+
+
+def stored(frame: Frame, scale: float) -> np.ndarray:
+    """Depth (H, W) as a 16-bit image holds it."""
+    return np.rint(frame.depth.astype(np.float64) * scale).astype(np.uint16)
+
+
+def source(scale: float | None = None) -> list[Frame]:
+    """The frames, with the depth that 16-bit images of that scale can hold."""
+    if scale is None:
+        return list(city())
+    return [dataclasses.replace(f, depth=np.float32(stored(f, scale)) / np.float32(scale)) for f in city()]
+
+
+def fused(frames: Sequence[Frame]) -> VoxelTable:
+    backend = create("numpy", voxel_size=0.1, num_classes=len(CLASSES))
+    for frame in frames:
+        backend.integrate(frame)
+    return backend.table()
+
+
+def assert_same_voxels(found: Sequence[Frame], expected: Sequence[Frame]) -> None:
+    """The same voxels with the same evidence, up to the last digits of poses."""
+    ours, theirs = fused(found), fused(expected)
+    assert len(ours) == len(theirs) > 500
+    for column in ("ix", "iy", "iz", "op", "pixels", "first_frame", "last_frame"):
+        np.testing.assert_array_equal(getattr(ours, column), getattr(theirs, column), err_msg=column)
+    for column in ("evidence", "drift_sum"):
+        np.testing.assert_allclose(getattr(ours, column), getattr(theirs, column), rtol=0, atol=1e-12)
+
+
+# --- parts of every format ------------------------------------------------------------------------------------------
+
+
+def save(path: Path, image: np.ndarray) -> None:
+    """PNG or JPEG of grey or RGB samples, or .npy."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npy":
+        np.save(path, image)
+    else:
+        assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)
+
+
+def numbers(values) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def write_lines(path: Path, lines) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{line}\n" for line in lines))
+    return path
+
+
+def matrix_text(matrix) -> list[str]:
+    return [numbers(row) for row in matrix]
+
+
+def with_axes(T_wc: np.ndarray, axes: str) -> np.ndarray:
+    """A camera-to-world pose whose columns are the axes of a camera of another convention."""
+    columns, signs = SIDES[axes]
+    T = T_wc.copy()
+    T[:3, :3] = T_wc[:3, columns] * signs
+    return T
+
+
+def quaternion(R) -> np.ndarray:
+    """x y z w."""
+    return Rotation.from_matrix(R).as_quat()
+
+
+def four(frame: Frame) -> list[float]:
+    K = frame.intrinsics
+    return [K.fx, K.fy, K.cx, K.cy]
+
+
+def write_labels(folder: Path, names: Sequence[str], frames: Sequence[Frame], template="labels/net/{}.png") -> None:
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / template.format(name), frame.labels)
+
+
+# --- formats --------------------------------------------------------------------------------------------------------
+
+
+def write_hololens(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    names = [f"{3 + k:05d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.png", stored(frame, 1000))
+        save(folder / f"images/{name}.png", frame.color)
+    write_lines(folder / "poses.txt", [numbers(frame.T_wc) for frame in frames])
+    write_lines(folder / "K.txt", matrix_text(frames[0].intrinsics.matrix))
+    return names
+
+
+def write_seven_scenes(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    names = [f"frame-{k:06d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        depth = stored(frame, 1000)
+        save(folder / f"{name}.depth.png", np.where(depth == 0, 65535, depth).astype(np.uint16))
+        save(folder / f"{name}.color.png", frame.color)
+        write_lines(folder / f"{name}.pose.txt", matrix_text(frame.T_wc))
+    return names
+
+
+def square(K: np.ndarray) -> np.ndarray:
+    """A 3x3 camera matrix as ScanNet's 4x4."""
+    padded = np.eye(4)
+    padded[:3, :3] = K
+    return padded
+
+
+def write_scannet(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    names = [str(k) for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.png", stored(frame, 1000))
+        save(folder / f"color/{name}.jpg", frame.color)
+        write_lines(folder / f"pose/{name}.txt", matrix_text(frame.T_wc))
+    K = frames[0].intrinsics
+    write_lines(folder / "intrinsic/intrinsic_depth.txt", matrix_text(square(K.matrix)))
+    write_lines(folder / "intrinsic/intrinsic_color.txt", matrix_text(square(K.resized((W, H), (2 * W, 2 * H)).matrix)))
+    return names
+
+
+def write_replica(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """The export of NICE-SLAM."""
+    names = [f"{k:06d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"results/depth{name}.png", stored(frame, 6553.5))
+        save(folder / f"results/frame{name}.jpg", frame.color)
+    write_lines(folder / "traj.txt", [numbers(frame.T_wc) for frame in frames])
+    fx, fy, cx, cy = four(frames[0])
+    camera = {"w": W, "h": H, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "scale": 6553.5}
+    (folder.parent / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return names
+
+
+def write_semantic_nerf(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """Replica in the export of Semantic-NeRF; numbers are not padded, class 0 is void."""
+    names = [str(k) for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/depth_{name}.png", stored(frame, 1000))
+        save(folder / f"rgb/rgb_{name}.png", frame.color)
+        save(folder / f"semantic_class/semantic_class_{name}.png", frame.labels)
+    write_lines(folder / "traj_w_c.txt", [numbers(frame.T_wc) for frame in frames])
+    return names
+
+
+def write_tum(folder: Path, frames: Sequence[Frame], start: float = 1305031102.0) -> list[str]:
+    """Colour 4 ms after depth; a pose at the time of each depth image and between them."""
+    depth_times = [start + 0.1 * k for k in range(len(frames))]
+    names = [f"{t + 0.004:.6f}" for t in depth_times]
+    trajectory = []
+    for t, name, frame in zip(depth_times, names, frames, strict=True):
+        save(folder / f"depth/{t:.6f}.png", stored(frame, 5000))
+        save(folder / f"rgb/{name}.png", frame.color)
+        pose = [*frame.T_wc[:3, 3], *quaternion(frame.T_wc[:3, :3])]
+        trajectory += [f"{t:.6f} {numbers(pose)}", f"{t + 0.05:.6f} {numbers(pose)}"]
+    write_lines(folder / "depth.txt", ["# depth maps", *(f"{t:.6f} depth/{t:.6f}.png" for t in depth_times)])
+    write_lines(folder / "rgb.txt", ["# color images", *(f"{name} rgb/{name}.png" for name in names)])
+    write_lines(folder / "groundtruth.txt", ["# timestamp tx ty tz qx qy qz qw", *trajectory])
+    return names
+
+
+def write_transforms(folder: Path, frames: Sequence[Frame], *, program: str = "nerfstudio") -> list[str]:
+    """OpenGL axes, principal point from the corner; of instant-ngp with its names and one camera a frame."""
+    ours = program == "nerfstudio"
+    names = [f"frame_{k:05d}" for k in range(len(frames))]
+    entries = []
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"images/{name}.png", frame.color)
+        save(folder / f"depths/{name}.png", stored(frame, 1000 if ours else 4000))
+        entry = {
+            "file_path": f"images/{name}.png" if ours else f"./images/{name}",
+            "depth_file_path" if ours else "depth_path": f"depths/{name}.png",
+            "transform_matrix": with_axes(frame.T_wc, "opengl").tolist(),
+        }
+        entries.append(entry if ours else entry | camera_json(frame))
+    shared = (
+        {"camera_model": "OPENCV", "k1": 0.0} | camera_json(frames[0]) if ours else {"integer_depth_scale": 1 / 4000}
+    )
+    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": entries[::-1]}))
+    return names
+
+
+def camera_json(frame: Frame) -> dict[str, float]:
+    fx, fy, cx, cy = four(frame)
+    return {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "w": W, "h": H}
+
+
+def write_tartanair(folder: Path, frames: Sequence[Frame], side: str = "left") -> list[str]:
+    """NED axes; depth in metres as .npy; pixels far away are sky."""
+    names = [f"{k:06d}" for k in range(len(frames))]
+    lines = []
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth_{side}/{name}_{side}_depth.npy", np.where(frame.depth > 0, frame.depth, np.float32(1e4)))
+        save(folder / f"seg_{side}/{name}_{side}_seg.npy", frame.labels)
+        save(folder / f"image_{side}/{name}_{side}.png", frame.color)
+        T = with_axes(frame.T_wc, "ned")
+        lines.append(numbers([*T[:3, 3], *quaternion(T[:3, :3])]))
+    write_lines(folder / f"pose_{side}.txt", lines)
+    return names
+
+
+def write_colmap(folder: Path, frames: Sequence[Frame], *, binary: bool = False, model: str = "sparse") -> list[str]:
+    """A dense workspace with a PINHOLE camera, and images whose points are there, or not."""
+    names = [f"cam 0/{k:04d}" for k in range(len(frames))]
+    poses = []
+    for name, frame in zip(names, frames, strict=True):
+        save_depth_map(folder / f"stereo/depth_maps/{name}.png.geometric.bin", frame.depth)
+        save(folder / f"images/{name}.png", frame.color)
+        T_cw = np.linalg.inv(frame.T_wc)
+        x, y, z, w = quaternion(T_cw[:3, :3])
+        poses.append([w, x, y, z, *T_cw[:3, 3]])
+    fx, fy, cx, cy = four(frames[0])
+    write = write_model_binary if binary else write_model_text
+    write(folder / model, [fx, fy, cx + 0.5, cy + 0.5], poses, [f"{name}.png" for name in names])
+    return names
+
+
+def save_depth_map(path: Path, depth: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = f"{depth.shape[1]}&{depth.shape[0]}&1&".encode()
+    path.write_bytes(header + np.asfortranarray(depth.T.astype("<f4")).tobytes(order="F"))
+
+
+def write_model_text(folder: Path, camera, poses, names) -> None:
+    write_lines(folder / "cameras.txt", ["# Camera list", f"7 PINHOLE {W} {H} {numbers(camera)}"])
+    lines = ["# Image list", "# Number of images: 4"]
+    for k, (pose, name) in enumerate(zip(poses, names, strict=True)):
+        lines += [f"{100 + k} {numbers(pose)} 7 {name}", "1.5 2.5 -1 3.5 4.5 12" if k % 2 else ""]
+    write_lines(folder / "images.txt", lines)
+
+
+def write_model_binary(folder: Path, camera, poses, names) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 7, 1, W, H, *camera))
+    content = struct.pack("<Q", len(poses))
+    for k, (pose, name) in enumerate(zip(poses, names, strict=True)):
+        content += struct.pack("<I7dI", 100 + k, *pose, 7) + name.encode() + b"\0"
+        content += struct.pack("<Q", k) + struct.pack("<ddQ", 1.5, 2.5, 2**64 - 1) * k
+    (folder / "images.bin").write_bytes(content)
+
+
+Writer = Callable[[Path, Sequence[Frame]], list[str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A dataset: its name, its writer, the depth scale that it stores (None: floats), and options that it needs."""
+
+    dataset: str
+    write: Writer
+    scale: float | None
+    options: dict[str, object] = dataclasses.field(default_factory=dict)
+
+
+def camera_option() -> list[float]:
+    return four(city()[0])
+
+
+FORMATS = {
+    "hololens": Format("hololens", write_hololens, 1000),
+    "seven_scenes": Format("seven_scenes", write_seven_scenes, 1000, {"intrinsics": camera_option}),
+    "scannet": Format("scannet", write_scannet, 1000, {"color_size": (2 * W, 2 * H)}),
+    "replica, NICE-SLAM": Format("replica", write_replica, 6553.5),
+    "replica, Semantic-NeRF": Format("replica", write_semantic_nerf, 1000, {"intrinsics": camera_option}),
+    "tum": Format("tum", write_tum, 5000, {"intrinsics": camera_option}),
+    "transforms_json, nerfstudio": Format("transforms_json", write_transforms, 1000),
+    "transforms_json, instant-ngp": Format(
+        "transforms_json", functools.partial(write_transforms, program="instant-ngp"), 4000
+    ),
+    "colmap, text": Format("colmap", write_colmap, None),
+    "colmap, binary": Format("colmap", functools.partial(write_colmap, binary=True, model="sparse/0"), None),
+    "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
+}
+
+
+def opened(form: Format, root: Path, **options):
+    """The only scene of a dataset that was written, with the options that its format needs."""
+    needed = {key: value() if callable(value) else value for key, value in form.options.items()}
+    dataset = open_dataset(form.dataset, {"root": root, "classes": CLASSES} | needed | options)
+    (name,) = dataset.scenes
+    return dataset.scene(name)

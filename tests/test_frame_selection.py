@@ -1,0 +1,175 @@
+"""Which frames a selection picks: by number, evenly, from a list, by time; and those without a pose, left out."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+from dataset_writers import FORMATS, matrix_text, opened, source, write_labels, write_lines
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semstab.config import Config, FrameSelection
+from semstab.datasets import Timed, Tracked, open_dataset
+from semstab.datasets.selection import select_frames
+from semstab.errors import ConfigError
+
+# --- by number
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"spacing": "even", "count": 5}, [0, 5, 10, 14, 19]),
+        ({"spacing": "even", "count": 3, "start": 4, "stop": 9}, [4, 6, 8]),
+        ({"spacing": "even", "count": 4, "stride": 3}, [0, 6, 12, 18]),
+        ({"spacing": "even", "count": 1}, [0]),
+        ({"spacing": "even", "count": 50, "start": 17}, [17, 18, 19]),
+        ({"spacing": "even", "count": 2, "start": 20}, []),
+        ({"list": [0, 7, 19]}, [0, 7, 19]),
+    ],
+)
+def test_frames_of_twenty(settings, expected):
+    assert FrameSelection(**settings).indices(20) == expected
+
+
+@given(
+    length=st.integers(0, 300), count=st.integers(1, 40), start=st.integers(0, 320), stop=st.integers(1, 320),
+    stride=st.integers(1, 9),
+)  # fmt: skip
+def test_evenly_spaced_frames_hold_both_ends_at_equal_distances(length, count, start, stop, stride):
+    all_of_them = FrameSelection(start=start, stop=stop, stride=stride).indices(length)
+    even = FrameSelection(start=start, stop=stop, stride=stride, count=count, spacing="even").indices(length)
+    assert set(even) <= set(all_of_them)
+    assert len(even) == min(count, len(all_of_them))
+    if len(even) > 1:
+        assert (even[0], even[-1]) == (all_of_them[0], all_of_them[-1])
+        steps = np.diff([all_of_them.index(frame) for frame in even])
+        assert steps.min() >= 1
+        assert steps.max() - steps.min() <= 1
+
+
+@given(length=st.integers(0, 100), start=st.integers(0, 120), stride=st.integers(1, 9), count=st.integers(1, 120))
+def test_without_more_it_is_a_slice(length, start, stride, count):
+    selection = FrameSelection(start=start, stride=stride, count=count)
+    assert selection.indices(length) == list(range(length))[start::stride][:count]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"spacing": "even"}, "frames: spacing: even needs count"),
+        ({"list": [3, 3]}, "frames: the frames of a list must ascend"),
+        ({"list": []}, r"frames\.list: "),
+        ({"list": [-1]}, r"frames\.list\.0: "),
+        ({"list": [1], "stride": 2, "count": 1}, "frames: list says which frames; leave out stride, count"),
+        ({"from_time": 2, "to_time": 1}, "frames: from_time lies after to_time"),
+        ({"from_time": math.nan}, r"frames\.from_time: "),
+        ({"lists": [1]}, r"unknown setting 'frames\.lists'; did you mean 'list'"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_in_one_line(settings, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        Config.build({"frames": settings})
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_survives_its_own_yaml(tmp_path):
+    config = Config(frames=FrameSelection(list=(1, 4)))
+    (tmp_path / "c.yaml").write_text(config.to_yaml())
+    assert Config.build(config.model_dump(mode="json")).frames.indices(9) == [1, 4]
+
+
+def test_a_listed_frame_that_is_not_there_is_named():
+    with pytest.raises(ConfigError, match=r"frames\.list: there is no frame 9; the sequence has 9, from 0"):
+        FrameSelection(list=(1, 9)).indices(9)
+
+
+# --- by time
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"from_time": 0.3}, [3, 4]),
+        ({"to_time": 0.2}, [0, 2]),
+        ({"from_time": 0.1, "to_time": 0.3, "stride": 2}, [2]),
+        ({"from_time": 9}, []),
+    ],
+)
+def test_a_range_of_time_includes_both_ends_and_no_frame_of_unknown_time(settings, expected):
+    assert FrameSelection(**settings).indices(5, [0.0, math.nan, 0.2, 0.3, 0.4]) == expected
+
+
+def test_a_range_of_time_needs_time_stamps():
+    with pytest.raises(ConfigError, match="need time stamps, which this sequence has not"):
+        FrameSelection(from_time=0).indices(5)
+
+
+# --- of scenes
+
+
+def test_times_are_those_of_the_scene(tmp_path):
+    names = FORMATS["tum"].write(tmp_path, source(5000))
+    write_labels(tmp_path, names, source(5000))
+    scene = opened(FORMATS["tum"], tmp_path)
+    assert isinstance(scene, Timed)
+    np.testing.assert_allclose(scene.timestamps - 1305031102, [0, 0.1, 0.2, 0.3], atol=1e-6)
+    assert scene.frame(2, "net").timestamp == pytest.approx(1305031102.2)
+    assert select_frames(scene, FrameSelection(from_time=1305031102.1, to_time=1305031102.25)) == [1, 2]
+
+
+def test_a_frame_rate_gives_times(tmp_path):
+    names = FORMATS["hololens"].write(tmp_path, source(1000))
+    write_labels(tmp_path, names, source(1000))
+    scene = opened(FORMATS["hololens"], tmp_path)
+    assert scene.timestamps is None
+    with pytest.raises(ConfigError, match="need time stamps"):
+        select_frames(scene, FrameSelection(from_time=0))
+    timed = opened(FORMATS["hololens"], tmp_path, frames_per_second=2)
+    assert select_frames(timed, FrameSelection(from_time=0.5, to_time=1)) == [1, 2]
+    assert timed.frame(3, "net").timestamp == 1.5
+
+
+@pytest.mark.parametrize("lost", ["-inf", "nan"])
+def test_lost_poses_are_left_out_and_said(tmp_path, caplog, lost):
+    frames = source(1000)
+    names = FORMATS["scannet"].write(tmp_path, frames)
+    write_labels(tmp_path, names, frames)
+    for k in (1, 3):
+        write_lines(tmp_path / f"pose/{k}.txt", [f"{lost} {lost} {lost} {lost}"] * 4)
+    scene = opened(FORMATS["scannet"], tmp_path)
+    assert isinstance(scene, Tracked)
+    assert len(scene) == 4
+    with caplog.at_level(logging.WARNING, logger="semstab"):
+        assert select_frames(scene, FrameSelection()) == [0, 2]
+    assert (
+        f"{tmp_path.name}: 2 of 4 selected frames have no pose (tracking was lost) and are left out: 1, 3"
+        in caplog.text
+    )
+    assert select_frames(scene, FrameSelection(list=(0, 3))) == [0]
+    with pytest.raises(ValueError, match=r"pose/1\.txt: the pose is not finite"):
+        scene.frame(1, "net")
+
+
+def test_a_damaged_pose_is_no_lost_one(tmp_path):
+    frames = source(1000)
+    names = FORMATS["scannet"].write(tmp_path, frames)
+    write_labels(tmp_path, names, frames)
+    write_lines(tmp_path / "pose/2.txt", matrix_text(np.eye(3)))
+    with pytest.raises(ValueError, match=r"pose/2\.txt: expected a 4x4 or 3x4 matrix, found 9 numbers"):
+        select_frames(opened(FORMATS["scannet"], tmp_path), FrameSelection())
+
+
+def test_scenes_without_times_and_tracking_are_selected_by_number():
+    scene = open_dataset("city", {"frames": 6}).scene("scene0")
+    assert select_frames(scene, FrameSelection(count=3, spacing="even")) == [0, 2, 5]
+
+
+def test_the_city_s_frames_can_be_chosen_by_time() -> None:
+    scene = open_dataset("city", {"frames": 9}).scene("scene0")
+    assert isinstance(scene, Timed)
+    first, last = scene.timestamps[2], scene.timestamps[5]
+    assert select_frames(scene, FrameSelection(from_time=first, to_time=last)) == [2, 3, 4, 5]

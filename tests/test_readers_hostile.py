@@ -1,0 +1,291 @@
+"""Damaged and hostile files in every format: one clear line, no traceback, no unpickling, no memory for a claim."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import resource
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_writers import CLASSES, COUNT, FORMATS, opened, source, write_labels, write_lines
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from image_files import raw_png
+from posed_scene import fails
+from test_cli import bench, error_of
+
+from semstab.config import FrameSelection
+from semstab.datasets.colmap_depth import read_depth_map
+from semstab.datasets.colmap_model import read_model
+from semstab.datasets.scannet import read_class_table
+from semstab.datasets.selection import select_frames
+from semstab.datasets.text_tables import read_table, records
+from semstab.datasets.transforms_json import read_transforms
+from semstab.errors import DataError, SemstabError
+from semstab.pipeline import run
+from semstab.plan import load_config
+from semstab.voxels import VoxelTable
+
+
+def write(form, folder: Path) -> list[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = source(form.scale)
+    names = form.write(folder, frames)
+    write_labels(folder, names, frames)
+    return names
+
+
+@pytest.fixture(params=FORMATS)
+def written(request, tmp_path):
+    """(format, folder, names) of a whole scene."""
+    return FORMATS[request.param], tmp_path, write(FORMATS[request.param], tmp_path)
+
+
+def text_files(folder: Path) -> list[Path]:
+    """What a reader parses beside images: text, JSON, COLMAP's binary files."""
+    suffixes = (".txt", ".json", ".bin")
+    return sorted(path for path in folder.rglob("*") if path.suffix in suffixes and "depth_maps" not in path.parts)
+
+
+def promised(action) -> None:
+    """It works, or says in one line what is wrong."""
+    message = ""
+    try:
+        action()
+    except SemstabError as error:
+        message = str(error)
+    assert "\n" not in message
+    assert len(message) < 1000
+
+
+def read_all(form, folder) -> None:
+    scene = opened(form, folder, intrinsics_size=None)
+    for index in select_frames(scene, FrameSelection()):
+        scene.frame(index, "net")
+
+
+# --- images
+
+
+def test_an_image_that_claims_3_6_gigapixels_is_refused_at_once(written):
+    form, folder, names = written
+    bomb = raw_png(60_000, 60_000, 8, 0, b"x\x9c\x03\x00\x00\x00\x00\x01")
+    (folder / f"labels/net/{names[1]}.png").write_bytes(bomb)
+    scene = opened(form, folder)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    fails(DataError, rf"labels/net/{names[1]}\.png: claims 60000x60000 pixels", scene.frame, 1, "net")
+    depth = Path(scene.frame(2, "net").files["depth"])
+    if depth.suffix == ".png":
+        depth.write_bytes(raw_png(60_000, 60_000, 16, 0, b""))
+        fails(DataError, "claims 60000x60000 pixels", scene.frame, 2, "net")
+    color = Path(scene.frame(3, "net").files["color"])
+    if color.suffix == ".png":
+        color.write_bytes(raw_png(60_000, 60_000, 8, 2, b""))
+        fails(DataError, "claims 60000x60000 pixels", scene.frame, 3, "net")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kilobytes
+
+
+class Unpickled:
+    """What a hostile file would run."""
+
+    def __reduce__(self):
+        return Path.write_text, (Path("unpickled"), "yes")
+
+
+def pickled_array() -> bytes:
+    """A .npy file of objects, as numpy writes it: loading it runs what is pickled."""
+    out = io.BytesIO()
+    np.lib.format.write_array(out, np.array([Unpickled()], dtype=object), allow_pickle=True)
+    return out.getvalue()
+
+
+def test_pickled_objects_are_not_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    form = FORMATS["tartanair"]
+    names = write(form, tmp_path)
+    with pytest.raises((pickle.UnpicklingError, ValueError)):
+        np.load(io.BytesIO(pickled_array()))
+    scene = opened(form, tmp_path)
+    (tmp_path / f"depth_left/{names[0]}_left_depth.npy").write_bytes(pickled_array())
+    fails(DataError, r"_left_depth\.npy: .*does not hold plain numbers", scene.frame, 0, "net")
+    (tmp_path / f"seg_left/{names[1]}_left_seg.npy").write_bytes(pickled_array())
+    fails(DataError, r"_left_seg\.npy: .*does not hold plain numbers", scene.frame, 1, "gt")
+    (tmp_path / f"labels/net/{names[2]}.png").write_bytes(pickled_array())
+    fails(DataError, r"labels/net/.*not a PNG image", scene.frame, 2, "net")
+    assert not (tmp_path / "unpickled").exists()
+
+
+# --- text
+
+
+def test_a_text_file_cut_in_the_middle_is_named(written):
+    form, folder, _ = written
+    for path in text_files(folder):
+        whole = path.read_bytes()
+        for length in (0, len(whole) // 3, len(whole) // 2):
+            path.write_bytes(whole[:length])
+            promised(lambda: read_all(form, folder))
+        path.write_bytes(b"")
+        with pytest.raises(DataError, match=path.name):
+            read_all(form, folder)
+        path.write_bytes(whole)
+    read_all(form, folder)
+
+
+@given(data=st.data())
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_text_file_with_any_bytes_changed_works_or_says_why(written, data):
+    form, folder, _ = written
+    path = data.draw(st.sampled_from(text_files(folder)), label="file")
+    whole = path.read_bytes()
+    at = data.draw(st.integers(0, len(whole)), label="at")
+    gone = data.draw(st.integers(0, 12), label="gone")
+    new = data.draw(st.one_of(st.binary(max_size=8), st.sampled_from(WORDS)), label="new")
+    try:
+        path.write_bytes(whole[:at] + new + whole[at + gone :])
+        promised(lambda: read_all(form, folder))
+    finally:
+        path.write_bytes(whole)
+
+
+WORDS = [
+    b"nan", b"-inf", b"1e999", b"\n", b"\n\n", b" ", b"\0", b"#", b",", b"-", b"\xff\xfe", b"../../", b"\xe2\x80\xa8",
+    b"9" * 400, b"{}", b"[]", b'"', b"null", b"true", b"1_0", b"0x10", b"/etc/passwd", b"\r", b"\x85", b"1e-320",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "match"),
+    [
+        ("hololens", "poses.txt", r"poses\.txt: has 3 poses, but there are 4 images; they must be as many"),
+        ("replica, NICE-SLAM", "traj.txt", r"traj\.txt: has 3 poses, but there are 4 depth images"),
+        ("replica, Semantic-NeRF", "traj_w_c.txt", r"traj_w_c\.txt: has 3 poses, but there are 4 depth images"),
+        ("tartanair", "pose_left.txt", r"pose_left\.txt: has 3 poses, but there are 4 depth maps"),
+    ],
+)
+def test_counts_that_do_not_match_are_named(tmp_path, name, file, match):
+    write(FORMATS[name], tmp_path)
+    write_lines(tmp_path / file, (tmp_path / file).read_text().splitlines()[1:])
+    fails(DataError, match, opened, FORMATS[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", ["hololens", "replica, NICE-SLAM", "tartanair", "seven_scenes", "scannet"])
+def test_a_pose_with_nan_is_lost_and_no_frame(tmp_path, name, caplog):
+    form = FORMATS[name]
+    write(form, tmp_path)
+    path = next(p for p in text_files(tmp_path) if "pose" in str(p.relative_to(tmp_path)) or "traj" in p.name)
+    lines = path.read_text().splitlines()
+    write_lines(path, [lines[0].replace(lines[0].split()[0], "nan", 1), *lines[1:]])
+    scene = opened(form, tmp_path)
+    assert select_frames(scene, FrameSelection()) == [1, 2, 3]
+    assert "1 of 4 selected frames have no pose" in caplog.text
+    fails(DataError, "the pose is not finite", scene.frame, 0, "net")
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("classes: [a, b]\nx: !!python/object/apply:os.system ['touch hacked']\n", "not valid YAML"),
+        ("!!python/name:os.system {}", "not valid YAML"),
+        ("a: &a [1]\nclasses: {<<: *a}\n", "not valid YAML|needs a list"),
+        ("classes: " + "[" * 1000, "not valid YAML"),
+    ],
+)
+def test_a_taxonomy_with_tags_makes_no_objects(tmp_path, monkeypatch, text, match):
+    monkeypatch.chdir(tmp_path)
+    write(FORMATS["hololens"], tmp_path)
+    (tmp_path / "t.yaml").write_text(text)
+    scene = opened(FORMATS["hololens"], tmp_path, classes=None, taxonomy=str(tmp_path / "t.yaml"))
+    fails(SemstabError, rf"t\.yaml: .*({match})", scene.frame, 0, "net")
+    assert not (tmp_path / "hacked").exists()
+
+
+def test_a_cam_params_that_is_none_is_named(tmp_path):
+    form = FORMATS["replica, NICE-SLAM"]
+    write(form, tmp_path / "room0")
+    for content, match in (
+        ("[]", "expected an object"),
+        ("{}", "no 'camera'"),
+        ('{"camera": {"fx": 1}}', "'fy' is missing"),
+        ('{"camera": {"w":1,"h":0,"fx":1,"fy":1,"cx":0,"cy":0,"scale":1}}', "w, h and scale must be positive"),
+        ('{"camera": {"w":8,"h":8,"fx":0,"fy":1,"cx":0,"cy":0,"scale":1}}', "focal lengths must be positive"),
+        ('{"camera": {"w":8,"h":8,"fx":NaN,"fy":1,"cx":0,"cy":0,"scale":1}}', "'fx' is nan"),
+    ):
+        (tmp_path / "cam_params.json").write_text(content)
+        fails(DataError, match, opened, form, tmp_path)
+
+
+# --- parsers by themselves
+
+TOKENS = [b"1", b"7", b"0.5", b"PINHOLE", b"a.png", b" ", b"\n", *WORDS]
+TEXTS = st.one_of(st.binary(max_size=200), st.lists(st.sampled_from(TOKENS), max_size=40).map(b" ".join))
+
+
+@given(content=TEXTS)
+@example(content=b"1 PINHOLE 1 1 1 1 1 1")
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_text_is_read_or_refused_in_one_line(tmp_path, content):
+    for name in ("cameras.txt", "images.txt", "table.txt", "transforms.json", "t.tsv"):
+        (tmp_path / name).write_bytes(content)
+    promised(lambda: read_model(tmp_path))
+    promised(lambda: read_table(tmp_path / "table.txt", 3, "x y z"))
+    promised(lambda: list(records(tmp_path / "table.txt")))
+    promised(lambda: read_transforms(tmp_path / "transforms.json", tmp_path, tmp_path))
+    promised(lambda: read_class_table(tmp_path / "t.tsv", "nyu40id"))
+
+
+@given(
+    images=st.binary(max_size=120),
+    cameras=st.binary(max_size=80),
+    count=st.integers(0, 2**64 - 1),
+    depth=st.binary(max_size=60),
+)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_bytes_are_read_or_refused_in_one_line(tmp_path, images, cameras, count, depth):
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", count) + cameras)
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", count) + images)
+    (tmp_path / "d.bin").write_bytes(b"2&3&1&" + depth)
+    promised(lambda: read_model(tmp_path))
+    promised(lambda: read_depth_map(tmp_path / "d.bin"))
+
+
+PATHS = ["", "images/1.png", "../x", "a\nb", "\ud800"]
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(PATHS),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(["x", "y"]), inner, max_size=2),
+    max_leaves=8,
+)  # fmt: skip
+KEYS = ["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "camera_model", "camera_angle_x", "integer_depth_scale", "frames"]
+FRAME_KEYS = ["file_path", "depth_file_path", "depth_path", "transform_matrix", "fl_x", "w"]
+
+
+@given(
+    shared=st.dictionaries(st.sampled_from(KEYS), JSON, max_size=4),
+    own=st.dictionaries(st.sampled_from(FRAME_KEYS), JSON, max_size=3),
+)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_transforms_are_read_or_refused_in_one_line(tmp_path, shared, own):
+    frame = {"file_path": "images/1.png", "depth_path": "d.png", "transform_matrix": np.eye(4).tolist()}
+    content = {"fl_x": 9, "cx": 1, "cy": 1, "frames": [frame | own, frame | {"file_path": "images/2.png"}]} | shared
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    promised(lambda: read_transforms(tmp_path / "transforms.json", tmp_path, tmp_path))
+
+
+# --- as a run
+
+
+def test_a_run_reads_a_dataset_and_the_command_line_says_what_is_wrong_with_it(tmp_path):
+    names = write(FORMATS["hololens"], tmp_path / "data")
+    options = {"root": str(tmp_path / "data"), "classes": CLASSES}
+    dataset = {"name": "hololens", "options": options}
+    config = load_config(overrides={"dataset": dataset, "backends": ["numpy"], "check": None, "voxel_size": 0.1})
+    (summary,) = run(config, out=tmp_path / "out").groups[0].runs
+    assert (summary.unit.scene, summary.unit.backbone, summary.frames) == ("data", "net", COUNT)
+    assert VoxelTable.load(tmp_path / f"out/voxels/{summary.unit.slug}.parquet").op.max() > 1
+    (tmp_path / f"data/labels/net/{names[COUNT - 1]}.png").write_bytes(raw_png(60_000, 60_000, 8, 0, b""))
+    command = ["run", "--config", tmp_path / "out/config.yaml", "--out", "again", "--rerun", "off"]
+    assert "claims 60000x60000 pixels" in error_of(bench(*command, cwd=tmp_path))

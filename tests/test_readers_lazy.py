@@ -1,0 +1,58 @@
+"""Opening a sequence, of any length, lists and parses text, but reads no image."""
+
+from __future__ import annotations
+
+import io
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_writers import COUNT, FORMATS, numbers, opened, source, write_labels, write_lines
+from posed_scene import fails
+
+from semstab.config import FrameSelection
+from semstab.datasets.selection import select_frames
+from semstab.errors import DataError
+
+IMAGES = {".png", ".jpg", ".npy"}
+
+
+def is_image(path: Path) -> bool:
+    return path.suffix in IMAGES or "depth_maps" in path.parts
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
+    form = FORMATS[name]
+    names = form.write(tmp_path, source(form.scale))
+    write_labels(tmp_path, names, source(form.scale))
+    images = [path for path in tmp_path.rglob("*") if path.is_file() and is_image(path)]
+    assert len(images) >= 3 * COUNT
+    for path in images:
+        path.write_bytes(b"")  # whoever reads it fails
+    read, actual = [], io.open
+    monkeypatch.setattr(io, "open", lambda path, *rest, **how: (read.append(Path(path)), actual(path, *rest, **how))[1])
+    scene = opened(form, tmp_path)
+    assert select_frames(scene, FrameSelection()) == [*range(COUNT)]
+    assert read
+    assert not [path for path in read if is_image(path)]
+    fails(DataError, "the file is empty", scene.frame, 0, "net")
+    assert is_image(read[-1])
+
+
+def test_ten_thousand_frames_open_at_once(tmp_path):
+    """Less than a second; the bound is for machines that do other work too."""
+    count = 10_000
+    (tmp_path / "depth_left").mkdir()
+    for k in range(count):
+        (tmp_path / f"depth_left/{k:06d}_left_depth.npy").touch()
+    steps = np.linspace(0, 500, count)
+    write_lines(tmp_path / "pose_left.txt", [numbers([x, 0, 0, 0, 0, 0, 1]) for x in steps])
+    started = time.process_time()
+    scene = opened(FORMATS["tartanair"], tmp_path)
+    chosen = select_frames(scene, FrameSelection(count=20, spacing="even"))
+    assert time.process_time() - started < 5
+    assert (len(scene), chosen[0], chosen[-1]) == (count, 0, count - 1)
+    assert scene.T_wc(count - 1)[0, 3] == 500
+    fails(DataError, r"009999_left_depth\.npy: the file is empty", scene.depth, count - 1)
