@@ -304,10 +304,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     recording = run / "recording.rrd" if run.is_dir() else run
     if not recording.exists():
         raise ConfigError(f"{recording}: there is no recording; run again without --rerun off")
-    # Through a pipe: the viewer's catalog, which opens files, refuses a recording with a large layout (many scenes).
-    with recording.open("rb") as stream:
-        command = [sys.executable, "-m", "rerun", "-"]
-        raise typer.Exit(subprocess.run(command, stdin=stream, check=False).returncode)
+    raise typer.Exit(subprocess.run([sys.executable, "-m", "rerun", str(recording)], check=False).returncode)
 
 
 @app.command("list")

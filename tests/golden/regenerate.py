@@ -1,14 +1,17 @@
-"""Writes small_map.json, the golden file: `python tests/golden/regenerate.py`. Look at the diff before you commit."""
+"""Writes the golden files: `python tests/golden/regenerate.py`. Look at the diff before you commit."""
 
 import dataclasses
+import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from semstab import backends
-from semstab.files import write_json
+from semstab.files import write_json, write_text
 from semstab.frames import Frame, Intrinsics
 from semstab.metrics import entropy, sbd, summarise, vss
+from semstab.tables import tables, to_csv, to_latex, to_markdown
 
 FILE = Path(__file__).parent / "small_map.json"
 K = 4
@@ -51,5 +54,17 @@ def golden(backend="numpy"):
     }
 
 
+def write_table_files():
+    """The tables of the study of two walls, tables.{csv,md,tex}."""
+    sys.path.insert(0, str(FILE.parents[1]))
+    from wall_study import wall_study
+
+    with tempfile.TemporaryDirectory() as base:
+        result, _ = wall_study(Path(base))
+        for suffix, write in {"csv": to_csv, "md": to_markdown, "tex": to_latex}.items():
+            write_text(FILE.with_name(f"tables.{suffix}"), "\n".join(write(table) for table in tables(result)))
+
+
 if __name__ == "__main__":
     write_json(FILE, golden())
+    write_table_files()

@@ -1,0 +1,139 @@
+"""The study's figures, PNG and SVG, at the widths of a paper's column and page; matplotlib is imported when used."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from semstab.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
+from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
+from semstab.plots.histograms import Histogram, together
+from semstab.plots.maps import Overview, draw_overview, draw_stability
+from semstab.plots.style import Figure
+from semstab.plots.sweeps import draw_sweep
+from semstab.results import slug
+from semstab.study.results import OVERVIEW, Record, StudyResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["Figure", "figures", "write_figures"]
+
+Histograms = Mapping[str, Mapping[str, Histogram]]
+"""By backbone and scene."""
+
+
+def write_figures(result: StudyResult, folder: str | Path) -> list[Path]:
+    """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths."""
+    target = Path(folder) / "figures"
+    return [path for figure in figures(result, folder) for path in figure.save(target)]
+
+
+def figures(result: StudyResult, folder: str | Path) -> list[Figure]:
+    """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
+    kept = [record for record in result.select() if record.voxels is not None]
+    return [
+        *_overviews(result, kept, Path(folder) / OVERVIEW),
+        *_distributions(kept),
+        *_maps(result, kept),
+        *_sweeps(result),
+    ]
+
+
+def _overviews(result: StudyResult, kept: list[Record], folder: Path) -> Iterator[Figure]:
+    """One a backbone, of the first scene that has a saved frame."""
+    for backbone, records in by_backbone(kept).items():
+        for record in records:
+            path = folder / f"{slug(record.unit.scene, backbone)}.npz"
+            if record.unit.scene in result.up and path.exists():
+                yield _overview(record, result.up[record.unit.scene], path)
+                break
+
+
+def _overview(record: Record, up: tuple[float, float, float], path: Path) -> Figure:
+    scene, backbone = record.unit.scene, record.unit.backbone
+    return Figure(
+        slug("overview", scene, backbone),
+        f"Overview: {scene}, {backbone}",
+        "A frame, its prediction, and the map that all sampled frames were fused into, seen from above: the dominant"
+        " class of the topmost voxels, in the prediction's colours.",
+        f"A camera image of {scene}, the classes that {backbone} predicts for it, and the fused map from above in the"
+        " same colours.",
+        lambda: draw_overview(record.table(), up, Overview.load(path)),
+        dense=True,
+    )
+
+
+def _distributions(kept: list[Record]) -> Iterator[Figure]:
+    if not kept:
+        return
+
+    @functools.cache
+    def histograms() -> Histograms:
+        return {
+            backbone: {record.unit.scene: Histogram.of(record.table()) for record in records}
+            for backbone, records in by_backbone(kept).items()
+        }
+
+    def ecdf(backbone: str) -> Canvas:
+        every = {f"{b}/{s}": h for b, scenes in histograms().items() for s, h in scenes.items()}
+        return draw_ecdf(histograms()[backbone], informative(every))
+
+    for backbone in by_backbone(kept):
+        yield Figure(
+            slug("ecdf", backbone),
+            f"Disagreement and drift by scene: {backbone}",
+            "Empirical distributions over the voxels of each scene: disagreement 1 - VSS of all voxels, SBD of those"
+            " seen twice or more. Dashed: the recurrent voxels of all scenes. The x axes are the same for each backbone"
+            " and end where 99% of the voxels of every scene are reached.",
+            f"Two panels of cumulative curves, one a scene, for {backbone}: how many voxels have how much disagreement"
+            " and drift.",
+            partial(ecdf, backbone),
+        )
+    yield Figure(
+        "persistence",
+        "VSS and SBD against observation persistence",
+        "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
+        " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
+        "For each backbone, VSS and SBD as curves against OP on a logarithmic axis, with the number of voxels beneath.",
+        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in histograms().items()}),
+    )
+
+
+def _maps(result: StudyResult, kept: list[Record]) -> Iterator[Figure]:
+    for record in kept:
+        scene, backbone = record.unit.scene, record.unit.backbone
+        if scene in result.up:
+            yield Figure(
+                slug("stability_map", scene, backbone),
+                f"Stability from above: {scene}, {backbone}",
+                "The topmost voxel of each column along the up axis: its stability category, its SBD (grey: seen once,"
+                " no SBD; the scale ends at the largest value there is) and its normalised entropy.",
+                f"Three maps of {scene} from above with the stability category, the drift and the entropy of"
+                f" {backbone}'s voxels.",
+                partial(_draw_map, record, result.up[scene]),
+                dense=True,
+            )
+
+
+def _draw_map(record: Record, up: tuple[float, float, float]) -> Canvas:
+    return draw_stability(record.table(), up)
+
+
+def _sweeps(result: StudyResult) -> Iterator[Figure]:
+    for sweep in swept(result):
+        backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
+        if backbones:
+            yield Figure(
+                f"sensitivity_{sweep.name}",
+                f"Sensitivity to {sweep.title}",
+                "The share of recurrent voxels, and VSS and SBD over all voxels (solid) and over the recurrent ones"
+                f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes; bars are the standard deviation"
+                " over repeats. Read (b) and (c) with (a): which voxels there are to average changes along the sweep.",
+                f"Three panels against {sweep.title}: the recurrent share, VSS and SBD, for all voxels and for the"
+                " recurrent ones.",
+                partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in backbones}),
+            )

@@ -1,0 +1,73 @@
+"""The sensitivity sweeps: aggregate and recurrent values together with the recurrent share (paper, Sensitivity)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from semstab.averages import ENOUGH, Level, Pooled, Sweep
+from semstab.plots.style import INK, PAGE, canvas, color, mark_panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
+    """VSS, SBD and the recurrent share along a sweep; the values stand at equal distances, in order."""
+    figure = canvas(PAGE, 2.5)
+    share, vss, sbd = figure.subplots(1, 3)
+    values = sorted({level.value for levels in backbones.values() for level in levels})
+    for k, levels in enumerate(backbones.values()):
+        x = [values.index(level.value) for level in levels]
+        _line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), recurrent=None)
+        for axes, measure in ((vss, "vss"), (sbd, "sbd")):
+            _line(axes, x, levels, _of_group("every", measure), color(k), recurrent=False)
+            enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
+            at = [values.index(level.value) for level in enough]
+            _line(axes, at, enough, _of_group("recurrent", measure), color(k), recurrent=True)
+    titles = ("recurrent share (%)", "VSS", "SBD (bits)")
+    for axes, letter, title in zip((share, vss, sbd), "abc", titles, strict=True):
+        axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
+        axes.set_xlim(-0.3, len(values) - 0.7)
+        axes.set_xlabel(f"{sweep.title.split(',')[0]} ({sweep.unit})" if sweep.unit else sweep.title)
+        mark_panel(axes, letter, title)
+    share.set_ylim(bottom=0)
+    figure.legend(handles=_legend(list(backbones)), loc="outside lower center", ncols=len(backbones) + 2)
+    return figure
+
+
+def _of_group(group: str, measure: str) -> Callable[[Pooled], float]:
+    return lambda pooled: float(getattr(getattr(pooled, group), measure))
+
+
+def _line(
+    axes: Axes,
+    x: list[int],
+    levels: tuple[Level, ...] | list[Level],
+    measure: Callable[[Pooled], float],
+    shade: str,
+    recurrent: bool | None,
+) -> None:
+    spreads = [level.spread(measure) for level in levels]
+    errors = [0.0 if math.isnan(spread.sd) else spread.sd for spread in spreads]
+    axes.errorbar(
+        x,
+        [spread.mean for spread in spreads],
+        yerr=errors if any(errors) else None,
+        color=shade,
+        linestyle="--" if recurrent else "-",
+        marker="s" if recurrent is None else "o",
+        markerfacecolor="white" if recurrent else shade,
+        capsize=2,
+        elinewidth=0.8,
+    )
+
+
+def _legend(backbones: list[str]) -> list[object]:
+    from matplotlib.lines import Line2D
+
+    every = Line2D([], [], color=INK, marker="o", label="all voxels")
+    recurrent = Line2D([], [], color=INK, marker="o", linestyle="--", markerfacecolor="white", label="OP ≥ 3")
+    return [*(Line2D([], [], color=color(k), label=name) for k, name in enumerate(backbones)), every, recurrent]

@@ -1,0 +1,49 @@
+"""The study's tables: CSV, Markdown and LaTeX rounded as the paper's, JSON in full precision."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from semstab.files import write_json, write_text
+from semstab.study.results import StudyResult
+from semstab.tables.fusion import agreement, fusion
+from semstab.tables.glance import glance
+from semstab.tables.image_space import flicker
+from semstab.tables.sensitivity import sensitivity
+from semstab.tables.stability import classes, cross_backbone, persistence, scenes
+from semstab.tables.table import Cell, Column, Group, Table
+from semstab.tables.writers import TEXT_WRITERS, to_csv, to_json, to_latex, to_markdown
+
+__all__ = [
+    "Cell",
+    "Column",
+    "Group",
+    "Table",
+    "tables",
+    "to_csv",
+    "to_json",
+    "to_latex",
+    "to_markdown",
+    "write_tables",
+]
+
+BUILDERS = (glance, flicker, scenes, persistence, classes, cross_backbone, sensitivity, fusion, agreement)
+"""In the paper's order; each makes no table where the study has nothing for it."""
+
+
+def tables(result: StudyResult) -> list[Table]:
+    """Every table that the study has records for, in the paper's order."""
+    return [table for build in BUILDERS for table in build(result)]
+
+
+def write_tables(result: StudyResult, folder: str | Path) -> list[Path]:
+    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table; return the paths."""
+    written = []
+    for table in tables(result):
+        stem = Path(folder) / "tables" / table.name
+        for suffix, write in TEXT_WRITERS.items():
+            written.append(stem.with_suffix(f".{suffix}"))
+            write_text(written[-1], write(table))
+        written.append(stem.with_suffix(".json"))
+        write_json(written[-1], to_json(table))
+    return written

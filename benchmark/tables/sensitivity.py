@@ -1,0 +1,59 @@
+"""The sensitivity sweeps: what all voxels say and what the recurrent ones say, side by side with their share."""
+
+from __future__ import annotations
+
+from semstab.averages import ENOUGH, Level, Sweep, complete_scenes, levels, swept
+from semstab.study.results import StudyResult
+from semstab.tables.stability import SBD_OVER
+from semstab.tables.table import Column, Group, Row, Table
+
+
+def sensitivity(result: StudyResult) -> list[Table]:
+    """One table a sweep (paper, Sensitivity to World-Space Association)."""
+    return [_table(result, sweep) for sweep in swept(result)]
+
+
+def _table(result: StudyResult, sweep: Sweep) -> Table:
+    columns = (
+        Column("value", sweep.header),
+        Column("repeats", "Repeats", 0),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("recurrent_percent", "OP>=3 (%)", 2),
+        Column("vss", "VSS", 4, "higher", over="All voxels"),
+        Column("sbd", "SBD", 4, "lower", over="All voxels"),
+        Column("entropy", "Entropy", 4, "lower", over="All voxels"),
+        Column("recurrent_vss", "VSS", 4, "higher", over="OP>=3"),
+        Column("recurrent_sbd", "SBD", 4, "lower", over="OP>=3"),
+        Column("recurrent_entropy", "Entropy", 4, "lower", over="OP>=3"),
+        Column("note", "Note"),
+    )
+    backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
+    groups = tuple(
+        Group(name, tuple(_row(sweep, level) for level in levels(result, sweep.name, name))) for name in backbones
+    )
+    scenes = dict.fromkeys(scene for name in backbones for scene in complete_scenes(result, sweep.name, name))
+    caption = (
+        f"Pooled: the means run over the voxels of all scenes together ({', '.join(scenes)}); ± is the standard"
+        f" deviation over the repeats, each with a seed of its own. {SBD_OVER} Few: fewer than {ENOUGH:,} recurrent"
+        " voxels."
+    )
+    return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
+
+
+def _row(sweep: Sweep, level: Level) -> Row:
+    spread = level.spread if len(level.repeats) > 1 else level.mean
+    return (
+        sweep.text(level.value),
+        len(level.repeats),
+        level.mean(lambda p: p.voxels),
+        level.mean(lambda p: p.mean_op),
+        spread(lambda p: 100 * p.recurrent.share),
+        spread(lambda p: p.every.vss),
+        spread(lambda p: p.every.sbd),
+        spread(lambda p: p.every.entropy),
+        spread(lambda p: p.recurrent.vss),
+        spread(lambda p: p.recurrent.sbd),
+        spread(lambda p: p.recurrent.entropy),
+        "" if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH else "few",
+    )

@@ -1,0 +1,47 @@
+"""Records of a study from maps given voxel by voxel, for cases that are worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.metrics import summarise
+from semstab.results import Unit, UnitSummary
+from semstab.study.results import BASE, Record, StudyResult, Variation
+from semstab.voxels import VoxelTable
+
+CLASSES = ("a", "b", "c")
+
+
+def voxels(*groups, r=0.2):
+    """A map in a row along z from groups (number of voxels, op, evidence[, SBD in bits])."""
+    n, op, evidence, drift = zip(*((group[0], group[1], group[2], (*group, 0.0)[3]) for group in groups), strict=True)
+    total = sum(n)
+    zeros = np.zeros(total)
+    ops = np.repeat(op, n)
+    return VoxelTable(
+        zeros,
+        zeros,
+        np.arange(total),
+        op=ops,
+        evidence=np.repeat(np.array(evidence, dtype=float), n, axis=0),
+        drift_sum=np.repeat(drift, n) * (ops - 1),
+        pixels=ops,
+        first_frame=zeros,
+        last_frame=zeros,
+        self_sum=zeros,
+        frame_entropy_sum=zeros,
+        voxel_size=r,
+        classes=CLASSES,
+    )
+
+
+def record(table, sweep=BASE, value=None, repeat=0, scene="s", backbone="m", backend="numpy", **more):
+    """The record of a unit that left this map."""
+    unit = Unit(scene, backbone, backend)
+    summary = UnitSummary(unit, "abc", 4, summarise(table), 10.0, fuse_ms_per_frame=5.0)
+    return Record(unit.slug, Variation(sweep, value, repeat), summary, **more)
+
+
+def study(*records, **more):
+    """A study of these records."""
+    return StudyResult("by hand", "numpy", records, **more)

@@ -1,0 +1,231 @@
+"""The four findings: worked out by hand where they show, where they do not, and where nothing can be said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from records import record, study, voxels
+from wall_study import BACKBONES, wall_study
+
+from semstab.averages import ENOUGH, Level, describe, pooled
+from semstab.findings import (
+    HARDLY,
+    VISIBLE_VSS,
+    Verdict,
+    denser_sampling,
+    falling_drift,
+    findings,
+    less_association,
+    more_disagreement,
+)
+from semstab.metrics import op, vss
+
+SURE, SPLIT = [1, 0, 0], [3, 1, 0]
+N = ENOUGH
+
+
+def level(value, *groups):
+    return Level(value, (pooled([record(voxels(*groups))]),))
+
+
+def seen(once, often, evidence):
+    """Voxels seen once, which all agree, and voxels seen four times with this evidence."""
+    return (once, 1, SURE), (often, 4, evidence)
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    return wall_study(tmp_path_factory.getbasetemp())[0]
+
+
+# --- Recurrent voxels disagree more than the aggregate says -----------------------------------------------------------
+
+
+def test_recurrent_voxels_that_disagree_more():
+    outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N, SPLIT)))]))
+    assert outcome.verdict is Verdict.SHOWN
+    assert (
+        outcome.numbers
+        == "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%."
+    )
+    assert outcome.why == ""
+
+
+def test_recurrent_voxels_that_agree_as_well_as_all():
+    outcome = more_disagreement(pooled([record(voxels((N, 1, SPLIT), (N, 4, SPLIT)))]))
+    assert outcome.verdict is Verdict.NOT_SHOWN
+    assert "agree as well" in outcome.why
+
+
+def test_too_few_recurrent_voxels_say_nothing():
+    outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N - 1, SPLIT)))]))
+    assert outcome.verdict is Verdict.UNTESTED
+    assert outcome.why == "999 voxels have OP>=3; 1,000 are needed."
+
+
+@pytest.mark.parametrize(("gap", "verdict"), [(1.2, Verdict.SHOWN), (0.8, Verdict.NOT_SHOWN)])
+def test_a_difference_counts_from_the_last_printed_decimal_on(gap, verdict):
+    evidence = [
+        1 - 2 * gap * VISIBLE_VSS,
+        2 * gap * VISIBLE_VSS,
+        0,
+    ]  # half of the voxels: the aggregate lies in the middle
+    assert more_disagreement(pooled([record(voxels(*seen(N, N, evidence)))])).verdict is verdict
+
+
+def test_the_first_finding_against_the_voxels_themselves(walls):
+    finding = findings(walls)[0]
+    for row in finding.evidence:
+        tables = [r.table() for r in walls.select(backbone=row.backbone)]
+        values, seen_by = (np.concatenate([measure(table) for table in tables]) for measure in (vss, op))
+        every, recurrent = values.mean(), values[seen_by >= 3].mean()
+        assert row.verdict is (Verdict.SHOWN if every - recurrent >= VISIBLE_VSS else Verdict.NOT_SHOWN)
+        assert f"VSS {recurrent:.4f} for OP>=3 against {every:.4f}" in row.outcome.numbers
+    assert [row.backbone for row in finding.evidence] == list(BACKBONES)
+
+
+# --- Mean SBD falls with OP -------------------------------------------------------------------------------------------
+
+
+def drifting(*sbd_by_op):
+    return pooled([record(voxels(*((n, op, SURE, sbd) for n, op, sbd in sbd_by_op)))])
+
+
+def test_sbd_that_falls_from_stratum_to_stratum():
+    outcome = falling_drift(drifting((N, 1, 0.0), (N, 2, 0.08), (N, 4, 0.05), (N, 9, 0.02)))
+    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.numbers == "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5."
+
+
+def test_sbd_that_rises_once_does_not_fall():
+    outcome = falling_drift(drifting((N, 2, 0.05), (N, 4, 0.06), (N, 9, 0.02)))
+    assert outcome.verdict is Verdict.NOT_SHOWN
+    assert outcome.why == "No fall from OP=2 to 3<=OP<=5."
+
+
+def test_a_small_stratum_does_not_count():
+    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Verdict.SHOWN
+
+
+def test_one_stratum_has_no_trend():
+    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Verdict.UNTESTED
+
+
+# --- Finer voxels and noise -------------------------------------------------------------------------------------------
+
+
+def test_noise_that_lowers_recurrence_and_raises_vss():
+    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
+    outcome = less_association(describe("depth_noise"), found)
+    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.numbers == "0 → 1 % of depth: VSS 0.8750 → 0.9375; OP>=3 50.00 → 25.00%."
+
+
+def test_finer_voxels_are_compared_with_the_coarsest():
+    found = [level(0.1, *seen(3 * N, N, SPLIT)), level(0.4, *seen(N, N, SPLIT))]
+    outcome = less_association(describe("voxel_size"), found)
+    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.numbers.startswith("0.4 → 0.1 m: VSS 0.8750 → 0.9375")
+
+
+def test_every_level_has_to_follow():
+    found = [level(0.0, *seen(N, N, SPLIT)), level(0.1, *seen(3 * N, N, SPLIT)), level(0.2, *seen(N, 3 * N, SPLIT))]
+    outcome = less_association(describe("translation_noise"), found)
+    assert outcome.verdict is Verdict.NOT_SHOWN
+    assert "VSS hardly rises or falls: -0.0625 at 0.2 m." in outcome.why
+    assert "The share does not fall at 0.2 m." in outcome.why
+    assert "1.0 pixels" in outcome.why
+
+
+def test_noise_needs_an_undisturbed_level():
+    found = [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))]
+    assert less_association(describe("depth_noise"), found).verdict is Verdict.UNTESTED
+    assert less_association(describe("depth_noise"), found[:1]).verdict is Verdict.UNTESTED
+
+
+def test_recurrence_that_was_never_there_cannot_fall():
+    found = [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))]
+    assert less_association(describe("depth_noise"), found).verdict is Verdict.UNTESTED
+
+
+# --- Denser sampling --------------------------------------------------------------------------------------------------
+
+
+def sampled(fewer, more):
+    return denser_sampling(describe("frame_count"), [level(20, *fewer), level(80, *more)])
+
+
+def test_denser_sampling_that_uncovers_what_was_there():
+    outcome = sampled(seen(9 * N, N, SPLIT), seen(N, N, SPLIT))
+    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.numbers == (
+        "20 → 80 frames: VSS over all voxels 0.9750 → 0.8750, for OP>=3 0.7500 → 0.7500; OP>=3 10.00 → 50.00%."
+    )
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.9, Verdict.SHOWN), (1.1, Verdict.NOT_SHOWN)])
+def test_recurrent_vss_may_move_by_half_as_much(share, verdict):
+    # With half of the voxels recurrent before, a share x after and VSS falling by m among them, the aggregate falls by
+    # 0.25 (x - 0.5) + m x: at x = 0.8 m is half of that where m = 0.0625.
+    move = 0.0625 * share
+    evidence = [0.75 - move, 0.25 + move, 0]
+    outcome = sampled(seen(4 * N, 4 * N, SPLIT), seen(2 * N, 8 * N, evidence))
+    fall = 0.25 * 0.3 + move * 0.8
+    assert (move <= HARDLY * fall) == (verdict is Verdict.SHOWN)
+    assert outcome.verdict is verdict
+
+
+def test_vss_that_does_not_fall():
+    outcome = sampled(seen(N, N, SPLIT), seen(9 * N, N, SPLIT))
+    assert (outcome.verdict, outcome.why) == (Verdict.NOT_SHOWN, "VSS over all voxels does not fall.")
+
+
+def test_levels_without_recurrent_voxels_do_not_count():
+    assert sampled(seen(9 * N, 10, SPLIT), seen(N, N, SPLIT)).verdict is Verdict.UNTESTED
+
+
+# --- Together ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_only_pooling_makes_is_not_shown():
+    """In each scene the recurrent voxels agree better than the others; the scene that disagrees has more of them."""
+    clear = record(voxels((9 * N, 1, [9, 1, 0]), (N, 4, SURE)), scene="clear")
+    unclear = record(voxels((N, 1, [1, 1, 0]), (9 * N, 4, [3, 2, 0])), scene="unclear")
+    finding = findings(study(clear, unclear))[0]
+    (row,) = finding.evidence
+    assert more_disagreement(pooled([clear, unclear])).verdict is Verdict.SHOWN
+    assert (row.verdict, row.scenes) == (Verdict.NOT_SHOWN, (0, 2))
+    assert "by themselves only 0 of 2" in row.outcome.why
+
+
+def test_a_finding_is_shown_where_every_backbone_shows_it():
+    agreeing = record(voxels((N, 1, SPLIT), (N, 4, SPLIT)), backbone="agreeing")
+    disagreeing = record(voxels(*seen(N, N, SPLIT)), backbone="disagreeing")
+    untested = record(voxels((N, 1, SPLIT)), backbone="unseen")
+    both = findings(study(agreeing, disagreeing, untested))[0]
+    assert (both.verdict, both.counts, both.said) == (Verdict.NOT_SHOWN, (1, 2), "shown in 1 of 2 tests")
+    assert findings(study(disagreeing, untested))[0].verdict is Verdict.SHOWN
+    assert findings(study(untested))[0].verdict is Verdict.UNTESTED
+
+
+def test_without_sweeps_two_findings_cannot_be_tested():
+    found = findings(study(record(voxels(*seen(N, N, SPLIT)))))
+    assert [finding.verdict for finding in found[2:]] == [Verdict.UNTESTED] * 2
+    assert all(row.outcome.why.startswith("The study varies n") for finding in found[2:] for row in finding.evidence)
+
+
+def test_repeats_are_averaged():
+    base = [record(voxels(*seen(N, N, SPLIT)), "depth_noise", 0.0)]
+    noisy = [record(voxels(*seen(n * N, N, SPLIT)), "depth_noise", 0.01, repeat) for repeat, n in enumerate((3, 1))]
+    (row,) = findings(study(record(voxels(*seen(N, N, SPLIT))), *base, *noisy))[2].evidence
+    assert "VSS 0.8750 → 0.9062; OP>=3 50.00 → 37.50%" in row.outcome.numbers
+
+
+def test_the_walls_show_what_they_were_made_for(walls):
+    """Errors drawn anew in every frame: more looks, more disagreement; and noise tears apart what meets."""
+    by_name = {finding.name: finding for finding in findings(walls)}
+    assert by_name["disagreement"].verdict is Verdict.SHOWN
+    assert by_name["drift"].verdict is Verdict.SHOWN
+    assert by_name["association"].verdict is Verdict.SHOWN
+    assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
+    assert all(row.outcome.numbers for row in by_name["sampling"].evidence)

@@ -1,0 +1,362 @@
+"""The study's figures: what they are drawn from, against plain recomputation, and the files that come out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from records import record, study, voxels
+from wall_study import BACKBONES, drawn_walls, wall_study
+
+from semstab import backends
+from semstab.averages import ENOUGH, describe, levels
+from semstab.errors import DataError
+from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
+from semstab.plots import figures, topdown
+from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
+from semstab.plots.histograms import BINS, MOST_DRIFT, OP_BOUNDS, Histogram, op_position, together
+from semstab.plots.maps import Overview, draw_overview, draw_stability, scale_length
+from semstab.plots.style import COLUMN, DPI, PAGE
+from semstab.plots.sweeps import draw_sweep
+from semstab.plots.topdown import EMPTY, level_axes, top_down
+from semstab.testing import SEQUENCES, as_frames, checks
+from semstab.voxels import VoxelTable
+
+SURE, SPLIT = [1, 0, 0], [3, 1, 0]
+PALETTE = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200]], dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    return wall_study(tmp_path_factory.getbasetemp())[0]
+
+
+def at(index, r=1.0, **columns):
+    """A map with voxels at these indices (n, 3), in any order, and these columns."""
+    index = np.asarray(index)
+    order = np.lexsort(index.T[::-1])
+    n, zeros = len(index), np.zeros(len(index))
+    given = {"op": np.ones(n), "evidence": np.tile(SURE, (n, 1)), "drift_sum": zeros} | columns
+    given = {name: np.asarray(value)[order] for name, value in given.items()}
+    rest = dict.fromkeys(("pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum"), zeros)
+    return VoxelTable(*index[order].T, **given, **rest, voxel_size=r, classes=("a", "b", "c"))
+
+
+# --- Histograms -------------------------------------------------------------------------------------------------------
+
+
+def test_the_bins_of_op_are_single_values_and_then_widen():
+    assert OP_BOUNDS[:9].tolist() == list(range(1, 10))
+    steps = np.diff(OP_BOUNDS[8:].astype(float))
+    assert (steps >= 1).all()
+    assert (steps <= 0.25 * OP_BOUNDS[8:-1] + 0.5).all()
+    assert OP_BOUNDS[-1] >= 2**31
+    assert op_position()[:8] == pytest.approx(range(1, 9))
+
+
+@checks
+@given(SEQUENCES)
+def test_histograms_say_what_the_voxels_say(sequence):
+    table = fused(sequence)
+    histogram = Histogram.of(table)
+    for measure, values in ((histogram.disagreement, 1 - vss(table)), (histogram.sbd, sbd(table))):
+        defined = ~np.isnan(values)
+        for k, seen in enumerate(range(1, 9)):
+            here = values[defined & (op(table) == seen)]
+            assert measure.voxels[k] == len(here)
+            if len(here):
+                assert measure.mean()[k] == pytest.approx(here.mean())
+                nearest = np.quantile(here, 0.25, method="inverted_cdf")
+                assert measure.quantile(0.25)[k] == pytest.approx(nearest, abs=measure.largest / BINS + 1e-9)
+        grid = np.arange(0, BINS + 1, 50)
+        expected = [np.mean(values[defined] <= measure.values[k] + 1e-9) if defined.any() else 0 for k in grid]
+        assert measure.ecdf()[grid] == pytest.approx(expected)
+
+
+def fused(sequence):
+    backend = backends.create("numpy", voxel_size=1.0, num_classes=3)
+    for frame in as_frames(sequence):
+        backend.integrate(frame)
+    return backend.table()
+
+
+@checks
+@given(SEQUENCES)
+def test_no_voxel_drifts_further_than_the_scale_of_the_maps(sequence):
+    drift = sbd(fused(sequence))
+    assert (drift[~np.isnan(drift)] <= MOST_DRIFT + 1e-12).all()
+
+
+def test_the_largest_drift_is_that_of_two_frames_that_contradict_each_other():
+    half = -(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25)) - 0.5
+    assert pytest.approx(half) == MOST_DRIFT
+
+
+def test_histograms_add_up():
+    parts = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1)), voxels((2, 4, SPLIT, 0.2), (7, 2, SURE))
+    whole = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1), (2, 4, SPLIT, 0.2), (7, 2, SURE))
+    added, direct = together(map(Histogram.of, parts)), Histogram.of(whole)
+    assert np.array_equal(added.sbd.counts, direct.sbd.counts)
+    assert np.array_equal(added.disagreement.counts, direct.disagreement.counts)
+    assert added.sbd.sums == pytest.approx(direct.sbd.sums)
+
+
+def test_the_ecdf_of_recurrent_voxels_leaves_the_others_out():
+    measure = Histogram.of(voxels((6, 1, SURE), (3, 3, SURE), (1, 3, SPLIT))).disagreement
+    assert (measure.ecdf()[0], measure.ecdf(3)[0], measure.ecdf(3)[BINS // 4]) == (0.9, 0.75, 1.0)
+
+
+def test_the_axes_of_the_ecdfs_end_where_nearly_all_voxels_are():
+    histogram = Histogram.of(voxels((99, 2, SURE, 0.1), (1, 2, [1, 1, 0], 0.3)))
+    disagreement, drift = informative({"s": histogram})
+    assert disagreement == 0.05
+    assert drift == pytest.approx(0.1, abs=MOST_DRIFT / BINS)
+
+
+# --- From above -------------------------------------------------------------------------------------------------------
+
+
+@checks
+@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda up: np.linalg.norm(up) > 0.1))
+def test_level_axes_are_right_handed_unit_vectors(up):
+    right, ahead, above = level_axes(up)
+    R = np.stack([right, ahead, above])
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    assert above @ np.array(up) == pytest.approx(np.linalg.norm(up))
+
+
+AXES = {
+    (0.0, 0.0, 1.0): lambda i: (i[1], i[0], i[2]),  # ahead, right, up of an index
+    (0.0, 0.0, -1.0): lambda i: (-i[1], i[0], -i[2]),
+    (0.0, -1.0, 0.0): lambda i: (i[2], i[0], -i[1]),
+    (0.0, 2.0, 0.0): lambda i: (-i[2], i[0], i[1]),
+    (1.0, 0.0, 0.0): lambda i: (i[2], i[1], i[0]),
+}
+
+
+@pytest.mark.parametrize("up", AXES)
+@checks
+@given(st.sets(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=40))
+def test_the_topmost_voxel_of_each_column(up, index):
+    table = at(list(index))
+    image, cell = top_down(table, up)
+    tops = {}
+    for row, i in enumerate(table.index):
+        ahead, right, height = (int(x) for x in AXES[up](i))
+        tops[ahead, right] = max(tops.get((ahead, right), (-99, -1)), (height, row))
+    farthest, leftmost = max(a for a, _ in tops), min(r for _, r in tops)
+    expected = np.full(image.shape, EMPTY)
+    for (ahead, right), (_, row) in tops.items():
+        expected[farthest - ahead, right - leftmost] = row
+    assert cell == 1.0
+    assert np.array_equal(image, expected)
+
+
+@pytest.mark.parametrize("up", [(0.05, 0.02, 1.0), (0.3, -0.2, 1.0)])
+def test_a_tilted_floor_has_no_holes(up):
+    """A floor at right angles to up, in voxels of a grid that is not."""
+    right, ahead, above = level_axes(up)
+    a, b = np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-4, 4, 0.05))
+    points = a[..., None] * right + b[..., None] * ahead + 0.5 * above
+    image, _ = top_down(at(np.unique(np.floor(points.reshape(-1, 3) / 0.2).astype(int), axis=0), r=0.2), up)
+    inside = image[3:-3, 3:-3]
+    assert inside.shape[0] > 30
+    assert (inside != EMPTY).all()
+
+
+def test_a_large_map_has_cells_of_several_voxels(monkeypatch):
+    monkeypatch.setattr(topdown, "LARGEST", 10)
+    table = at([(x, 0, x % 7) for x in range(40)])
+    image, cell = top_down(table, (0, 0, 1))
+    assert cell == 4.0
+    assert image.shape == (1, 10)
+    assert [table.iz[row] for row in image[0][:3]] == [3, 6, 4]
+
+
+def test_lone_voxels_far_away_are_cut_off():
+    plate = [(x, y, 0) for x in range(40) for y in range(40)]
+    image, _ = top_down(at([*plate, (10_000, 0, 0), (0, -10_000, 0)]), (0, 0, 1))
+    assert image.shape == (40, 40)
+
+
+@pytest.mark.parametrize(("width", "length"), [(100, 20), (8, 2), (4.1, 1), (0.6, 0.1), (1999, 200)])
+def test_a_scale_bar_has_a_round_length(width, length):
+    assert scale_length(width) == pytest.approx(length)
+
+
+# --- What is drawn ----------------------------------------------------------------------------------------------------
+
+
+def pixels(axes):
+    (image,) = axes.get_images()
+    return image.get_array()
+
+
+def test_a_map_has_the_colours_of_its_categories():
+    columns = {"op": [1, 4, 4], "evidence": [SURE, [2, 2, 0], [4, 0, 0]], "drift_sum": [0, 0.6, 0]}
+    table = at([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **columns)
+    kind, drift, doubt, *_ = draw_stability(table, (0, 0, 1)).axes
+    assert pixels(kind)[0].tolist() == [list(CATEGORY_COLORS[k]) for k in categories(table)]
+    grey = [204, 204, 204]
+    assert pixels(drift)[0, 0, :3].tolist() == grey
+    assert pixels(doubt)[0, 0, :3].tolist() == grey
+    assert pixels(drift)[0, 2, :3].tolist() != pixels(drift)[0, 1, :3].tolist() != grey
+
+
+def test_nothing_is_white():
+    table = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
+    for axes in draw_stability(table, (0, 0, 1)).axes[:3]:
+        assert pixels(axes)[0, 1, :3].tolist() == [255, 255, 255]
+
+
+def test_the_overview_is_in_one_palette():
+    table = at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]])
+    overview = Overview(7, np.array([[0, 1], [2, 255]]), np.zeros((2, 2, 3), np.uint8), PALETTE)
+    image, prediction, fused_map = draw_overview(table, (0, 0, 1), overview).axes
+    assert [axes.get_title(loc="left")[:3] for axes in (image, prediction, fused_map)] == ["(a)", "(b)", "(c)"]
+    white = [255, 255, 255]
+    assert pixels(prediction).tolist() == [[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], white]]
+    assert pixels(fused_map)[0].tolist() == [PALETTE[k].tolist() for k in dominant(table)]
+
+
+def test_without_an_image_the_overview_has_two_panels():
+    overview = Overview(0, np.zeros((2, 2), int), None, PALETTE)
+    assert len(draw_overview(at([(0, 0, 0)]), (0, 0, 1), overview).axes) == 2
+
+
+def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
+    found = {name: levels(walls, "depth_noise", name) for name in BACKBONES}
+    share, stability, _ = draw_sweep(describe("depth_noise"), found).axes
+    lines = [container.lines[0].get_ydata() for container in stability.containers]
+    expected = [
+        [level.mean(lambda p, group=group: getattr(p, group).vss) for level in levels_]
+        for levels_ in found.values()
+        for group in ("every", "recurrent")
+    ]
+    assert np.array(lines) == pytest.approx(np.array(expected))
+    assert [label.get_text() for label in share.get_xticklabels()] == ["0", "1"]
+    shares = share.containers[0].lines[0].get_ydata()
+    assert shares == pytest.approx([100 * level.mean(lambda p: p.recurrent.share) for level in found["calm"]])
+
+
+def test_recurrent_values_of_few_voxels_are_not_drawn():
+    few = record(voxels((ENOUGH - 1, 3, SPLIT)), "frame_count", 5)
+    many = record(voxels((ENOUGH, 3, SPLIT)), "frame_count", 10)
+    found = {"m": levels(study(few, many), "frame_count", "m")}
+    every, recurrent = draw_sweep(describe("frame_count"), found).axes[1].containers
+    assert (list(every.lines[0].get_xdata()), list(recurrent.lines[0].get_xdata())) == ([0, 1], [1])
+
+
+def test_curves_against_op_have_the_means_of_the_voxels():
+    histogram = Histogram.of(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
+    stability, drift, counts = draw_persistence({"m": histogram}).axes
+    mean, few = stability.get_lines()
+    assert mean.get_xdata().tolist() == pytest.approx([1, 2, 4])
+    assert mean.get_ydata().tolist() == pytest.approx([1, 0.75, 0.5])
+    assert few.get_xdata().tolist() == pytest.approx([4])
+    assert drift.get_lines()[0].get_ydata().tolist() == pytest.approx([math.nan, 0.2, 0.1], nan_ok=True)
+    assert [tick for tick in counts.get_xticks() if tick <= 4] == [1, 2, 3, 4]
+
+
+def test_an_ecdf_has_a_curve_a_scene_and_one_of_the_recurrent_voxels():
+    scenes = {name: Histogram.of(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
+    disagreement, _ = draw_ecdf(scenes, (0.5, 0.3)).axes
+    at_zero = [line.get_ydata()[0] for line in disagreement.get_lines()]
+    assert at_zero == pytest.approx([0.5, 0.25, 0.0])
+
+
+# --- Files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    return drawn_walls(tmp_path_factory.getbasetemp())
+
+
+def test_every_figure_is_written_as_png_and_svg(drawn):
+    result, folder, paths = drawn
+    names = [figure.name for figure in figures(result, folder)]
+    assert names == [
+        "overview__often__calm",
+        "ecdf__calm",
+        "persistence",
+        "stability_map__often__calm",
+        "stability_map__rarely__calm",
+        "sensitivity_voxel_size",
+        "sensitivity_depth_noise",
+        "sensitivity_frame_count",
+    ]
+    assert paths == [folder / "figures" / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
+
+
+def test_figures_have_the_width_of_a_column_or_a_page(drawn):
+    for path in drawn[2]:
+        if path.suffix == ".png":
+            with Image.open(path) as image:
+                assert image.width in (round(COLUMN * DPI), round(PAGE * DPI))
+                assert image.height <= 8 * DPI
+
+
+def test_svg_files_are_whole_and_without_a_date(drawn):
+    for path in drawn[2]:
+        if path.suffix == ".svg":
+            assert ET.parse(path).getroot().tag.endswith("svg")
+            assert "date" not in path.read_text(encoding="utf-8")
+
+
+def test_the_same_study_gives_the_same_files(drawn, tmp_path):
+    result, folder, _ = drawn
+    (figure,) = (f for f in figures(result, folder) if f.name == "stability_map__often__calm")
+    for path in figure.save(tmp_path):
+        assert path.read_bytes() == (folder / "figures" / path.name).read_bytes()
+
+
+def test_titles_and_texts_are_there_for_every_figure(drawn):
+    result, folder, _ = drawn
+    for figure in figures(result, folder):
+        assert figure.title
+        assert figure.caption.endswith(".")
+        assert len(figure.alt) > 40
+
+
+def test_without_an_up_axis_there_is_no_map(drawn):
+    result, folder, _ = drawn
+    level = dataclasses.replace(result, up={"often": (0.0, -1.0, 0.0)})
+    names = [figure.name for figure in figures(level, folder)]
+    assert "stability_map__often__calm" in names
+    assert "stability_map__rarely__calm" not in names
+
+
+def test_a_study_of_nothing_has_no_figure(tmp_path):
+    assert figures(study(), tmp_path) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04broken"])
+def test_a_damaged_frame_file_is_said_in_one_line(tmp_path, content):
+    path = tmp_path / "s__m.npz"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"s__m\.npz: not a saved frame") as caught:
+        Overview.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_frame_file_without_palette_or_with_objects_is_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", frame=0, labels=np.zeros((2, 2)))
+    np.savez(tmp_path / "b.npz", frame=0, labels=np.array([{}], dtype=object), palette=PALETTE)
+    for name in "ab":
+        with pytest.raises(DataError, match="not a saved frame"):
+            Overview.load(tmp_path / f"{name}.npz")
+
+
+def test_matplotlib_is_imported_only_when_something_is_drawn():
+    code = "import sys, semstab.plots, semstab.report; assert not {'matplotlib', 'jinja2', 'PIL'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

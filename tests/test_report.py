@@ -1,0 +1,291 @@
+"""The report: one page that needs nothing else, says what was found, and survives any name."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import re
+from html.parser import HTMLParser
+
+import pytest
+from PIL import Image
+from records import record, study, voxels
+from wall_study import BACKBONES, CLASSES, STEPS, drawn_walls
+
+from semstab.averages import ENOUGH, pooled
+from semstab.findings import findings
+from semstab.plots import figures
+from semstab.report import write_report
+from semstab.report.reading import reading
+from semstab.results import Agreement, Unit
+from semstab.study.results import BASE, SHARED, Failure, ImageSpace, Variation
+from semstab.tables import tables
+
+SURE, SPLIT = [1, 0, 0], [3, 1, 0]
+EVIL = '<script>alert("x")</script> & "quoted"'
+VOID = {"meta", "link", "img", "br"}
+
+
+class Page(HTMLParser):
+    """The elements of a page, in order, with their attributes and text; it must be well nested."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(text)
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        if self._open and self._open[-1] not in ("style", "pre"):
+            self.text += data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def page_of(result, folder):
+    (path,) = write_report(result, folder)
+    assert path == folder / "report.html"
+    return Page(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    """The study with both walls, one backbone, its figures, and a failure."""
+    calm, folder, _ = drawn_walls(tmp_path_factory.getbasetemp())
+    failure = Failure(Unit("often", "calm", "numpy"), Variation("voxel_size", 0.001), f"out of memory {EVIL}")
+    result = dataclasses.replace(calm, failures=(failure,))
+    return result, folder, page_of(result, folder)
+
+
+def plain(text):
+    return re.sub(r"\s+", " ", text.replace("<=", "≤").replace(">=", "≥"))
+
+
+# --- The page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_needs_no_other_file_no_script_and_no_network(walls):
+    page = walls[2]
+    assert not page.all("script")
+    assert not page.all("iframe")
+    sources = [attributes["src"] for attributes in page.all("img")]
+    links = [attributes["href"] for tag in ("a", "link") for attributes in page.all(tag)]
+    assert sources
+    assert all(source.startswith("data:image/") for source in sources)
+    assert all(link.startswith("#") or link == "data:," for link in links)
+    assert "url(" not in (walls[1] / "report.html").read_text()
+    assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
+
+
+def test_every_link_leads_somewhere_and_every_id_is_one(walls):
+    page = walls[2]
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert {a["href"][1:] for a in page.all("a")} <= set(ids)
+
+
+def test_the_page_can_be_heard(walls):
+    page = walls[2]
+    assert page.all("html")[0]["lang"] == "en"
+    assert all(len(attributes["alt"]) > 40 for attributes in page.all("img"))
+    assert len(page.all("caption")) == len(tables(walls[0]))
+    regions = [attributes for _, attributes in page.elements if "scroll" in (attributes.get("class") or "")]
+    assert all(attributes["tabindex"] == "0" and attributes["aria-label"] for attributes in regions)
+    assert [tag for tag, _ in page.elements if re.fullmatch(r"h\d", tag)][:2] == ["h1", "h2"]
+
+
+def test_every_table_and_figure_stands_on_the_page(walls):
+    result, folder, page = walls
+    text = plain(page.text)
+    ids = {attributes.get("id") for _, attributes in page.elements}
+    for table in tables(result):
+        assert f"table-{table.name}" in ids
+        assert plain(table.title) in text
+        for _, row in table.rows():
+            for column, cell in zip(table.columns, row, strict=True):
+                printed = plain(column.text(cell)).replace("--", "\N{EN DASH}")
+                assert printed in text.replace("\N{MINUS SIGN}", "-")
+    assert {f"figure-{figure.name}" for figure in figures(result, folder)} <= ids
+
+
+def test_rows_have_as_many_cells_as_the_table_has_columns(walls):
+    text = (walls[1] / "report.html").read_text()
+    for table in re.findall(r"<table>.*?</table>", text, re.DOTALL):
+        rows = re.findall(r"<tr.*?</tr>", table, re.DOTALL)
+        widths = [
+            sum(
+                int(n or 1)
+                for n in re.findall(r"<t[hd](?:\s+colspan=\"(\d+)\")?", row.replace('scope="rowgroup" ', ""))
+            )
+            for row in rows
+        ]
+        assert len(set(widths)) == 1, table[:300]
+
+
+def test_every_finding_is_stated_with_its_numbers(walls):
+    text = plain(walls[2].text)
+    for finding in findings(walls[0]):
+        assert finding.claim in text
+        for row in finding.evidence:
+            assert plain(row.outcome.numbers) in text
+            assert plain(row.outcome.why) in text
+
+
+def test_failures_and_where_the_numbers_come_from_are_said(walls):
+    text = plain(walls[2].text)
+    assert "1 failed" in text
+    assert 'out of memory <script>alert("x")</script>' in text
+    assert "voxel size 0.001, repeat 0" in text
+    assert walls[0].manifest["python"] in text
+
+
+def test_undefined_numbers_are_dashes(walls):
+    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", walls[2].text)
+    assert "\N{EN DASH}" in walls[2].text
+
+
+def test_figures_are_taken_from_the_folder_and_dense_ones_made_small(walls):
+    result, folder, page = walls
+    by_alt = {attributes["alt"]: attributes for attributes in page.all("img")}
+    for figure in figures(result, folder):
+        kind, _, data = by_alt[figure.alt]["src"].partition(";base64,")
+        content = base64.b64decode(data)
+        if figure.dense:
+            assert kind == "data:image/png"
+            with (
+                Image.open(io.BytesIO(content)) as image,
+                Image.open(folder / "figures" / f"{figure.name}.png") as full,
+            ):
+                assert image.width == round(full.width * 2 / 3)
+        else:
+            assert kind == "data:image/svg+xml"
+            assert content == (folder / "figures" / f"{figure.name}.svg").read_bytes()
+
+
+def test_figures_that_are_missing_are_drawn(tmp_path):
+    result = study(record(voxels((5, 2, SURE))), record(voxels((5, 2, SURE)), "frame_count", 5))
+    page = page_of(result, tmp_path)
+    assert len(page.all("img")) == 1
+    assert (tmp_path / "figures" / "sensitivity_frame_count.svg").exists()
+
+
+def test_of_the_maps_one_a_backbone_is_open(walls):
+    text = (walls[1] / "report.html").read_text()
+    maps = text[text.index('<section id="maps"') :]
+    assert maps.index("figure-stability_map__often__calm") < maps.index("<details>")
+    assert maps.index("<details>") < maps.index("figure-stability_map__rarely__calm")
+
+
+def test_names_are_shown_as_they_are_whatever_they_are(tmp_path):
+    found = study(*(record(voxels((5, 2, SURE)), scene=EVIL, backbone=name) for name in (EVIL, "b")), failures=())
+    named = dataclasses.replace(found, name=EVIL, manifest={"command": [EVIL], EVIL: EVIL})
+    page = page_of(named, tmp_path)
+    assert not page.all("script")
+    assert page.text.count(EVIL) >= 6
+    assert CLASSES[2] == "window & <sill>"
+
+
+def test_a_study_in_which_everything_failed_has_a_report(tmp_path):
+    failure = Failure(Unit("s", "m", "numpy"), Variation(BASE), "no depth")
+    page = page_of(study(failures=(failure,)), tmp_path)
+    assert "there is nothing to say yet" in page.text
+    assert "no depth" in page.text
+
+
+def test_the_same_study_gives_the_same_page(walls, tmp_path):
+    result, folder, _ = walls
+    before = (folder / "report.html").read_bytes()
+    write_report(result, folder)
+    assert (folder / "report.html").read_bytes() == before
+
+
+# --- The plain-language reading ---------------------------------------------------------------------------------------
+
+
+def read(result):
+    return reading(result, findings(result))
+
+
+def test_the_reading_says_what_was_seen_once_and_what_recurs():
+    sentences = read(study(record(voxels((3 * ENOUGH, 1, SURE), (ENOUGH, 4, SPLIT)), backbone="net")))
+    assert sentences[0].startswith("75% of the voxels were seen once.")
+    assert sentences[1] == (
+        "Where net had three looks or more (25% of its voxels), 25.0% of the evidence goes against the voxel's own"
+        " class; over all voxels it seems to be 6.2%."
+    )
+
+
+def test_too_few_recurrent_voxels_are_not_read_from():
+    sentences = read(study(record(voxels((90, 1, SURE), (10, 4, SPLIT)))))
+    assert "m has 10 voxels with three looks or more: too few to judge it by." in sentences
+
+
+def backbone(name, once, recurrent, sweep=BASE):
+    return record(voxels((ENOUGH, 1, once), (ENOUGH, 4, recurrent)), sweep, backbone=name)
+
+
+def test_the_order_of_the_backbones_may_change_where_voxels_recur():
+    found = study(backbone("x", [1, 0, 0], [6, 4, 0]), backbone("y", [6, 4, 0], [8, 2, 0]))
+    assert "In one taxonomy (abc) the order by VSS is x > y over all voxels, but y > x for OP>=3." in read(found)
+    same = study(backbone("x", SURE, SURE), backbone("y", SURE, SPLIT))
+    assert "In one taxonomy (abc) the order by VSS is x > y, over all voxels and for OP>=3 alike." in read(same)
+
+
+def test_the_shared_taxonomy_decides_the_order():
+    base = [backbone("x", SURE, SURE), backbone("y", SURE, SPLIT)]
+    shared = [backbone("x", SURE, SPLIT, SHARED), backbone("y", SURE, SURE, SHARED)]
+    assert any("the order by VSS is y > x" in sentence for sentence in read(study(*base, *shared)))
+
+
+def test_flicker_is_read_beside_its_compensated_share():
+    image = ImageSpace(65.2, 12.4)
+    sentences = read(study(record(voxels((5, 1, SURE)), backbone="net", image_space=image)))
+    assert any(sentence.endswith("the camera's motion is taken out: net 65% (12%).") for sentence in sentences)
+
+
+def test_the_scene_that_looks_steadiest_may_be_the_one_seen_least():
+    scenes = [
+        record(voxels((10, 4, SPLIT)), scene="looked at"),
+        record(voxels((10, 1, SURE)), scene="passed by"),
+    ]
+    expected = "m looks steadiest in passed by (VSS 1.000), which is also the scene seen least: 1.00 frames a voxel."
+    assert expected in read(study(*scenes))
+    assert expected not in read(study(record(voxels((10, 4, SURE)), scene="looked at"), scenes[1]))
+
+
+def agreement(name, agrees):
+    return Agreement("s", "m", ("numpy", name), (1, 1), (0, 0), {}, agrees)
+
+
+def test_the_reading_says_which_implementations_agree():
+    rows = (agreement("numba", True), agreement("open3d", True), agreement("mine", True), agreement("mine", False))
+    sentences = read(study(record(voxels((5, 1, SURE)))))
+    assert not any("same maps" in sentence for sentence in sentences)
+    found = dataclasses.replace(study(record(voxels((5, 1, SURE)))), agreement=rows)
+    sentences = reading(found, ())
+    assert "numba and open3d leave the same maps as numpy." in sentences
+    assert "mine and numpy disagree in 1 of 2 comparisons." in sentences
+
+
+def test_the_reading_says_what_became_of_each_finding(walls):
+    (sentence,) = (s for s in reading(walls[0], findings(walls[0])) if s.startswith("The paper's findings here:"))
+    assert "recurrent voxels disagree more than the aggregate says (shown); mean SBD falls with OP (shown);" in sentence
+
+
+def test_the_reading_of_the_walls_says_their_numbers(walls):
+    voxels_seen = pooled(walls[0].select())
+    assert reading(walls[0], ())[0].startswith(f"{voxels_seen.once:.0%} of the voxels were seen once.")
+    assert set(walls[0].scenes) == set(STEPS)
+    assert walls[0].backbones == tuple(BACKBONES)[:1]

@@ -1,0 +1,437 @@
+"""A study through the API: its grid, what is kept and what computed again, and that shared frames change no number."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import tiny_study
+from tiny_study import Counting, Interrupting, configure, summary
+
+import semstab
+from semstab.datasets.posed_folder import PosedScene
+from semstab.errors import ConfigError, DataError
+from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
+from semstab.plan import read
+from semstab.results import Unit
+from semstab.study import load_study_result, run_study
+from semstab.study.folder import StudyFolder
+from semstab.study.grid import make_grid
+from semstab.study.jobs import Job, Request, run_job
+from semstab.study.results import BACKENDS, Variation
+from semstab.study.run import split
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_study.write(tmp_path / "wall")
+
+
+def count(config, out, **options) -> Counting:
+    counting = Counting()
+    run_study(config, out, observers=[counting], **options)
+    return counting
+
+
+def test_every_unit_has_the_numbers_of_a_run_with_its_settings(root, tmp_path) -> None:
+    """Though its frames were decoded once for all of them."""
+    config = configure(root, shared_taxonomy=None, strata=[1, 3]).resolved()
+    result = run_study(config, tmp_path / "out")
+    cells = make_grid(config).cells
+    assert [record.variation for record in result.records] == [cell.variation for cell in cells]
+    for cell, record in zip(cells, result.records, strict=True):
+        (run,) = semstab.run(cell.config, out=tmp_path / "run" / record.key).runs
+        expected, found = run.to_dict(), record.summary.to_dict()
+        for name in tiny_study.TIMES:
+            expected.pop(name), found.pop(name)
+        np.testing.assert_equal(found, expected)
+        if record.voxels is not None:
+            voxels = semstab.VoxelTable.load(tmp_path / "run" / record.key / "voxels" / f"{record.unit.slug}.parquet")
+            assert compare(record.table(), voxels, (record.unit, record.unit), tolerance=0).agrees
+
+
+def test_the_grid_goes_through_every_sweep_scene_and_backbone(root) -> None:
+    cells = make_grid(configure(root, seed=7)).cells
+    assert [(cell.variation.sweep, cell.variation.value, cell.variation.repeat) for cell in cells[::2]][:7] == [
+        ("base", None, 0), ("voxel_size", 0.25, 0), ("voxel_size", 0.5, 0), ("depth_noise", 0.0, 0),
+        ("depth_noise", 0.05, 0), ("depth_noise", 0.05, 1), ("frame_count", 5, 0),
+    ]  # fmt: skip
+    noisy = [cell.config.perturbation for cell in cells if cell.variation.value == 0.05]
+    assert [(noise.depth_noise, noise.seed) for noise in noisy] == [(0.05, 7), (0.05, 7), (0.05, 8), (0.05, 8)]
+    counted = [cell for cell in cells if cell.variation.sweep == "frame_count"]
+    assert [(cell.unit.backbone, len(cell.task.indices)) for cell in counted] == [("a", 5), ("a", 10)]
+    assert counted[0].task.indices == [0, 2, 4, 7, 9]
+    assert [cell.unit.backend for cell in cells if cell.variation.sweep == BACKENDS] == ["numba", "numba"]
+
+
+def test_a_point_at_the_base_settings_is_the_base_unit(root, tmp_path) -> None:
+    counting, out = Counting(), tmp_path / "out"
+    result = run_study(configure(root), out, observers=[counting])
+    of_a = [record for record in result.records if record.unit.backbone == "a"]
+    base = of_a[0]
+    twins = [record.variation for record in of_a[1:] if record.key == base.key]
+    assert twins == [
+        Variation("voxel_size", 0.25), Variation("depth_noise", 0), Variation("frame_count", 5),
+        Variation("pixel_stride", 1),
+    ]  # fmt: skip
+    assert all(record.summary == base.summary for record in of_a if record.key == base.key)
+    # base, voxel 0.5, two noisy ones, stride 2 and backend numba for each backbone; ten frames for a
+    assert counting.units == len(counting.computed) == 2 * 6 + 1
+    assert len(list((out / "units").iterdir())) == 13
+    assert {record.voxels is None for record in of_a if record.variation.sweep in ("base", "backends")} == {False}
+    assert {record.voxels for record in of_a if record.variation.sweep not in ("base", "backends")} == {None}
+
+
+def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, monkeypatch) -> None:
+    decoded: list[tuple[int, str]] = []
+    frame = PosedScene.frame
+
+    def counted(self, index, backbone, *, color=True):
+        decoded.append((index, backbone))
+        return frame(self, index, backbone, color=color)
+
+    monkeypatch.setattr(PosedScene, "frame", counted)
+    run_study(configure(root), tmp_path / "out")
+    predicted = [pair for pair in decoded if pair[1] != "gt"]
+    # a's ten frames for the sweep of frame_count, b's five
+    assert sorted(predicted) == sorted([(i, "a") for i in range(10)] + [(i, "b") for i in (0, 2, 4, 7, 9)])
+    # the truth beside the base frames, for video consistency
+    assert len(decoded) - len(predicted) == 2 * 5
+
+
+def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_same(
+    root, tmp_path, monkeypatch
+) -> None:
+    run_study(configure(root), tmp_path / "whole")
+    decoded: list[int] = []
+    frame = PosedScene.frame
+
+    def counted(self, index, backbone, *, color=True):
+        decoded.append(index)
+        return frame(self, index, backbone, color=color)
+
+    monkeypatch.setattr(PosedScene, "frame", counted)
+    grown = itertools.count(step=1_000_000)
+    monkeypatch.setattr("semstab.study.passes._resident_bytes", lambda: next(grown))
+    run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")
+    assert len(decoded) > 25
+    assert summary(tmp_path / "tight") == summary(tmp_path / "whole")
+
+
+def test_an_interrupted_study_goes_on_where_it_was(root, tmp_path) -> None:
+    config, out = configure(root), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run_study(config, out, observers=[Interrupting(4)])
+    assert not (out / "summary.json").exists()
+    resumed = count(config, out)
+    assert (resumed.kept, len(resumed.computed)) == (4, 13 - 4)
+    assert count(config, out).computed == []
+    run_study(config, tmp_path / "whole")
+    assert summary(out) == summary(tmp_path / "whole")
+    assert not list(out.rglob(".*"))
+
+
+def test_a_changed_setting_computes_only_what_it_touches(root, tmp_path) -> None:
+    out = tmp_path / "out"
+    run_study(configure(root), out)
+    finer = tiny_study.SWEEPS | {"voxel_size": [0.125, 0.25, 0.5]}
+    assert count(configure(root, sweeps=finer), out).computed == [
+        "wall__a__numpy voxel_size 0.125", "wall__b__numpy voxel_size 0.125"
+    ]  # fmt: skip
+    more = tiny_study.SWEEPS | {"depth_noise": {"values": [0, 0.05], "repeats": 3}}
+    assert len(count(configure(root, sweeps=more), out).computed) == 2
+    # tolerance and name change no unit, and fewer sweeps need none
+    assert count(configure(root, name="other", tolerance=1e-6, sweeps={}), out).computed == []
+    # other strata change all of them
+    assert len(count(configure(root, strata=[1, 4]), out).computed) == 13
+
+
+def test_what_was_a_sweep_becomes_the_base_with_all_that_a_base_has(root, tmp_path) -> None:
+    out = tmp_path / "out"
+    run_study(configure(root), out)
+    coarse = configure(root, voxel_size=0.5, sweeps={}, backends=[])
+    assert len(count(coarse, out).computed) == 2  # now with its voxels and in image space
+    run_study(coarse, tmp_path / "fresh")
+    assert summary(out) == summary(tmp_path / "fresh")
+    # the voxels of the first base were overwritten: it is computed again, its sweeps are not
+    assert sorted(count(configure(root), out).computed) == ["wall__a__numpy base None", "wall__b__numpy base None"]
+
+
+def test_a_changed_input_computes_what_reads_it(root, tmp_path) -> None:
+    out, config = tmp_path / "out", configure(root)
+    run_study(config, out)
+    cv2.imwrite(str(root / "labels/a/0003.png"), np.zeros((6, 8), np.uint8))  # not among the base frames
+    assert count(config, out).computed == ["wall__a__numpy frame_count 10"]
+    cv2.imwrite(str(root / "labels/b/0002.png"), np.zeros((6, 8), np.uint8))
+    assert len(count(config, out).computed) == 6
+
+
+def test_voxels_that_were_lost_or_damaged_are_computed_again(root, tmp_path) -> None:
+    out, config = tmp_path / "out", configure(root, sweeps={}, backends=[])
+    run_study(config, out)
+    (out / "voxels/wall__a__numpy.parquet").unlink()
+    (out / "voxels/wall__b__numpy.parquet").write_bytes(b"x")
+    assert len(count(config, out).computed) == 2
+    assert count(config, out).computed == []
+
+
+def test_a_failing_unit_is_reported_and_the_others_finish(root, tmp_path) -> None:
+    (root / "depth/0003.png").write_bytes(b"no image")  # read by the sweep of frame_count alone
+    (root / "labels/b/0002.png").write_bytes(b"no image")  # among the base frames of b
+    counting, out = Counting(), tmp_path / "out"
+    result = run_study(configure(root), out, observers=[counting])
+    assert len(counting.failed) == 1 + 6
+    assert len(counting.computed) == 6
+    assert {failure.unit.backbone for failure in result.failures} == {"a", "b"}
+    (of_a,) = [failure for failure in result.failures if failure.unit.backbone == "a"]
+    assert of_a.variation == Variation("frame_count", 10)
+    assert "depth/0003.png: not a PNG image" in of_a.message
+    assert all("labels/b/0002.png" in failure.message for failure in result.failures if failure is not of_a)
+    assert load_study_result(out).failures == result.failures
+    # mended, it goes on
+    shutil.copy(root / "depth/0002.png", root / "depth/0003.png")
+    shutil.copy(root / "labels/b/0001.png", root / "labels/b/0002.png")
+    assert len(count(configure(root), out).computed) == 7
+
+
+def test_a_backend_that_breaks_fails_its_own_units(root, tmp_path, monkeypatch) -> None:
+    from semstab.backends.numba_hash import NumbaHash
+
+    def broken(self, frame):
+        raise RuntimeError("out of\norder")
+
+    monkeypatch.setattr(NumbaHash, "integrate", broken)
+    result = run_study(configure(root), tmp_path / "out")
+    assert {failure.unit for failure in result.failures} == {Unit("wall", name, "numba") for name in "ab"}
+    assert {failure.message for failure in result.failures} == {"RuntimeError: out of order"}
+    assert len(result.select()) == 2
+    assert result.agreement == ()
+
+
+def test_a_unit_without_a_valid_pixel_says_what_is_missing(root, tmp_path) -> None:
+    for path in (root / "labels/a").iterdir():
+        cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
+    result = run_study(configure(root, sweeps={}, backends=[]), tmp_path / "out")
+    assert [record.unit.backbone for record in result.select()] == ["b"]
+    assert "no pixel of 5 frames is valid" in result.failures[0].message
+
+
+def test_the_result_is_read_back_from_its_folder(root, tmp_path) -> None:
+    out = tmp_path / "out"
+    result = run_study(configure(root), out, command=["semstab-bench", "study"])
+    again = load_study_result(out)
+    assert json.dumps(again.to_dict()) == json.dumps(result.to_dict())
+    assert again.manifest["command"] == ["semstab-bench", "study"]
+    assert again.manifest["study"] == {
+        "units": 13, "kept": 0, "computed": 13, "failed": 0, "executor": "in this process"
+    }  # fmt: skip
+    assert set(again.manifest["inputs"]) == {"wall/a", "wall/b"}
+    assert again.up == {"wall": (0.0, -1.0, 0.0)}
+    assert summarise(again.select()[0].table()) == again.select()[0].summary.table
+    assert (again.scenes, again.backbones) == (("wall",), ("a", "b"))
+    with pytest.raises(DataError, match=r"summary\.json: cannot be read"):
+        load_study_result(tmp_path)
+    (out / "summary.json").write_text('{"name": "x"}')
+    with pytest.raises(DataError, match=r"summary\.json: not the summary of a study"):
+        load_study_result(out)
+
+
+def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> None:
+    config = configure(root, frames={}, sweeps={"pixel_stride": [2]}, backends=[]).resolved()
+    result = run_study(config, tmp_path / "out")
+    (task, _) = [cell.task for cell in make_grid(config).cells][:2]
+    frames = [read(task, i) for i in range(10)]
+    truth = [read(dataclasses.replace(task, backbone="gt"), i) for i in range(10)]
+    pairs = list(itertools.pairwise(frames))
+    compensated = [compensated_flicker(*pair) for pair in pairs]
+    self_vc8, vc8 = SelfConsistency(8), VideoConsistency(8)
+    for frame, true in zip(frames, truth, strict=True):
+        self_vc8.add(frame.predicted, frame.valid)
+        vc8.add(frame.predicted, frame.valid & true.valid, true.predicted)
+    found = result.select()[0].image_space
+    assert found.flicker_percent == pytest.approx(np.mean([flicker_percent(*pair) for pair in pairs]))
+    assert found.compensated_flicker_percent == pytest.approx(np.mean([row.flicker_percent for row in compensated]))
+    assert found.compensated_share == pytest.approx(7 / 8)  # a column of eight leaves the view with each frame
+    assert (found.self_vc8, found.vc8) == (self_vc8.value, vc8.value)
+    assert np.isnan([found.self_vc16, found.vc16]).all()  # ten frames have no clip of 16
+    swept = result.select("pixel_stride")[0].image_space
+    assert np.isnan(list(dataclasses.astuple(swept))).all()
+
+
+def test_ground_truth_is_consistent_wherever_it_stays_the_same(root, tmp_path) -> None:
+    config = configure(root, frames={}, backbones=["gt", "a"], sweeps={}, backends=[])
+    gt, a = run_study(config, tmp_path / "out").select()
+    assert np.isnan(gt.image_space.vc8)  # nothing to compare it with
+    assert gt.image_space.compensated_flicker_percent == 0
+    assert a.image_space.compensated_flicker_percent > 0
+
+
+def test_frames_without_ground_truth_are_in_no_clip(root, tmp_path) -> None:
+    (root / "labels/gt/0005.png").unlink()
+    config = configure(root, frames={}, backbones=["a"], sweeps={}, backends=[])
+    (a,) = run_study(config, tmp_path / "out").select()
+    assert np.isnan(a.image_space.vc8)
+    assert a.image_space.self_vc8 >= 0
+
+
+def test_statistics_come_with_every_unit_where_they_are_wanted(root, tmp_path) -> None:
+    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a", "gt"])
+    run_study(config, tmp_path / "out")
+    wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a", "gt"], statistics=True)
+    assert len(count(wanted, tmp_path / "out").computed) == 4
+    result = run_study(wanted, tmp_path / "out")
+    run = semstab.run(make_grid(wanted.resolved()).cells[0].config, out=tmp_path / "run").runs[0]
+    events = semstab.Events.load(tmp_path / "run" / "events" / f"{run.unit.slug}.parquet")
+    base, gt, *swept = result.records
+    assert base.statistics["agreement"]["psa"]["value"] == pytest.approx(psa_by_definition(events))
+    assert base.statistics["drift"] is not None  # the events were kept
+    assert base.statistics["correctness"] is not None  # against the truth, which no map of the truth itself has
+    assert gt.statistics["correctness"] is None
+    assert all(record.statistics["voxel_size"] == 0.5 for record in swept)
+    assert all(record.statistics == {} for record in run_study(config, tmp_path / "out").records)
+
+
+def psa_by_definition(events) -> float:
+    """The mean over voxels of how often two of its observations agree."""
+    voxels = [events.evidence[events.voxel == v] for v in range(len(events.ix))]
+    pairs = [[float(a @ b) for a, b in itertools.combinations(seen, 2)] for seen in voxels if len(seen) > 1]
+    return float(np.mean([np.mean(each) for each in pairs]))
+
+
+def test_units_fused_by_another_backend_are_checked_unless_they_differ_by_design(root, tmp_path) -> None:
+    result = run_study(configure(root, sweeps={}, backends=["numba", "open3d-projective"]), tmp_path / "out")
+    assert [row.backends for row in result.agreement] == [("numpy", "numba")] * 2
+    assert all(row.agrees for row in result.agreement)
+    assert [record.unit.backend for record in result.select(BACKENDS)] == ["numba"] * 2 + ["open3d-projective"] * 2
+    unchecked = configure(root, sweeps={}, backends=[{"name": "numba", "check": False}])
+    assert run_study(unchecked, tmp_path / "out").agreement == ()
+    (group, _) = result.base_runs().groups
+    assert [run.unit.backend for run in group.runs] == ["numpy", "numba", "open3d-projective"]
+
+
+def test_a_backend_that_disagrees_is_told(root, tmp_path, monkeypatch) -> None:
+    from semstab.backends.numba_hash import NumbaHash
+
+    table = NumbaHash.table
+
+    def half(self):
+        whole = table(self)
+        return dataclasses.replace(whole, evidence=whole.evidence / 2)
+
+    monkeypatch.setattr(NumbaHash, "table", half)
+    result = run_study(configure(root, sweeps={}), tmp_path / "out")
+    assert [row.agrees for row in result.agreement] == [False, False]
+
+
+def test_backbones_are_compared_in_the_shared_taxonomy(root, tmp_path) -> None:
+    path = tmp_path / "two.yaml"
+    path.write_text("classes: [wall, {name: opening, members: [door, window]}]\n")
+    result = run_study(configure(root, sweeps={}, backends=[], shared_taxonomy=str(path)), tmp_path / "out")
+    assert [record.summary.table.K for record in result.select("shared_taxonomy")] == [2, 2]
+    assert [record.summary.taxonomy for record in result.select("shared_taxonomy")] == ["two", "two"]
+    # the file's content counts, not its name
+    path.rename(tmp_path / "zwei.yaml")
+    renamed = configure(root, sweeps={}, backends=[], shared_taxonomy=str(tmp_path / "zwei.yaml"))
+    assert len(count(renamed, tmp_path / "out").computed) == 2  # the name stands in the summary
+    (tmp_path / "zwei.yaml").write_text("classes: [{name: wall, members: [door]}, window]\nname: zwei\n")
+    assert len(count(renamed, tmp_path / "out").computed) == 2
+
+
+def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
+    for name in ("long", "short"):
+        tiny_study.write(tmp_path / "data" / name, backbones=("a",))
+    frames = {"long": {"stop": 8, "stride": 4}}
+    sweeps = {"frame_count": {"values": [2, 8], "scenes": ["long"]}}
+    config = configure(tmp_path / "data", frames={}, scene_frames=frames, sweeps=sweeps, backends=[])
+    cells = make_grid(config).cells
+    assert [cell.task.indices for cell in cells] == [[0, 4], [*range(10)], [0, 7], [*range(8)]]
+    listed = configure(tmp_path / "data", frames={"list": [1, 2, 5, 6, 9]}, sweeps={"frame_count": [3]}, backends=[])
+    assert [cell.task.indices for cell in make_grid(listed).cells][2:] == [[1, 5, 9]] * 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"scenes": ["wal"]}, "no scene 'wal'; did you mean 'wall'"),
+        ({"backbones": ["c"]}, "wall: no backbone 'c'"),
+        ({"scene_frames": {"hall": {}}}, "scene_frames: 'hall' is not among the study's wall"),
+        (
+            {"sweeps": {"voxel_size": {"values": [1], "scenes": ["x"]}}},
+            "voxel_size.scenes: 'x' is not among the study's",
+        ),
+        (
+            {"backends": {"values": ["numba"], "backbones": ["x"]}},
+            "backends.backbones: 'x' is not among the study's a, b",
+        ),
+        ({"sweeps": {"frame_count": [11]}}, "frame_count: wall has 10 frames over the extent of the base ones, not 11"),
+        ({"backends": ["open4d"]}, "backend 'open4d' is not known"),
+        ({"backend": {"name": "numpy", "options": {"x": 1}}}, "backend 'numpy' has no option 'x'"),
+        ({"shared_taxonomy": "uavid3"}, "no class takes 'wall, door, window'"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp_path, settings, message) -> None:
+    with pytest.raises((ConfigError, DataError), match=message):
+        run_study(configure(root, **settings), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_something_else_is_refused(root, tmp_path) -> None:
+    config = configure(root, sweeps={}, backends=[])
+    with pytest.raises(ConfigError, match="is not empty and holds no study"):
+        run_study(config, root)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="is a file"):
+        run_study(config, tmp_path / "file")
+    (tmp_path / "empty").mkdir()
+    run_study(config, tmp_path / "empty")
+
+
+def test_a_damaged_unit_file_is_named(root, tmp_path) -> None:
+    out, config = tmp_path / "out", configure(root, sweeps={}, backends=[])
+    run_study(config, out)
+    unit = next((out / "units").iterdir())
+    unit.write_text('{"key": ')
+    with pytest.raises(DataError, match=r"units/\w+\.json: not valid JSON"):
+        run_study(config, out)
+    unit.unlink()
+    run_study(config, out)
+    unit.write_text(json.dumps({**json.loads(unit.read_text()), "summary": {}}))
+    with pytest.raises(DataError, match=r"units/\w+\.json: damaged"):
+        run_study(config, out)
+
+
+def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_path) -> None:
+    config = configure(root, sweeps={}, backends=[], backbones=["a"]).resolved()
+    (cell,) = make_grid(config).cells
+    elsewhere = tmp_path / "elsewhere"
+    job = Job("wall", "a", (Request(cell.identity, cell.config, image_space=True, voxels=True),), "start", elsewhere)
+    (outcome,) = run_job(job)
+    assert not elsewhere.exists()
+    folder = StudyFolder(tmp_path / "out", config)
+    folder.save(outcome)
+    counting = Counting()
+    result = run_study(config, tmp_path / "out", observers=[counting])
+    assert counting.kept == 1
+    assert summarise(result.select()[0].table()) == result.select()[0].summary.table
+
+
+def test_a_job_that_cannot_even_begin_fails_as_a_whole(root, tmp_path) -> None:
+    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a"]).resolved()
+    requests = tuple(Request(c.identity, c.config, image_space=False, voxels=False) for c in make_grid(config).cells)
+    outcomes = run_job(Job("hall", "a", requests, "start", tmp_path))
+    assert [outcome.error for outcome in outcomes] == [outcomes[0].error] * 2
+    assert "scene 'hall' is not there" in outcomes[0].error
+
+
+def test_jobs_are_halved_until_every_worker_has_one() -> None:
+    jobs = [Job("s", "a", tuple("123456"), "", None), Job("s", "b", tuple("78"), "", None)]
+    assert split(jobs, 2) == jobs
+    assert [job.requests for job in split(jobs, 4)] == [("1",), ("2", "3"), ("4", "5", "6"), ("7", "8")]
+    assert [len(job.requests) for job in split(jobs, 100)] == [1] * 8
+    assert "".join(request for job in split(jobs, 5) for request in job.requests) == "12345678"
+    assert split([], 3) == []

@@ -1,0 +1,166 @@
+"""`semstab-bench study` as a process: killed and started again, interrupted, failing; what it prints and writes."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import tiny_study
+import yaml
+
+from semstab.study import run_study
+
+COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+ENVIRONMENT = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_study.write(tmp_path / "wall", backbones=("a", "b", "c"))
+
+
+@pytest.fixture
+def file(root, tmp_path):
+    path = tmp_path / "tiny.yaml"
+    path.write_text(yaml.safe_dump(tiny_study.content(root, backends=[])))
+    return path
+
+
+def started(*arguments: str | Path, cwd: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [COMMAND, "study", *map(str, arguments)],
+        cwd=cwd, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def study(*arguments: str | Path, cwd: Path, code: int = 0) -> tuple[str, str]:
+    """What it prints to stdout and stderr."""
+    process = started(*arguments, cwd=cwd)
+    out, errors = process.communicate()
+    assert process.returncode == code, errors
+    assert "Traceback" not in errors
+    return out, errors
+
+
+def units(out: Path) -> int:
+    return len(list((out / "units").glob("[!.]*.json"))) if out.exists() else 0
+
+
+def wait_for_units(out: Path, count: int) -> None:
+    deadline = time.monotonic() + 60
+    while units(out) < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file, tmp_path, jobs) -> None:
+    run_study(tiny_study.configure(root, backends=[]), tmp_path / "whole")
+    moments = random.Random(jobs)
+    for after in (0, moments.randrange(1, 6), moments.randrange(7, 12)):
+        process = started(file, "--out", "out", "--jobs", jobs, "--quiet", cwd=tmp_path)
+        wait_for_units(tmp_path / "out", after)
+        time.sleep(moments.random() * 0.05)
+        process.kill()
+        process.communicate()
+    kept = units(tmp_path / "out")
+    counting = tiny_study.Counting()
+    run_study(tiny_study.configure(root, backends=[]), tmp_path / "out", observers=[counting])
+    assert counting.kept == kept > 0
+    assert tiny_study.summary(tmp_path / "out") == tiny_study.summary(tmp_path / "whole")
+    assert not list((tmp_path / "out").rglob(".*"))  # not even what was half-written when it was killed
+
+
+def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
+    arguments = (file, "--set", "backends=[numba]", "--set", "backbones=[a]", "--only", "backends")
+    out, errors = study(*arguments, cwd=tmp_path)
+    for name in ("report.html", "manifest.json", "study.yaml", "tables/scenes.csv", "figures/persistence.png"):
+        assert (tmp_path / "studies/tiny" / name).exists()
+    assert max(len(line) for line in (out + errors).splitlines()) <= 80
+    assert "agree" in out
+    assert "seen once" in out
+    assert "study folder: studies/tiny" in out
+    runs = json.loads((tmp_path / "studies/tiny/summary.json").read_text())["runs"]
+    assert {run["variation"]["sweep"] for run in runs} == {"base", "backends"}
+
+
+def test_ctrl_c_keeps_what_is_finished(file, tmp_path) -> None:
+    process = started(file, "--out", "out", "--jobs", "2", "--quiet", cwd=tmp_path)
+    wait_for_units(tmp_path / "out", 1)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert errors.startswith("interrupted; what was finished is kept")
+    assert len(errors.splitlines()) == 1
+    assert units(tmp_path / "out") >= 1
+
+
+def test_failing_units_are_one_line_each_and_the_others_are_reported(root, file, tmp_path) -> None:
+    (root / "labels/b/0002.png").write_bytes(b"no image")
+    (root / "depth/0003.png").write_bytes(b"no image")
+    arguments = (file, "--out", "out", "--set", "backbones=[a, b]", "--only", "frame_count", "--only", "voxel_size")
+    out, errors = study(*arguments, cwd=tmp_path, code=2)
+    wall = tmp_path / "wall"
+    of_b, of_a = errors.splitlines()
+    assert of_b.startswith(f"error: wall, b: base numpy and 2 more: {wall}/labels/b/0002.png: not a PNG image")
+    assert of_a.startswith(f"error: wall, a: frame_count 10: {wall}/depth/0003.png: not a PNG image")
+    assert "seen once" in out
+    assert (tmp_path / "out" / "report.html").exists()
+    assert len(json.loads((tmp_path / "out" / "summary.json").read_text())["failures"]) == 4
+
+
+def test_nothing_but_failures_is_still_a_summary(root, file, tmp_path) -> None:
+    for name in "abc":
+        (root / f"labels/{name}/0002.png").write_bytes(b"no image")
+    out, errors = study(file, "--out", "out", "--only", "base", cwd=tmp_path, code=2)
+    assert len(errors.splitlines()) == 3
+    assert out == "study folder: out\n"
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["runs"] == []
+
+
+def test_backends_that_disagree_end_with_their_own_code(file, tmp_path) -> None:
+    settings = ("backends=[numba]", "backbones=[a]", "tolerance=0", "voxel_size=0.7")
+    arguments = [word for setting in settings for word in ("--set", setting)]
+    _, errors = study(file, *arguments, "--only", "backends", "--quiet", cwd=tmp_path, code=3)
+    assert errors == "error: the backends disagree; the agreement in studies/tiny/summary.json says where\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["citi"], "study 'citi' is not known; did you mean 'city'?, or name a .yaml file"),
+        (["nowhere.yaml"], "nowhere.yaml: cannot be read"),
+        (["tiny.yaml", "--only", "voxelsize"], "study tiny: no part 'voxelsize'; did you mean 'voxel_size'?"),
+        (["tiny.yaml", "--set", "sweeps.voxels=[1]"], "unknown setting 'sweeps.voxels'; did you mean 'voxel_size'?"),
+        (
+            ["tiny.yaml", "--jobs", "2", "--scheduler", "tcp://x:1"],
+            "--jobs and --scheduler: the scheduler's workers do",
+        ),
+        (["tiny.yaml", "--out", "wall"], "is not empty and holds no study; choose another folder"),
+    ],
+)
+def test_bad_input_is_one_line(file, tmp_path, arguments, message) -> None:
+    _, errors = study(*arguments, cwd=tmp_path, code=2)
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith("error: ")
+    assert message in errors
+
+
+def test_list_names_the_studies_that_ship(tmp_path) -> None:
+    result = subprocess.run(
+        [COMMAND, "list"],
+        cwd=tmp_path,
+        env=ENVIRONMENT | {"COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    rows = [line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["study"]]
+    assert [row[2] for row in rows] == ["city", "uavid3d"]

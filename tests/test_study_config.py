@@ -1,0 +1,127 @@
+"""Study files: short forms, the layers below them, unknown settings, the studies that ship, parts of a study."""
+
+from __future__ import annotations
+
+import pytest
+import tiny_study
+import yaml
+
+from semstab.config import Config
+from semstab.errors import ConfigError
+from semstab.study import StudyConfig, load_study, shipped_studies
+from semstab.study.config import BASE_SETTINGS
+from semstab.study.grid import NOT_IN_KEYS, make_grid
+
+
+def write(tmp_path, **content):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_short_forms_mean_the_long_ones(tmp_path) -> None:
+    short = load_study(write(tmp_path, sweeps={"voxel_size": [0.1]}, backend="numpy", backends=["open3d"]))
+    long = {
+        "sweeps": {"voxel_size": {"values": [0.1]}},
+        "backend": {"name": "numpy"},
+        "backends": {"values": [{"name": "open3d"}]},
+    }
+    assert short == load_study(write(tmp_path, **long))
+    assert [name for name, _ in short.sweeps.given()] == ["voxel_size"]
+
+
+def test_the_name_is_the_file_s_and_the_dataset_s_defaults_lie_below(tmp_path) -> None:
+    study = load_study(write(tmp_path, voxel_size=0.5))
+    assert (study.name, study.dataset.name, study.taxonomy) == ("mine", "city", "uavid7")
+    assert study.scenes == ["scene0", "scene3"]  # of configs/datasets/city.yaml
+    assert load_study(write(tmp_path, taxonomy=None, scenes=None)).scenes is None
+    assert load_study(write(tmp_path), {"dataset": {"name": "posed_folder"}}).taxonomy is None
+    assert load_study(write(tmp_path), {"voxel_size": 0.3, "sweeps": {"pixel_stride": [2]}}).voxel_size == 0.3
+
+
+def test_a_resolved_study_is_read_back(tmp_path) -> None:
+    study = load_study("city").resolved()
+    (tmp_path / "study.yaml").write_text(study.to_yaml())
+    assert load_study(tmp_path / "study.yaml") == study
+    assert study.dataset.options["seed"] == 0  # defaults are filled in
+
+
+def test_base_settings_are_a_run_s(tmp_path) -> None:
+    study = load_study(
+        write(tmp_path, strata=[1, 3], seed=4, perturbation={"depth_noise": 0.01}, scene_frames={"scene0": {"stop": 3}})
+    )
+    base = study.base("scene0")
+    assert (base.strata, base.scenes, base.check) == ([1, 3], ["scene0"], None)
+    assert (base.frames.stop, study.base("scene3").frames.stop) == (3, None)
+    assert base.perturbation is not None
+    assert base.perturbation.seed == 4
+
+
+def test_every_setting_of_a_run_is_a_study_s_or_has_a_reason_not_to_be() -> None:
+    """A new one must be thought of: as part of the key, or not."""
+    only_of_runs = {"backends", "check", "events", "check_geometry", "threads", "memory_gb"}
+    assert set(Config.model_fields) - only_of_runs == set(BASE_SETTINGS)
+    assert set(NOT_IN_KEYS) <= set(Config.model_fields)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"voxelsize": 1}, "unknown setting 'voxelsize'; did you mean 'voxel_size'"),
+        ({"sweeps": {"voxel": [1]}}, r"unknown setting 'sweeps\.voxel'; did you mean 'voxel_size'"),
+        ({"sweeps": {"depth_noise": {"values": [1], "repeat": 2}}}, "depth_noise.repeat'; did you mean 'repeats'"),
+        ({"sweeps": {"voxel_size": [0]}}, r"sweeps\.voxel_size\.values\.0: input should be greater than 0"),
+        ({"sweeps": {"voxel_size": []}}, r"sweeps\.voxel_size\.values: list should have at least 1 item"),
+        ({"sweeps": {"depth_noise": [-0.1]}}, r"sweeps\.depth_noise\.values\.0: input should be greater than or equal"),
+        ({"sweeps": {"frame_count": [2.5]}}, r"sweeps\.frame_count\.values\.0: input should be a valid integer"),
+        ({"sweeps": {"pixel_stride": {"values": [2], "repeats": 3}}}, "unknown setting 'sweeps.pixel_stride.repeats'"),
+        ({"sweeps": {"voxel_size": [1, 0.5, 1.0]}}, "name each value once"),
+        ({"backends": ["numpy", "numpy"]}, r"backends\.values: name each value once"),
+        ({"backend": "numpy", "backends": ["numpy"]}, "backends: 'numpy' is named twice; the base backend is 'numpy'"),
+        ({"perturbation": {"seed": 3}}, "perturbation: leave its seed out; the study's own 'seed' counts"),
+        ({"region_maps": ["x"], "backbones": ["x"]}, "region_maps: 'x' is named among the backbones too"),
+        ({"strata": [2, 1]}, "strata: edges must be ascending"),
+        ({"frames": {"spacing": "even"}}, "spacing: even needs count"),
+    ],
+)  # fmt: skip
+def test_bad_settings_are_one_line_that_names_the_setting(tmp_path, content, message) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_study(write(tmp_path, **content))
+    assert str(caught.value).startswith(str(tmp_path / "mine.yaml"))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_shipped_studies_fit_together() -> None:
+    assert shipped_studies() == ("city", "uavid3d")
+    assert all(load_study(name).description for name in shipped_studies())
+    grid = make_grid(load_study("city").resolved())
+    assert {cell.variation.sweep for cell in grid.cells} == {
+        "base", "shared_taxonomy", "backends", "voxel_size", "depth_noise", "translation_noise", "rotation_noise",
+        "translation_drift", "rotation_drift", "frame_count", "pixel_stride",
+    }  # fmt: skip
+    assert len(grid.units()) < 300  # they take minutes
+    paper = load_study("uavid3d")
+    assert paper.base("scene1").frames.indices(200) == [*range(0, 80, 4)]
+    assert len(paper.base("scene5").frames.indices(200)) == 20
+    assert (paper.taxonomy, paper.shared_taxonomy, paper.voxel_size) == ("uavid7", "uavid3", 0.2)
+
+
+def test_a_part_of_a_study(tmp_path) -> None:
+    study = load_study("city")
+    part = study.only(["depth_noise"])
+    assert [name for name, _ in part.sweeps.given()] == ["depth_noise"]
+    assert (part.shared_taxonomy, part.backends.values) == (None, [])
+    assert study.only(["backends", "shared_taxonomy"]).backends == study.backends
+    assert study.only(["base"]).sweeps == StudyConfig().sweeps
+
+
+def test_perturbed_base_units_are_varied_on_top(tmp_path) -> None:
+    root = tiny_study.write(tmp_path / "wall", backbones=("a",))
+    study = tiny_study.configure(
+        root, seed=2, perturbation={"translation_noise": 0.01}, sweeps={"depth_noise": [0, 0.1]}, backends=[]
+    )
+    noises = [cell.config.perturbation for cell in make_grid(study).cells]
+    assert [(noise.translation_noise, noise.depth_noise, noise.seed) for noise in noises] == [
+        (0.01, 0, 2), (0.01, 0, 2), (0.01, 0.1, 2)
+    ]  # fmt: skip
+    assert len(make_grid(study).units()) == 2

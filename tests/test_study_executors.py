@@ -1,0 +1,217 @@
+"""A study in local processes and on a Dask cluster: the same numbers as in this process, also where workers die."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import tiny_study
+from tiny_study import Counting, Interrupting, summary
+
+from semstab.errors import ConfigError, MissingDependencyError
+from semstab.study import DaskCluster, LocalProcesses, run_study
+from semstab.study.grid import make_grid
+from semstab.study.jobs import Job
+
+BACKBONES = ("a", "b", "c", "d")
+
+
+def configure(root):
+    """Eight units in four jobs."""
+    return tiny_study.configure(root, sweeps={"voxel_size": [0.5]}, backends=[])
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_study.write(tmp_path / "wall", backbones=BACKBONES)
+
+
+@pytest.fixture
+def expected(root, tmp_path):
+    """What the study finds in this process."""
+    run_study(configure(root), tmp_path / "expected")
+    return summary(tmp_path / "expected")
+
+
+def children() -> set[int]:
+    found = subprocess.run(
+        ["ps", "-o", "pid=,args=", "--ppid", str(os.getpid())], capture_output=True, text=True, check=False
+    )
+    return {int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line}
+
+
+def gone(process: int) -> bool:
+    with contextlib.suppress(OSError):
+        os.kill(process, 0)
+        with open(f"/proc/{process}/stat") as stat:  # noqa: PTH123 - gone at any moment
+            return stat.read().rpartition(")")[2].split()[0] == "Z"
+    return True
+
+
+def wait_until(condition, seconds: float = 30) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+class Killing(Counting):
+    """Kills one of the workers when the first unit is finished."""
+
+    def __init__(self, worker) -> None:
+        super().__init__()
+        self.worker = worker
+
+    def unit_finished(self, cell, error) -> None:
+        super().unit_finished(cell, error)
+        if self.worker is not None:
+            process, self.worker = self.worker(), None
+            os.kill(process, signal.SIGKILL)
+
+
+def test_local_processes_give_the_same_numbers(root, tmp_path, expected) -> None:
+    counting = Counting()
+    result = run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[counting])
+    assert summary(tmp_path / "out") == expected
+    assert result.manifest["study"]["executor"] == "2 local processes"
+    assert len(counting.computed) == counting.units
+    assert children() == set()
+    again = Counting()
+    run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[again])
+    assert again.computed == []
+
+
+def test_a_local_process_that_is_killed_costs_no_unit(root, tmp_path, expected) -> None:
+    killing = Killing(lambda: min(children()))
+    result = run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[killing])
+    assert result.failures == ()
+    assert summary(tmp_path / "out") == expected
+
+
+class Deadly:
+    """A unit whose process dies of it."""
+
+    identity = "deadly"
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
+    config = tiny_study.configure(root, sweeps={}, backends=[]).resolved()
+    fine = [Job("wall", cell.unit.backbone, (cell.request(),), "start", tmp_path) for cell in make_grid(config).cells]
+    jobs = [fine[0], Job("wall", "x", (Deadly(),), "start", tmp_path), *fine[1:]]
+    found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs)}
+    assert sorted(found) == ["a", "b", "c", "d", "x"]
+    assert found["x"].error.startswith("its process was killed, perhaps for want of memory")
+    assert [found[name].error for name in BACKBONES] == [None] * 4
+
+
+def test_an_interruption_ends_the_processes_and_keeps_what_is_finished(root, tmp_path, expected) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[Interrupting(1)])
+    wait_until(lambda: all(gone(process) for process in children()))
+    counting = Counting()
+    run_study(configure(root), tmp_path / "out", observers=[counting])
+    assert counting.kept >= 1
+    assert summary(tmp_path / "out") == expected
+
+
+def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> None:
+    code = (
+        "import multiprocessing, time\n"
+        "from semstab.study.executors import _start_worker\n"
+        "if __name__ == '__main__':\n"
+        "    context = multiprocessing.get_context('spawn')\n"
+        "    listening, alive = context.Pipe(duplex=False)\n"
+        "    import worker\n"
+        "    process = context.Process(target=worker.work, args=(listening,))\n"
+        "    process.start()\n"
+        "    print(process.pid, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    (tmp_path / "parent.py").write_text(code)
+    (tmp_path / "worker.py").write_text(
+        "import time\nfrom semstab.study.executors import _start_worker\n"
+        "def work(listening):\n    _start_worker(listening, 1)\n    time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    with parent:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    wait_until(lambda: gone(worker))
+
+
+def test_a_script_without_a_main_guard_is_told_so(root, tmp_path) -> None:
+    (tmp_path / "script.py").write_text(
+        "from semstab.study import *\n"
+        f"config = StudyConfig.build({tiny_study.content(root)!r})\n"
+        "run_study(config, 'out', executor=LocalProcesses(2))\n"
+    )
+    result = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "call run_study under if __name__ == '__main__'" in result.stderr
+
+
+def test_local_processes_are_at_least_one() -> None:
+    with pytest.raises(ConfigError, match="0 jobs: use 1 or more"):
+        LocalProcesses(0)
+
+
+@contextlib.contextmanager
+def dask(*command: str):
+    """A process of a cluster; it ends with the block."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"distributed.cli.dask_{command[0]}", "--host", "127.0.0.1", *command[1:]],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """The address of a scheduler with two workers, and the workers' processes."""
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    file = tmp_path / "scheduler.json"
+    arguments = ("--scheduler-file", str(file), "--no-dashboard")
+    with dask("scheduler", "--port", "0", *arguments):
+        wait_until(file.exists)
+        quiet = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path), *arguments)
+        with dask(*quiet) as first, dask(*quiet) as second:
+            yield json.loads(file.read_text())["address"], (first, second)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(root, tmp_path, expected, cluster) -> None:
+    address, workers = cluster
+    executor = DaskCluster(address)
+    wait_until(lambda: len(executor._client.nthreads()) == 2)
+    killing = Killing(lambda: workers[0].pid)
+    result = run_study(configure(root), tmp_path / "out", executor=executor, observers=[killing])
+    assert workers[0].wait(10) == -signal.SIGKILL
+    assert result.failures == ()
+    assert summary(tmp_path / "out") == expected
+    assert result.manifest["study"]["executor"].startswith("Dask")
+
+
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    monkeypatch.setattr("semstab.study.executors.CONNECT_SECONDS", 0.5)
+    with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
+        DaskCluster("tcp://127.0.0.1:9")
+
+
+def test_a_cluster_without_dask_says_what_to_install(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'semstab\[cluster\]'"):
+        DaskCluster("tcp://127.0.0.1:9")

@@ -1,0 +1,376 @@
+"""The study's tables: what stands in them, and how each format says it."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import math
+import re
+import shutil
+import statistics
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from records import record, study, voxels
+from wall_study import BACKBONES, STEPS, wall_study
+
+from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.metrics import entropy, op, sbd, vss
+from semstab.study.results import BACKENDS, SHARED, ImageSpace, RegionFlicker, StudyResult
+from semstab.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
+from semstab.testing import checks
+
+GOLDEN = Path(__file__).parent / "golden"
+SURE, SPLIT = [1, 0, 0], [3, 1, 0]
+WRITERS = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory) -> StudyResult:
+    return wall_study(tmp_path_factory.getbasetemp())[0]
+
+
+def table_of(result: StudyResult, name: str) -> Table:
+    (found,) = (table for table in tables(result) if table.name == name)
+    return found
+
+
+def rows_of(result: StudyResult, name: str) -> list[dict]:
+    return to_json(table_of(result, name))["rows"]
+
+
+# --- The golden files -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_the_walls_tables_are_as_in_the_golden_file(walls, suffix):
+    written = "\n".join(WRITERS[suffix](table) for table in tables(walls))
+    assert written == (GOLDEN / f"tables.{suffix}").read_text(encoding="utf-8")
+
+
+# --- What stands in them ----------------------------------------------------------------------------------------------
+
+
+def test_a_study_of_everything_has_every_table(walls):
+    assert [table.name for table in tables(walls)] == [
+        "glance",
+        "flicker",
+        "flicker_by_scene",
+        "scenes",
+        "persistence",
+        "classes",
+        "cross_backbone",
+        "sensitivity_voxel_size",
+        "sensitivity_depth_noise",
+        "sensitivity_frame_count",
+        "fusion",
+        "agreement",
+    ]
+
+
+def test_a_study_of_nothing_has_no_table():
+    assert tables(study()) == []
+
+
+def voxels_of(walls, backbone):
+    """All voxels of a backbone, straight from the maps: OP, VSS, SBD, entropy."""
+    maps = [row.table() for row in walls.select(backbone=backbone)]
+    return [np.concatenate([measure(table) for table in maps]) for measure in (op, vss, sbd, entropy)]
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_strata_pool_the_voxels_of_all_scenes(walls, backbone):
+    seen, *measures = voxels_of(walls, backbone)
+    inside = {
+        "OP=1": seen == 1,
+        "OP=2": seen == 2,
+        "3<=OP<=5": (seen >= 3) & (seen <= 5),
+        "OP>5": seen > 5,
+        "OP>=3": seen >= 3,
+    }
+    rows = [row for row in rows_of(walls, "persistence") if row["backbone"] == backbone]
+    assert [row["persistence"] for row in rows] == list(inside)
+    for row in rows:
+        where = inside[row["persistence"]]
+        assert row["voxels"] == where.sum()
+        assert row["share_percent"] == pytest.approx(100 * where.mean())
+        means = [value[where][~np.isnan(value[where])] for value in measures]
+        expected = [mean.mean() if mean.size else math.nan for mean in means]
+        assert [row["vss"], row["sbd"], row["entropy"]] == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_scenes_have_their_own_means_and_a_macro_mean(walls, backbone):
+    rows = [row for row in rows_of(walls, "scenes") if row["backbone"] == backbone]
+    assert [row["scene"] for row in rows] == [*STEPS, "Total / Mean"]
+    for row, unit in zip(rows, walls.select(backbone=backbone), strict=False):
+        table = unit.table()
+        assert row["vss"] == pytest.approx(vss(table).mean())
+        assert row["sbd"] == pytest.approx(np.nanmean(sbd(table)))
+        assert row["mean_op"] == pytest.approx(table.op.mean())
+        assert row["points"] == table.pixels.sum()
+    *scenes, total = rows
+    for key in ("voxels", "points"):
+        assert total[key] == sum(row[key] for row in scenes)
+    for key in ("mean_op", "vss", "sbd", "entropy"):
+        assert total[key] == pytest.approx(statistics.mean(row[key] for row in scenes))
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_comparison_has_macro_and_pooled_means(walls, backbone):
+    macro, every, recurrent = (row for row in rows_of(walls, "cross_backbone") if row["backbone"] == backbone)
+    seen, stability, drift, _ = voxels_of(walls, backbone)
+    assert every["vss"] == pytest.approx(stability.mean())
+    assert every["sbd"] == pytest.approx(np.nanmean(drift))
+    assert recurrent["vss"] == pytest.approx(stability[seen >= 3].mean())
+    assert recurrent["share_percent"] == pytest.approx(100 * (seen >= 3).mean())
+    assert macro["vss"] == pytest.approx(
+        statistics.mean(vss(r.table()).mean() for r in walls.select(backbone=backbone))
+    )
+    assert macro["vss"] != pytest.approx(every["vss"])
+
+
+def test_a_comparison_needs_one_taxonomy_and_two_backbones():
+    a, b = (record(voxels((5, 2, SURE)), backbone=name) for name in "ab")
+    assert "cross_backbone" in [table.name for table in tables(study(a, b))]
+    assert "cross_backbone" not in [table.name for table in tables(study(a))]
+    other = dataclasses.replace(b, summary=dataclasses.replace(b.summary, taxonomy="other"))
+    assert "cross_backbone" not in [table.name for table in tables(study(a, other))]
+    shared = [record(voxels((7, 2, SURE)), SHARED, backbone=name) for name in "ab"]
+    rows = rows_of(study(a, other, *shared), "cross_backbone")
+    assert {row["voxels"] for row in rows[::3]} == {7}
+
+
+def test_rare_classes_are_marked():
+    found = study(record(voxels((ENOUGH, 2, [2, 0, 0]), (ENOUGH - 1, 2, [0, 2, 0]))))
+    assert [row["note"] for row in rows_of(found, "classes")] == ["", "rare", "absent"]
+
+
+def test_flicker_is_the_macro_mean_of_the_scenes():
+    images = (ImageSpace(20.0, 8.0, 0.5, 0.9), ImageSpace(30.0, math.nan, 0.7, 0.8))
+    found = study(*(record(voxels((1, 1, SURE)), scene=f"s{k}", image_space=image) for k, image in enumerate(images)))
+    (row,) = rows_of(found, "flicker")
+    assert row["flicker_percent"] == 25
+    assert row["compensated_flicker_percent"] == 8
+    assert row["compensated_share_percent"] == pytest.approx(60)
+    assert row["vc8"] == pytest.approx(0.85)
+    assert math.isnan(row["vc16"])
+    assert [row["scene"] for row in rows_of(found, "flicker_by_scene")] == ["s0", "s1"]
+
+
+def test_regions_without_classes_stand_in_the_flicker_tables_only():
+    found = study(
+        record(voxels((1, 1, SURE)), image_space=ImageSpace(20.0, 8.0, 0.5)),
+        regions=(RegionFlicker("s", "raw SAM", 21.64, 10.0, 0.5), RegionFlicker("t", "raw SAM", 23.0, math.nan, 0.7)),
+    )
+    row = rows_of(found, "flicker")[1]
+    assert (row["method"], row["flicker_percent"], row["compensated_flicker_percent"]) == ("raw SAM", 22.32, 10.0)
+    assert math.isnan(row["vc8"])
+    assert "raw SAM" in table_of(found, "flicker").caption
+    assert [row["scene"] for row in rows_of(found, "flicker_by_scene")] == ["s", "s", "t"]
+    assert "raw SAM" not in {row["backbone"] for row in rows_of(found, "scenes")}
+
+
+def test_one_scene_has_no_total_and_no_second_flicker_table():
+    found = study(record(voxels((1, 1, SURE))))
+    assert [row["scene"] for row in rows_of(found, "scenes")] == ["s"]
+    assert "flicker_by_scene" not in [table.name for table in tables(found)]
+
+
+# --- Sweeps -----------------------------------------------------------------------------------------------------------
+
+
+def noisy(once, repeat, value=0.01, scene="s"):
+    return record(voxels((once, 1, SURE), (ENOUGH, 3, SPLIT)), "depth_noise", value, repeat, scene)
+
+
+def test_a_sweep_has_mean_and_spread_over_its_repeats():
+    counts = (ENOUGH, 2 * ENOUGH, 4 * ENOUGH)
+    base = record(voxels((1, 1, SURE)))
+    calm, disturbed = rows_of(study(base, noisy(0, 0, 0.0), *map(noisy, counts, range(3))), "sensitivity_depth_noise")
+    shares = [100 * ENOUGH / (ENOUGH + once) for once in counts]
+    assert disturbed["recurrent_percent"] == {
+        "mean": pytest.approx(statistics.mean(shares)),
+        "sd": pytest.approx(statistics.stdev(shares)),
+        "repeats": 3,
+    }
+    assert (calm["value"], calm["recurrent_percent"], calm["vss"]) == ("0", 100, 0.75)
+    assert disturbed["recurrent_vss"]["sd"] == 0
+
+
+def test_levels_pool_the_scenes_that_have_all_of_them():
+    base = [record(voxels((1, 1, SURE)), scene=scene) for scene in "xy"]
+    whole = [noisy(5, 0, value, "x") for value in (0.0, 0.01)]
+    found = study(*base, *whole, noisy(7, 0, 0.0, "y"))
+    assert complete_scenes(found, "depth_noise", "m") == ("x",)
+    assert [level.repeats[0].voxels for level in levels(found, "depth_noise", "m")] == [ENOUGH + 5] * 2
+    assert "together (x);" in table_of(found, "sensitivity_depth_noise").caption
+
+
+def test_few_recurrent_voxels_are_noted():
+    found = study(
+        record(voxels((1, 1, SURE))),
+        record(voxels((ENOUGH, 3, SURE)), "frame_count", 40),
+        record(voxels((ENOUGH - 1, 3, SURE)), "frame_count", 20),
+    )
+    assert [(row["value"], row["note"]) for row in rows_of(found, "sensitivity_frame_count")] == [
+        ("20", "few"),
+        ("40", ""),
+    ]
+
+
+def test_sweeps_stand_in_a_fixed_order_and_new_ones_go_by_their_name():
+    base = record(voxels((1, 1, SURE)))
+    named = [record(voxels((1, 1, SURE)), name, 1.0) for name in ("new_thing", "frame_count", "voxel_size")]
+    assert [sweep.name for sweep in swept(study(base, *named))] == ["voxel_size", "frame_count", "new_thing"]
+    assert describe("new_thing").header == "New thing"
+
+
+def test_pooling_counts_a_scene_by_its_voxels():
+    small, large = record(voxels((1, 2, SPLIT, 0.2)), scene="x"), record(voxels((9, 1, SURE)), scene="y")
+    together = pooled([small, large])
+    assert (together.voxels, together.observations, together.mean_op) == (10, 11, 1.1)
+    assert (together.every.vss, together.every.sbd, together.once) == pytest.approx((0.975, 0.2, 0.9))
+
+
+# --- Fusion implementations -------------------------------------------------------------------------------------------
+
+
+def test_other_backends_stand_beside_the_base_one_on_the_scenes_that_all_fused():
+    base = [record(voxels((n, 2, SURE)), scene=scene) for scene, n in (("x", 10), ("y", 30))]
+    other = record(voxels((8, 2, SURE), (4, 3, SPLIT, 0.1)), BACKENDS, scene="x", backend="other")
+    first, second = rows_of(study(*base, other), "fusion")
+    assert (first["backend"], first["voxels"], first["delta_voxels"]) == ("numpy", 10, 0)
+    assert (second["backend"], second["voxels"], second["delta_voxels"]) == ("other", 12, 2)
+    assert second["delta_vss"] == pytest.approx((8 + 4 * 0.75) / 12 - 1)
+    assert second["delta_sbd"] == pytest.approx(0.4 / 12)
+    assert second["delta_mean_op"] == pytest.approx(28 / 12 - 2)
+
+
+def test_backends_without_a_scene_in_common_are_not_compared():
+    base = record(voxels((10, 2, SURE)), scene="x")
+    other = record(voxels((8, 2, SURE)), BACKENDS, scene="y", backend="other")
+    assert "fusion" not in [table.name for table in tables(study(base, other))]
+
+
+def test_the_agreement_says_who_agrees(walls):
+    rows = rows_of(walls, "agreement")
+    assert {row["verdict"] for row in rows} == {"agree"}
+    assert [(row["scene"], row["backbone"]) for row in rows] == [("often", backbone) for backbone in BACKBONES]
+    assert all(0 <= row["max_sbd"] < 1e-9 for row in rows)
+    odd = dataclasses.replace(walls, agreement=(dataclasses.replace(walls.agreement[0], agrees=False),))
+    assert [row["verdict"] for row in rows_of(odd, "agreement")] == ["disagree"]
+
+
+# --- Formats ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "text"),
+    [
+        (Column("", "", 0), 705902, "705,902"),
+        (Column("", "", 3), 0.95749, "0.957"),
+        (Column("", "", 4), math.nan, "--"),
+        (Column("", "", 3), -0.0001, "0.000"),
+        (Column("", "", 3, signed=True), 0.0021, "+0.002"),
+        (Column("", "", 3, signed=True), -0.0021, "-0.002"),
+        (Column("", "", 3, signed=True), 0.0001, "0.000"),
+        (Column("", "", 0, scientific=True), 2.2e-16, "2e-16"),
+        (Column("", "", 0, scientific=True), 0.0, "0"),
+        (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
+        (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"),
+        (Column("", ""), "road", "road"),
+    ],
+)
+def test_a_cell_in_print(column, cell, text):
+    assert column.text(cell) == text
+
+
+def test_the_rows_of_the_papers_scene_table_are_printed_as_there():
+    columns = table_of(study(record(voxels((1, 1, SURE)))), "scenes").columns
+    row = ("Total / Mean", 705902, 1353903, 1.5134, 0.95668, 0.084538, 0.033598)
+    text = [column.text(cell) for column, cell in zip(columns, row, strict=True)]
+    assert text == ["Total / Mean", "705,902", "1,353,903", "1.51", "0.957", "0.0845", "0.0336"]
+
+
+def test_csv_holds_the_numbers_of_the_json_rounded(walls):
+    for table in tables(walls):
+        rows = list(csv.DictReader(io.StringIO(to_csv(table))))
+        exact = to_json(table)["rows"]
+        assert len(rows) == len(exact)
+        for row, full in zip(rows, exact, strict=True):
+            for column in table.columns:
+                value = full[column.key]
+                value = value["mean"] if isinstance(value, dict) else value
+                if isinstance(value, str):
+                    assert row[column.key] == value
+                elif math.isnan(value):
+                    assert row[column.key] == ""
+                elif not column.scientific:
+                    assert abs(float(row[column.key]) - value) <= 0.5 * 10.0**-column.digits + 1e-12
+
+
+def test_csv_gives_the_spread_a_column_of_its_own(walls):
+    rows = list(csv.DictReader(io.StringIO(to_csv(table_of(walls, "sensitivity_depth_noise")))))
+    undisturbed, disturbed = rows[0], rows[1]
+    assert undisturbed["vss_sd"] == ""
+    assert float(disturbed["vss_sd"]) >= 0
+    assert "voxels_sd" not in disturbed
+
+
+NASTY = r"a|b_c & 50% #1 {x} $y$ ~^ \z <b>*i* [l](u) `c` é ≥ ±"
+
+
+def nasty_table() -> Table:
+    columns = (Column("name", NASTY), Column("value", "VSS", 3, "higher", over="OP>=3"))
+    return Table("nasty", NASTY, NASTY, columns, (Group(NASTY, ((NASTY, 0.5),)), Group("b", (("c", math.nan),))))
+
+
+def test_markdown_has_as_many_cells_in_every_row():
+    lines = [line for line in to_markdown(nasty_table()).splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {3}
+    assert not re.search(r"<b>|(?<!\\)\*i|(?<!\\)\[l", "\n".join(lines[2:]))
+
+
+@checks
+@given(st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs"))))
+def test_latex_keeps_its_structure_whatever_the_names(name):
+    plain = Table(
+        "t", "x", "x", (Column("a", "x"), Column("b", "B", 0)), (Group("x", (("x", 1),)), Group("y", (("y", 2),)))
+    )
+    named = Table(
+        "t", name, name, (Column("a", name), Column("b", "B", 0)), (Group(name, ((name, 1),)), Group("y", (("y", 2),)))
+    )
+    counts = [[len(re.findall(rf"(?<!\\){c}", to_latex(t))) for c in ("&", "%", "#")] for t in (plain, named)]
+    assert counts[0] == counts[1]
+    unescaped = re.sub(r"\\[{}$]", "", to_latex(named))
+    assert unescaped.count("{") == unescaped.count("}")
+    assert unescaped.count("$") % 2 == 0
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no pdflatex")
+def test_latex_compiles_without_overfull_lines(walls, tmp_path):
+    floats = "\n".join(to_latex(table) for table in [*tables(walls), nasty_table()])
+    page = r"\documentclass[10pt,twocolumn]{article}\usepackage[a4paper,margin=0.7in]{geometry}\usepackage[T1]{fontenc}"
+    packages = r"\usepackage{lmodern,booktabs,graphicx}"
+    (tmp_path / "t.tex").write_text(f"{page}{packages}\n\\begin{{document}}\n{floats}\n\\end{{document}}\n")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    wide = re.findall(r"Overfull \\hbox \((\d+)", done.stdout)
+    assert not [points for points in wide if int(points) > 5]
+
+
+def test_tables_are_written_in_four_formats(walls, tmp_path):
+    paths = write_tables(walls, tmp_path)
+    assert sorted(paths) == sorted((tmp_path / "tables").iterdir())
+    assert {path.suffix for path in paths} == {".csv", ".md", ".tex", ".json"}
+    content = json.loads((tmp_path / "tables" / "persistence.json").read_text())
+    assert content["rows"][0]["persistence"] == "OP=1"
+    assert content["rows"][0]["sbd"] is None

@@ -1,0 +1,80 @@
+"""A study small enough for a test: two backbones on a wall, several sweeps, and its numbers without times."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import tiny_scene
+
+from semstab.study import StudyConfig, StudyObserver
+
+FRAMES = 10
+TIMES = ("fuse_ms_per_frame", "stages_ms")
+
+SWEEPS = {
+    "voxel_size": [0.25, 0.5],
+    "depth_noise": {"values": [0, 0.05], "repeats": 2},
+    "frame_count": {"values": [5, 10], "backbones": ["a"]},
+    "pixel_stride": [1, 2],
+}
+
+
+def write(root: Path, **scene: Any) -> Path:
+    """The wall, seen by ten frames."""
+    return tiny_scene.write(root, **{"frames": FRAMES, **scene})
+
+
+def content(root: Path, **settings: Any) -> dict[str, Any]:
+    """Settings of a study of the scene, or the scenes, in a folder."""
+    return {
+        "name": "tiny",
+        "dataset": {"name": "posed_folder", "options": {"root": str(root)}},
+        "backend": "numpy",
+        "voxel_size": 0.25,
+        "frames": {"spacing": "even", "count": 5},
+        "sweeps": SWEEPS,
+        "backends": ["numba"],
+        **settings,
+    }
+
+
+def configure(root: Path, **settings: Any) -> StudyConfig:
+    return StudyConfig.build(content(root, **settings))
+
+
+def summary(out: Path) -> dict[str, Any]:
+    """The study's summary.json without timings: what must come out the same."""
+    found = json.loads((out / "summary.json").read_text())
+    runs = [{key: value for key, value in run.items() if key not in TIMES} for run in found["runs"]]
+    return {**found, "runs": runs}
+
+
+class Counting(StudyObserver):
+    """What was wanted, kept and computed."""
+
+    def __init__(self) -> None:
+        self.units = self.kept = 0
+        self.computed: list[str] = []
+        self.failed: list[str] = []
+
+    def study_started(self, units, kept) -> None:
+        self.units, self.kept = units, kept
+
+    def unit_finished(self, cell, error) -> None:
+        what = f"{cell.unit.slug} {cell.variation.sweep} {cell.variation.value}"
+        (self.computed if error is None else self.failed).append(what)
+
+
+class Interrupting(Counting):
+    """Ctrl-C after so many units."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        self.after = after
+
+    def unit_finished(self, cell, error) -> None:
+        super().unit_finished(cell, error)
+        if len(self.computed) == self.after:
+            raise KeyboardInterrupt

@@ -1,0 +1,84 @@
+"""A study small enough for tests, run for real: two label sources on a wall seen often and on one seen rarely."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from semstab.plots import write_figures
+from semstab.study import StudyConfig, run_study
+from semstab.study.results import StudyResult
+
+WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
+STEPS = {"often": 0.25, "rarely": 1.0}
+"""How far the camera moves from frame to frame, metres, along a wall of which it sees 3 m."""
+BACKBONES = {"calm": 0.05, "nervous": 0.25}
+"""How much of the wall each of them gets wrong, anew in every frame."""
+CLASSES = ["wall", "door_1", "window & <sill>", "ghost"]
+
+
+def write_wall(folder: Path, step: float) -> None:
+    """A camera that looks along z at a wall 2.03 m away and moves to the right; blocks of 4 x 4 pixels err together."""
+    for part in ("depth", "pose", "color", "labels/gt", *(f"labels/{name}" for name in BACKBONES)):
+        (folder / part).mkdir(parents=True)
+    np.savetxt(folder / "intrinsics.txt", [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    (folder / "scene.yaml").write_text(f"classes: {CLASSES}\nup_axis: -y\n")
+    for i in range(FRAMES):
+        name = f"{i:04d}"
+        columns = (np.arange(WIDTH) + i * step * FOCAL / 2.03).astype(int)
+        truth = np.tile((columns // 24 % 3).astype(np.uint8), (HEIGHT, 1))
+        pose = np.eye(4)
+        pose[:3, 3] = [step * i + 0.003, 0.003, 0.0]
+        np.savetxt(folder / "pose" / f"{name}.txt", pose)
+        cv2.imwrite(str(folder / "depth" / f"{name}.png"), np.full((HEIGHT, WIDTH), 2030, np.uint16))
+        cv2.imwrite(str(folder / "color" / f"{name}.png"), np.repeat(truth[..., None] * 80, 3, axis=2))
+        cv2.imwrite(str(folder / "labels/gt" / f"{name}.png"), truth)
+        for k, (backbone, share) in enumerate(BACKBONES.items()):
+            wrong = np.random.default_rng([k, i]).random((HEIGHT // 4, WIDTH // 4)) < share
+            labels = np.where(np.kron(wrong, np.ones((4, 4), bool)), (truth + 1) % 3, truth)
+            cv2.imwrite(str(folder / f"labels/{backbone}" / f"{name}.png"), labels)
+
+
+@functools.cache
+def wall_study(base: Path) -> tuple[StudyResult, Path]:
+    """What the study found, and its folder, made once in `base`; times are set to 12.5 ms a frame."""
+    for scene, step in STEPS.items():
+        write_wall(base / "walls" / scene, step)
+    config = StudyConfig.build(
+        {
+            "name": "wall & <door>",
+            "dataset": {"name": "posed_folder", "options": {"root": str(base / "walls")}},
+            "voxel_size": 0.0625,
+            "backend": "numpy",
+            "sweeps": {
+                "voxel_size": [0.0625, 0.125],
+                "depth_noise": {"values": [0, 0.01], "repeats": 2},
+                "frame_count": {"values": [5, 9], "scenes": ["often"]},
+            },
+            "backends": {"values": ["numba"], "scenes": ["often"]},
+        }
+    )
+    folder = base / "wall study"
+    result = run_study(config, folder)
+    assert not result.failures
+    records = tuple(
+        dataclasses.replace(record, summary=dataclasses.replace(record.summary, fuse_ms_per_frame=12.5))
+        for record in result.records
+    )
+    return dataclasses.replace(result, records=records), folder
+
+
+@functools.cache
+def drawn_walls(base: Path) -> tuple[StudyResult, Path, list[Path]]:
+    """The part of one backbone, with a saved frame of one scene; a folder with its figures, and their paths."""
+    result, _ = wall_study(base)
+    calm = dataclasses.replace(result, records=tuple(r for r in result.records if r.unit.backbone == "calm"))
+    folder = base / "drawn walls"
+    (folder / "overview").mkdir(parents=True)
+    frame = {"frame": 3, "labels": np.zeros((6, 8), np.uint8), "palette": np.zeros((len(CLASSES), 3), np.uint8)}
+    np.savez(folder / "overview" / "often__calm.npz", **frame)
+    return calm, folder, write_figures(calm, folder)
