@@ -1,0 +1,84 @@
+"""Stability whatever the number of observations, its null models, its uncertainty, and right beside stable.
+
+Pure functions of a VoxelTable and its Events. `describe` says everything about one map, `compare_backbones` about
+several; docs/metrics.md derives each measure.
+"""
+
+from semstab.statistics.agreement import ClassAgreement, class_agreement, fleiss_kappa, krippendorff_alpha, psa
+from semstab.statistics.backbones import compare_backbones
+from semstab.statistics.blocks import BlockBootstrap, Blocks, Estimate, spatial_blocks
+from semstab.statistics.ceiling import Losses, ceiling, losses, rendered
+from semstab.statistics.comparison import coverage, paired, sign_flip_test, standardised
+from semstab.statistics.correctness import (
+    Correctness,
+    Quadrants,
+    Reliability,
+    Truth,
+    correctness,
+    join_truth,
+    quadrants,
+    reliability,
+    stable_wrong,
+)
+from semstab.statistics.description import Analysis, analyse, describe
+from semstab.statistics.drift import (
+    Flips,
+    SceneDrift,
+    VoxelDrift,
+    benjamini_hochberg,
+    expected_sbd,
+    flips,
+    scene_drift,
+    voxel_drift,
+)
+from semstab.statistics.fusion_rules import RULES, Fused, fuse
+from semstab.statistics.uncertainty import Uncertainty, decompose
+from semstab.statistics.verdict import Verdict, verdict
+
+__all__ = [
+    "RULES",
+    "Analysis",
+    "BlockBootstrap",
+    "Blocks",
+    "ClassAgreement",
+    "Correctness",
+    "Estimate",
+    "Flips",
+    "Fused",
+    "Losses",
+    "Quadrants",
+    "Reliability",
+    "SceneDrift",
+    "Truth",
+    "Uncertainty",
+    "Verdict",
+    "VoxelDrift",
+    "analyse",
+    "benjamini_hochberg",
+    "ceiling",
+    "class_agreement",
+    "compare_backbones",
+    "correctness",
+    "coverage",
+    "decompose",
+    "describe",
+    "expected_sbd",
+    "fleiss_kappa",
+    "flips",
+    "fuse",
+    "join_truth",
+    "krippendorff_alpha",
+    "losses",
+    "paired",
+    "psa",
+    "quadrants",
+    "reliability",
+    "rendered",
+    "scene_drift",
+    "sign_flip_test",
+    "spatial_blocks",
+    "stable_wrong",
+    "standardised",
+    "verdict",
+    "voxel_drift",
+]

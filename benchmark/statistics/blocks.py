@@ -1,0 +1,164 @@
+"""Spatial blocks of voxels, and confidence intervals from resampling them: voxels of one block are not independent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.statistics.matching import voxel_keys
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Statistic = Callable[[Float64], Float64]
+"""From sums over voxels (..., C) to a value (...,); smooth, and the same when all sums are doubled."""
+
+LEAST_BLOCKS = 32
+LEVEL = 0.95
+REPLICATES = 2000
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % confidence interval; NaN where undefined."""
+
+    value: float
+    low: float
+    high: float
+
+
+UNDEFINED = Estimate(math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Cubes of space and the voxels in them.
+
+    of     (n,) int64 block of each voxel, 0 to count - 1
+    count  occupied blocks
+    size   their edge, metres
+    """
+
+    of: Int64
+    count: int
+    size: float
+
+    def sums(self, columns: Float64) -> Float64:
+        """Sums (count, C) over the voxels of each block of columns (n, C)."""
+        by_column = [np.bincount(self.of, weights=column, minlength=self.count) for column in columns.T]
+        return np.stack(by_column, axis=1)
+
+
+def spatial_blocks(
+    index: npt.NDArray[np.integer], voxel_size: float, *, size: float | None = None, least: int = LEAST_BLOCKS
+) -> Blocks:
+    """Cut space into cubes aligned with the voxels (n, 3).
+
+    Their edge is `size` metres, rounded to whole voxels; where it is not given, the largest one, in steps of an eighth,
+    that leaves at least `least` occupied blocks: large, so that errors hardly reach from one block into the next, and
+    many, so that an interval from resampling them holds its level.
+    """
+    edge = _largest_edge(index, least) if size is None else max(1, round(size / voxel_size))
+    (key,) = voxel_keys(index // edge)
+    blocks, of = np.unique(key, return_inverse=True)
+    return Blocks(of.astype(np.int64), len(blocks), edge * voxel_size)
+
+
+def _largest_edge(index: npt.NDArray[np.integer], least: int) -> int:
+    """The edge, in voxels: first the power of 2, then what can be added to it."""
+    cells, unit, steps = _distinct(index), 1, 1  # blocks of `steps` cells, cells of `unit` voxels
+    while len(_distinct(cells // (2 * steps))) >= max(least, 2):
+        if steps < 8:
+            steps *= 2
+        else:
+            cells, unit = _distinct(cells // 2), 2 * unit
+    fitting = (more for more in range(2 * steps, steps, -1) if len(_distinct(cells // more)) >= least)
+    return unit * next(fitting, steps)
+
+
+def _distinct(index: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    (key,) = voxel_keys(index)
+    return index[np.unique(key, return_index=True)[1]]
+
+
+class BlockBootstrap:
+    """Resamples of the blocks with replacement, the same ones for every estimate (Künsch 1989; Lahiri 2003).
+
+    weights (R, B) is how often each block is in each resample.
+    """
+
+    def __init__(self, blocks: Blocks, *, replicates: int = REPLICATES, seed: int = 0) -> None:
+        self.blocks = blocks
+        rng = np.random.default_rng(seed)
+        drawn = rng.integers(max(blocks.count, 1), size=(replicates, blocks.count))
+        resample = np.arange(replicates)[:, None] * blocks.count
+        counts = np.bincount((drawn + resample).ravel(), minlength=replicates * blocks.count)
+        self.weights: Float64 = counts.reshape(replicates, blocks.count).astype(np.float64)
+
+    def estimate(
+        self, columns: Float64, statistic: Statistic, bounds: tuple[float, float] = (-math.inf, math.inf)
+    ) -> Estimate:
+        """The statistic of the voxels' columns (n, C) with its interval."""
+        return interval(self.blocks.sums(columns), statistic, self.weights, bounds)
+
+    def replicates(self, columns: Float64, statistic: Statistic) -> Float64:
+        """The statistic (R,) in each resample."""
+        return statistic(self.weights @ self.blocks.sums(columns))
+
+
+def interval(
+    sums: Float64, statistic: Statistic, weights: Float64, bounds: tuple[float, float] = (-math.inf, math.inf)
+) -> Estimate:
+    """The bootstrap-t interval of a statistic of block sums (B, C) (Efron and Tibshirani 1993, section 12.5).
+
+    The standard error of each resample is that of the statistic's linear part. Blocks differ much in size and few of
+    them may hold all the disagreement; there the percentiles of the resampled values cover too seldom, these do not.
+    Bounds are the statistic's range. Undefined for fewer than two blocks.
+    """
+    value = float(statistic(sums.sum(axis=0)))
+    if len(sums) < 2 or math.isnan(value):
+        return Estimate(value, math.nan, math.nan)
+    everything = np.ones((1, len(sums)))
+    error = float(_standard_errors(sums, statistic, everything)[0])
+    if error < ROUNDING:
+        return Estimate(value, value, value)
+    if math.isnan(error):
+        return Estimate(value, math.nan, math.nan)
+    resampled = statistic(weights @ sums)
+    errors = np.maximum(_standard_errors(sums, statistic, weights), 1e-9 * error)
+    pivots = (resampled - value) / errors
+    pivots = pivots[~np.isnan(pivots)]
+    if len(pivots) < len(weights) / 2:
+        return Estimate(value, math.nan, math.nan)
+    low, high = np.quantile(pivots, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    ends = np.clip([value - high * error, value - low * error], *bounds)
+    return Estimate(value, float(ends[0]), float(ends[1]))
+
+
+def _standard_errors(sums: Float64, statistic: Statistic, weights: Float64) -> Float64:
+    """Standard errors (R,) by the delta method: blocks are the sampling units, weights (R, B) how often they are in."""
+    gradient = _gradient(statistic, weights @ sums)
+    n = weights.sum(axis=1)
+    variance = np.zeros(len(weights))
+    with np.errstate(invalid="ignore", over="ignore"):  # resamples in which the statistic is not defined
+        for rows in np.array_split(np.arange(len(weights)), max(1, weights.size // 2**22)):
+            linear = gradient[rows] @ sums.T
+            mean = (weights[rows] * linear).sum(axis=1, keepdims=True) / n[rows, None]
+            variance[rows] = (weights[rows] * (linear - mean) ** 2).sum(axis=1)
+    errors: Float64 = np.sqrt(variance * n / np.maximum(n - 1, 1))
+    return errors
+
+
+def _gradient(statistic: Statistic, totals: Float64) -> Float64:
+    """Central differences (R, C) of the statistic at totals (R, C)."""
+    scale = np.abs(totals).max(axis=0)
+    gradient = np.zeros_like(totals)
+    for column in np.flatnonzero(scale):
+        step = np.zeros(totals.shape[1])
+        step[column] = 1e-5 * scale[column]
+        gradient[:, column] = (statistic(totals + step) - statistic(totals - step)) / (2 * step[column])
+    return gradient

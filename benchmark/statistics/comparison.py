@@ -1,0 +1,316 @@
+"""Which backbone is more stable? Compared on the same places, at the same number of observations, with intervals."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import ConfigError
+from semstab.metrics import dominant, entropy, sbd, vss
+from semstab.results import RECURRENT
+from semstab.statistics.agreement import alpha_columns, alpha_of, psa, ratio_of
+from semstab.statistics.blocks import (
+    LEAST_BLOCKS,
+    REPLICATES,
+    BlockBootstrap,
+    Estimate,
+    Statistic,
+    spatial_blocks,
+)
+from semstab.statistics.correctness import join_truth
+from semstab.statistics.matching import require_same_grid, shared_rows
+from semstab.voxels import VoxelTable
+
+Float64 = npt.NDArray[np.float64]
+Tables = Mapping[str, VoxelTable]
+
+MEASURES: Mapping[str, Callable[[VoxelTable], Float64]] = {"psa": psa, "vss": vss, "sbd": sbd, "entropy": entropy}
+"""Measures with one value a voxel. Higher is better for psa, vss and alpha, lower for sbd and entropy."""
+
+LOWER_IS_BETTER = ("sbd", "entropy")
+
+EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
+"""Upper edges of the strata of OP that comparisons are standardised by; OP = 1 is left out."""
+
+FLIPS = 9999
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What a backbone's map covers. `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
+
+    backbone: str
+    voxels: int
+    observations: int
+    mean_op: float
+    repeated: int
+    recurrent: int
+    common_share: float
+    alone: int
+
+
+def coverage(tables: Tables) -> tuple[Coverage, ...]:
+    """Coverage of each backbone's map; common_share is the part of its voxels that all maps hold."""
+    common = len(shared_rows(*tables.values())[0])
+    rows = []
+    for name, table in tables.items():
+        elsewhere = np.zeros(len(table), dtype=np.bool_)
+        for other in (t for n, t in tables.items() if n != name):
+            elsewhere[shared_rows(table, other)[0]] = True
+        n, observations = len(table), int(table.op.sum(dtype=np.int64))
+        rows.append(
+            Coverage(
+                backbone=name,
+                voxels=n,
+                observations=observations,
+                mean_op=observations / n if n else math.nan,
+                repeated=int(np.count_nonzero(table.op >= 2)),
+                recurrent=int(np.count_nonzero(table.op >= RECURRENT)),
+                common_share=common / n if n else math.nan,
+                alone=int(np.count_nonzero(~elsewhere)),
+            )
+        )
+    return tuple(rows)
+
+
+# --- At the same number of observations -------------------------------------------------------------------------------
+
+
+def standard_weights(tables: Tables, edges: Sequence[int] = EDGES) -> Float64:
+    """The common distribution of OP: shares (S,) of the strata among the voxels with OP >= 2 of all maps together.
+
+    A stratum that is empty in some map has weight 0: there is nothing to compare it with.
+    """
+    counts = np.stack([np.bincount(_stratum(table, edges), minlength=len(edges) + 2)[1:] for table in tables.values()])
+    pooled = np.where((counts > 0).all(axis=0), counts.sum(axis=0), 0)
+    total = pooled.sum()
+    return pooled / total if total else np.zeros(counts.shape[1])
+
+
+def standardised(
+    tables: Tables, measure: str, *, edges: Sequence[int] = EDGES, seed: int = 0, weights: Float64 | None = None
+) -> dict[str, Estimate]:
+    """A measure's mean in each map, as it would be if all had the common distribution of OP (direct standardisation).
+
+    sum_s w_s m_s with m_s the mean in stratum s; each map counts with all its voxels with OP >= 2.
+    """
+    require_same_grid(*tables.values())
+    w = standard_weights(tables, edges) if weights is None else weights
+    S = len(w)
+
+    def weighted(sums: Float64) -> Float64:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = sums[..., :S] / sums[..., S:]
+        used = (w > 0) & (sums[..., S:] > 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            value: Float64 = np.where(used, w * means, 0.0).sum(axis=-1) / np.where(used, w, 0.0).sum(axis=-1)
+        return value
+
+    estimates = {}
+    for name, table in tables.items():
+        columns = np.zeros((len(table), 2 * S))
+        stratum = _stratum(table, edges)
+        again = np.flatnonzero(stratum)
+        columns[again, stratum[again] - 1] = MEASURES[measure](table)[again]
+        columns[again, S + stratum[again] - 1] = 1.0
+        bootstrap = BlockBootstrap(spatial_blocks(table.index, table.voxel_size), seed=seed)
+        estimates[name] = bootstrap.estimate(columns, weighted, (0.0, 1.0))
+    return estimates
+
+
+def _stratum(table: VoxelTable, edges: Sequence[int]) -> npt.NDArray[np.int64]:
+    """(n,) 0 for OP = 1, else 1 to len(edges) + 1."""
+    if list(edges) != sorted(set(edges)) or not edges or edges[0] < 2:
+        raise ConfigError(f"edges = {list(edges)}: upper bounds of OP must ascend from 2 or more")
+    return np.where(table.op >= 2, np.searchsorted(edges, table.op) + 1, 0)
+
+
+# --- On the same places -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A measure of backbone a minus that of b on the voxels that all saw twice or more.
+
+    p_value  of the paired sign-flip test over blocks, for measures with one value a voxel; p_holm corrects it for the
+             number of pairs (Holm 1979)
+    """
+
+    measure: str
+    a: str
+    b: str
+    difference: Estimate
+    p_value: float
+    p_holm: float
+
+
+@dataclass(frozen=True)
+class Rank:
+    """A backbone's place, 1 being the best, with the range that holds 95 % of the resamples.
+
+    best is the share of the resamples in which it is first.
+    """
+
+    backbone: str
+    value: float
+    rank: int
+    low: int
+    high: int
+    best: float
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The backbones by one measure on common voxels, the best first."""
+
+    measure: str
+    ranks: tuple[Rank, ...]
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Backbones on the voxels that every one of them observed at least twice.
+
+    values  the measures by name ('psa', 'vss', 'sbd', 'entropy', 'alpha', 'accuracy') and backbone
+    """
+
+    voxels: int
+    blocks: int
+    block_size: float
+    values: Mapping[str, Mapping[str, Estimate]]
+    differences: tuple[Difference, ...]
+    rankings: tuple[Ranking, ...]
+
+
+def repeated_rows(tables: Tables) -> list[npt.NDArray[np.int64]]:
+    """Rows of the voxels that every map saw twice or more, one array a map, in the same order of voxels."""
+    rows = shared_rows(*tables.values())
+    again = np.all([table.op[r] >= 2 for table, r in zip(tables.values(), rows, strict=True)], axis=0)
+    return [r[again] for r in rows]
+
+
+def paired(
+    tables: Tables,
+    truth: VoxelTable | None = None,
+    *,
+    seed: int = 0,
+    block_size: float | None = None,
+    replicates: int = REPLICATES,
+    flips: int = FLIPS,
+    least_blocks: int = LEAST_BLOCKS,
+) -> Paired:
+    """Compare backbones voxel by voxel where all of them observed at least twice.
+
+    truth is the map of the ground truth labels; without it there is no accuracy. Intervals come from one spatial block
+    bootstrap, the same resamples for all; block_size is in metres.
+    """
+    rows = repeated_rows(tables)
+    first = next(iter(tables.values()))
+    blocks = spatial_blocks(first.index[rows[0]], first.voxel_size, size=block_size, least=least_blocks)
+    bootstrap = BlockBootstrap(blocks, replicates=replicates, seed=seed)
+    columns, statistics = _columns(tables, rows, truth)
+    values, differences, rankings = {}, [], []
+    for measure, statistic in statistics.items():
+        sums = columns[measure]
+        bounds = (-1.0, 1.0) if measure == "alpha" else (0.0, 1.0)
+        values[measure] = {name: bootstrap.estimate(sums[name], statistic, bounds) for name in tables}
+        differences += _differences(measure, statistic, sums, bootstrap, seed, flips)
+        rankings.append(_ranking(measure, statistic, sums, bootstrap))
+    return Paired(len(rows[0]), blocks.count, blocks.size, values, tuple(differences), tuple(rankings))
+
+
+def _columns(
+    tables: Tables, rows: Sequence[npt.NDArray[np.int64]], truth: VoxelTable | None
+) -> tuple[dict[str, dict[str, Float64]], dict[str, Statistic]]:
+    """By measure: each backbone's columns on the common voxels, and what makes the measure of their sums."""
+    statistics: dict[str, Statistic] = {**dict.fromkeys(MEASURES, ratio_of), "alpha": alpha_of}
+    if truth is not None:
+        statistics["accuracy"] = ratio_of
+    columns: dict[str, dict[str, Float64]] = {measure: {} for measure in statistics}
+    for (name, table), r in zip(tables.items(), rows, strict=True):
+        for measure, values in MEASURES.items():
+            columns[measure][name] = np.stack([values(table)[r], np.ones(len(r))], axis=1)
+        columns["alpha"][name] = alpha_columns(table)[r]
+        if truth is not None:
+            true = join_truth(table, truth)
+            right = np.stack([true.known & (dominant(table) == true.label), true.known], axis=1)
+            columns["accuracy"][name] = right[r].astype(np.float64)
+    return columns, statistics
+
+
+def _differences(
+    measure: str,
+    statistic: Statistic,
+    columns: Mapping[str, Float64],
+    bootstrap: BlockBootstrap,
+    seed: int,
+    flips: int,
+) -> list[Difference]:
+    found = []
+    for a, b in itertools.combinations(columns, 2):
+        both = np.concatenate([columns[a], columns[b]], axis=1)
+        estimate = bootstrap.estimate(both, _difference_of(statistic, columns[a].shape[1]))
+        p = math.nan
+        if measure != "alpha":
+            p = sign_flip_test(bootstrap.blocks.sums(columns[a][:, :1] - columns[b][:, :1])[:, 0], seed, flips)
+        found.append((a, b, estimate, p))
+    corrected = holm([p for *_, p in found])
+    return [Difference(measure, *row, p_holm) for row, p_holm in zip(found, corrected, strict=True)]
+
+
+def _difference_of(statistic: Statistic, C: int) -> Statistic:
+    """The statistic of the first C sums minus that of the others."""
+    return lambda sums: statistic(sums[..., :C]) - statistic(sums[..., C:])
+
+
+def sign_flip_test(differences: Float64, seed: int = 0, flips: int = FLIPS) -> float:
+    """P-value of the sum of paired differences (B,) of independent blocks, two-sided.
+
+    Under the hypothesis that the two are interchangeable within a block each difference has either sign with equal
+    probability; `flips` random signs stand for all of them (Fisher 1935). NaN where there is no block.
+    """
+    if not len(differences):
+        return math.nan
+    seen = abs(differences.sum())
+    rng = np.random.default_rng(seed)
+    as_high = 0
+    for rows in np.array_split(np.arange(flips), max(1, flips * len(differences) // 2**24)):
+        signs = rng.integers(0, 2, size=(len(rows), len(differences)), dtype=np.int8) * 2.0 - 1.0
+        as_high += int(np.count_nonzero(np.abs(signs @ differences) >= seen - 1e-9 * (1 + seen)))
+    return (as_high + 1) / (flips + 1)
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """P-values corrected for their number: rejecting those <= q keeps the chance of any false one at q (Holm 1979).
+
+    >>> [round(value, 2) for value in holm([0.01, 0.04, 0.03])]
+    [0.03, 0.06, 0.06]
+    """
+    corrected = [math.nan] * len(p)
+    tested = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
+    highest = 0.0
+    for rank, (value, i) in enumerate(tested):
+        highest = max(highest, min(1.0, value * (len(tested) - rank)))
+        corrected[i] = highest
+    return corrected
+
+
+def _ranking(measure: str, statistic: Statistic, columns: Mapping[str, Float64], bootstrap: BlockBootstrap) -> Ranking:
+    sign = 1.0 if measure in LOWER_IS_BETTER else -1.0
+    values = {name: float(statistic(own.sum(axis=0))) for name, own in columns.items()}
+    resampled = np.stack([sign * bootstrap.replicates(own, statistic) for own in columns.values()])
+    ranks = 1 + (resampled[None] < resampled[:, None]).sum(axis=1)
+    ranks = ranks[:, ~np.isnan(resampled).any(axis=0)]
+    order = sorted(values, key=lambda name: (math.isnan(values[name]), sign * values[name]))
+    rows = []
+    for place, name in enumerate(order, start=1):
+        own = ranks[list(columns).index(name)]
+        low, high = np.quantile(own, [0.025, 0.975], method="inverted_cdf") if own.size else (1, len(columns))
+        best = float(np.mean(own == 1)) if own.size else math.nan
+        rows.append(Rank(name, values[name], place, int(low), int(high), best))
+    return Ranking(measure, tuple(rows))

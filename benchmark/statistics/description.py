@@ -1,0 +1,297 @@
+"""Everything that the statistics say of one map, as content for JSON and as maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.information import normalise
+from semstab.metrics import dominant, entropy, sbd, strata, vss
+from semstab.metrics.summary import STRATA
+from semstab.statistics import fusion_rules
+from semstab.statistics.agreement import (
+    alpha_columns,
+    alpha_of,
+    class_agreement,
+    kappa_columns,
+    kappa_of,
+    psa,
+    ratio_of,
+)
+from semstab.statistics.blocks import UNDEFINED, BlockBootstrap, Estimate, spatial_blocks
+from semstab.statistics.ceiling import losses
+from semstab.statistics.content import mean, plain
+from semstab.statistics.correctness import (
+    Truth,
+    by_stratum,
+    correctness,
+    join_truth,
+    quadrants,
+    reliability,
+    stable_wrong,
+)
+from semstab.statistics.drift import (
+    TESTABLE,
+    SceneDrift,
+    VoxelDrift,
+    benjamini_hochberg,
+    expected_sbd,
+    flips,
+    scene_drift,
+    trend_columns,
+    voxel_drift,
+)
+from semstab.statistics.matching import require_same_map
+from semstab.statistics.uncertainty import decompose
+from semstab.statistics.verdict import verdict
+from semstab.voxels import Events, VoxelTable
+
+SCHEMA = 1
+FALSE_DISCOVERIES = 0.05
+"""Rate at which drifting voxels are named."""
+
+Float64 = npt.NDArray[np.float64]
+Maps = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """What the statistics say of a map: `summary` for JSON, `maps` with one value a voxel (n,), NaN where undefined."""
+
+    summary: dict[str, Any]
+    maps: Maps
+
+
+def describe(
+    table: VoxelTable,
+    events: Events | None = None,
+    truth: VoxelTable | None = None,
+    *,
+    limit: VoxelTable | None = None,
+    name: str = "",
+    seed: int = 0,
+    edges: Sequence[int] = STRATA,
+) -> dict[str, Any]:
+    """All statistics of one map as content for JSON: the `summary` of `analyse`, which takes the same arguments."""
+    return analyse(table, events, truth, limit=limit, name=name, seed=seed, edges=edges).summary
+
+
+def analyse(
+    table: VoxelTable,
+    events: Events | None = None,
+    truth: VoxelTable | None = None,
+    *,
+    limit: VoxelTable | None = None,
+    name: str = "",
+    seed: int = 0,
+    edges: Sequence[int] = STRATA,
+) -> Analysis:
+    """All statistics of one map; the same seed gives the same numbers.
+
+    events  the log behind the table; without it there is no drift test, no flip rate and no other fusion rule
+    truth   the map of the ground truth labels of the same frames; without it nothing is said about right and wrong
+    limit   the map of view-independent labels (`ceiling`); without it nothing is said about geometry's part
+    name    of the backbone, for the verdict
+    edges   upper bounds of the strata of OP
+
+    Intervals are at 95 %, from a spatial block bootstrap over the voxels with OP >= 2; undefined numbers are NaN, and
+    a section that cannot be computed is None.
+    Raises DataError where events, truth or limit do not belong to the table.
+    """
+    if events is not None:
+        require_same_map(table, events)
+    again = table.op >= 2
+    blocks = spatial_blocks(table.index[again], table.voxel_size)
+    means = _Means(table, again, BlockBootstrap(blocks, seed=seed))
+    maps: Maps = {"psa": psa(table)}
+    known = None if truth is None else join_truth(table, truth)
+    agreement = _agreement(table, events, means)
+    drift = _drift(table, events, means, maps, seed)
+    uncertainty = _uncertainty(table, means, maps)
+    right = None if known is None else _correctness(table, known, means, maps, edges, seed)
+    repeated = int(np.count_nonzero(again))
+    judged = verdict(
+        name or "backbone",
+        alpha=agreement["alpha"],
+        psa=agreement["psa"],
+        voxels=repeated,
+        share=repeated / len(table) if len(table) else math.nan,
+        blocks=blocks.count,
+        wrong_of_stable=UNDEFINED if right is None else right["quadrants"].wrong_of_stable,
+    )
+    summary = {
+        "schema": SCHEMA,
+        "name": name,
+        "seed": seed,
+        "K": table.K,
+        "voxel_size": table.voxel_size,
+        "voxels": len(table),
+        "observations": int(table.op.sum(dtype=np.int64)),
+        "repeated": {"voxels": repeated, "share": repeated / len(table) if len(table) else math.nan},
+        "blocks": {"count": blocks.count, "size": blocks.size},
+        "verdict": judged,
+        "agreement": agreement,
+        "drift": drift,
+        "uncertainty": uncertainty,
+        "geometry": None if limit is None else losses(table, limit, seed=seed),
+        "correctness": right,
+        "fusion_rules": None if events is None else _fusion_rules(table, events, known),
+        "strata": _strata(table, maps, edges),
+    }
+    return Analysis(plain(summary), maps)
+
+
+# --- Sections ---------------------------------------------------------------------------------------------------------
+
+
+class _Means:
+    """Means over the voxels with OP >= 2, with their intervals from one bootstrap."""
+
+    def __init__(self, table: VoxelTable, again: npt.NDArray[np.bool_], bootstrap: BlockBootstrap) -> None:
+        self.table = table
+        self.again = again
+        self.bootstrap = bootstrap
+
+    def mean(self, values: Float64, bounds: tuple[float, float] = (0.0, 1.0)) -> Estimate:
+        """Of values (n,) where they are defined."""
+        own = values[self.again]
+        defined = ~np.isnan(own)
+        return self.bootstrap.estimate(np.stack([np.where(defined, own, 0.0), defined], axis=1), ratio_of, bounds)
+
+    def function(
+        self, columns: Float64, statistic: Callable[[Float64], Float64], bounds: tuple[float, float]
+    ) -> Estimate:
+        """Of a statistic of the sums of columns (n, C)."""
+        return self.bootstrap.estimate(columns[self.again], statistic, bounds)
+
+
+def _agreement(table: VoxelTable, events: Events | None, means: _Means) -> dict[str, Any]:
+    return {
+        "psa": means.mean(psa(table)),
+        "kappa": means.function(kappa_columns(table), kappa_of, (-1.0, 1.0)),
+        "alpha": means.function(alpha_columns(table), alpha_of, (-1.0, 1.0)),
+        "vss": means.mean(vss(table)),
+        "classes": class_agreement(table, events),
+    }
+
+
+def _drift(table: VoxelTable, events: Events | None, means: _Means, maps: Maps, seed: int) -> dict[str, Any]:
+    """Against its null; without events only for one-hot evidence, and without tests."""
+    drift = None if events is None else voxel_drift(table, events, seed=seed)
+    null = expected_sbd(table) if drift is None else drift.null
+    maps |= {"sbd_null": null, "sbd_excess": sbd(table) - null}
+    known = ~np.isnan(null)
+    found: dict[str, Any] = {
+        "voxels": int(known.sum()),
+        "sbd": means.mean(np.where(known, sbd(table), np.nan)),
+        "null": means.mean(null),
+        "excess": means.mean(maps["sbd_excess"], (-1.0, 1.0)),
+        "tests": None,
+        "flips": None,
+    }
+    if drift is None or events is None:
+        return found
+    changes = flips(events)
+    tested = table.op >= TESTABLE
+    maps |= {
+        "drift_p": drift.p_value,
+        "drift_q": benjamini_hochberg(np.where(tested, drift.p_value, np.nan)),
+        "trend": drift.trend,
+        "trend_p": drift.trend_p,
+        "trend_q": benjamini_hochberg(np.where(tested, drift.trend_p, np.nan)),
+        "flip_rate": changes.rate,
+        "frames_since_flip": changes.since,
+    }
+    found["tests"] = _tests(table, drift, scene_drift(table, events, drift, seed=seed), means, maps)
+    found["flips"] = {
+        "rate": means.mean(changes.rate),
+        "null": means.mean(changes.null),
+        "excess": means.mean(changes.rate - changes.null, (-1.0, 1.0)),
+        "frames_since": means.mean(changes.since, (0.0, math.inf)),
+    }
+    return found
+
+
+def _tests(table: VoxelTable, drift: VoxelDrift, scene: SceneDrift, means: _Means, maps: Maps) -> dict[str, Any]:
+    one_way, by_chance, all_of_it = trend_columns(table, drift).T
+    excess = np.stack([one_way - by_chance, all_of_it], axis=1)
+    return {
+        "sbd_p": scene.p_value,
+        "trend": scene.trend,
+        "trend_null": scene.trend_null,
+        "trend_excess": means.function(excess, ratio_of, (-1.0, 1.0)),
+        "trend_p": scene.trend_p,
+        "tested_voxels": int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
+        "unusual_sbd_voxels": _discoveries(maps["drift_q"]),
+        "drifting_voxels": _discoveries(maps["trend_q"]),
+    }
+
+
+def _discoveries(q: Float64) -> int:
+    with np.errstate(invalid="ignore"):
+        return int(np.count_nonzero(q <= FALSE_DISCOVERIES))
+
+
+def _uncertainty(table: VoxelTable, means: _Means, maps: Maps) -> dict[str, Any]:
+    parts = decompose(table)
+    maps |= {"entropy_within": parts.within, "entropy_between": parts.between}
+    return {
+        "entropy": means.mean(parts.total),
+        "within": means.mean(parts.within),
+        "between": means.mean(parts.between),
+    }
+
+
+def _correctness(
+    table: VoxelTable, truth: Truth, means: _Means, maps: Maps, edges: Sequence[int], seed: int
+) -> dict[str, Any]:
+    maps |= {"true_label": truth.label, "stable_wrong": stable_wrong(table, truth)}
+    right = np.where(truth.known, dominant(table) == truth.label, np.nan)
+    belief, counted = normalise(table.evidence), truth.known & means.again
+    everywhere = spatial_blocks(table.index, table.voxel_size, size=means.bootstrap.blocks.size)
+    return {
+        "accuracy": means.mean(right),
+        "strata": by_stratum(table, truth, edges),
+        "reliability": reliability(belief[counted], truth.label[counted]),
+        "quadrants": quadrants(table, truth, BlockBootstrap(everywhere, seed=seed)),
+    }
+
+
+def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> list[dict[str, Any]]:
+    """Means over the voxels with OP >= 2 under each rule."""
+    again = table.op >= 2
+    usual = fusion_rules.labels(normalise(table.evidence))
+    rows = []
+    for rule in fusion_rules.RULES:
+        fused = fusion_rules.fuse(events, rule)
+        label = fusion_rules.labels(fused.belief)
+        row: dict[str, Any] = {
+            "rule": rule,
+            "vss": mean(fused.vss[again]),
+            "sbd": mean(fused.sbd[again]),
+            "entropy": mean(fused.entropy[again]),
+            "relabelled_share": mean((label != usual)[again]),
+        }
+        if truth is not None:
+            known = again & truth.known
+            right = correctness(fused.belief[known], truth.label[known])
+            row |= {"accuracy": right.accuracy, "miou": right.miou, "ece": right.ece, "brier": right.brier}
+        rows.append(row)
+    return rows
+
+
+def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> list[dict[str, Any]]:
+    columns = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table)} | {
+        name: maps[name] for name in ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_between")
+    }
+    rows = []
+    for name, low, high in strata(edges):
+        where = (table.op >= low) & (table.op <= high)
+        means = {key: mean(values[where]) for key, values in columns.items()}
+        rows.append({"name": name, "voxels": int(np.count_nonzero(where))} | means)
+    return rows

@@ -1,0 +1,66 @@
+"""The same voxels in several maps."""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import DataError
+from semstab.voxels import Events, VoxelTable
+
+Int64 = npt.NDArray[np.int64]
+
+
+def voxel_keys(*indices: npt.NDArray[np.integer]) -> list[Int64]:
+    """One int64 key a voxel of each index array (n, 3), ascending with (ix, iy, iz), the same for all arrays.
+
+    Raises DataError where the voxels span more than 2^63 cells together.
+    """
+    filled = [index for index in indices if len(index)]
+    if not filled:
+        return [np.zeros(0, dtype=np.int64) for _ in indices]
+    low = np.min([index.min(axis=0) for index in filled], axis=0).astype(np.int64)
+    high = np.max([index.max(axis=0) for index in filled], axis=0).astype(np.int64)
+    size = [int(n) for n in high - low + 1]
+    if math.prod(size) >= 2**63:
+        raise DataError(f"the maps span {' x '.join(map(str, size))} voxels; leave out far depth, or use larger voxels")
+    keys = []
+    for index in indices:
+        x, y, z = (index.astype(np.int64) - low).T
+        keys.append((x * size[1] + y) * size[2] + z)
+    return keys
+
+
+def shared_rows(*tables: VoxelTable) -> list[Int64]:
+    """Rows of the voxels that all tables hold, one array a table, in the same order of voxels.
+
+    Raises DataError where the tables differ in K or voxel size.
+    """
+    require_same_grid(*tables)
+    keys = voxel_keys(*(table.index for table in tables))
+    common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
+    return [np.searchsorted(own, common).astype(np.int64) for own in keys]
+
+
+def require_same_grid(*tables: VoxelTable) -> None:
+    """Raise DataError where tables differ in K or voxel size."""
+    first, *others = tables
+    for other in others:
+        if (first.K, first.voxel_size) != (other.K, other.voxel_size):
+            raise DataError(
+                f"maps of {first.K} classes in voxels of {first.voxel_size:g} m and of {other.K} in"
+                f" {other.voxel_size:g} m cannot be joined; fuse both alike"
+            )
+
+
+def require_same_map(table: VoxelTable, events: Events) -> None:
+    """Raise DataError where the events are not the log behind the table."""
+    op = np.diff(np.append(events.starts, len(events)))
+    if not (len(table) == len(events.ix) and np.array_equal(table.op, op)):
+        raise DataError(
+            f"events of {len(events.ix)} voxels and {len(events)} observations do not belong to a table of"
+            f" {len(table)} and {int(table.op.sum(dtype=np.int64))}; take both from one backend"
+        )

@@ -1,0 +1,41 @@
+"""Logs of observations from labels that a test writes down or draws."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.voxels import Events
+
+
+def log_of(labels, K=3, index=None, frames=None, voxel_size=0.2):
+    """One-hot observations: labels (n, F) of n voxels in F frames, -1 where a frame does not see the voxel."""
+    labels = np.asarray(labels)
+    return log_of_evidence(np.eye(K)[np.maximum(labels, 0)], labels >= 0, index, frames, voxel_size)
+
+
+def log_of_evidence(evidence, seen=None, index=None, frames=None, voxel_size=0.2):
+    """Observations s_bar (n, F, K), where (n, F) `seen` says which there are; voxels (0, 0, 0), (0, 0, 1), ..."""
+    evidence = np.asarray(evidence, dtype=np.float64)
+    n, F, _ = evidence.shape
+    seen = np.ones((n, F), dtype=bool) if seen is None else seen
+    voxel, frame = np.nonzero(seen)
+    index = np.stack([np.zeros(n), np.zeros(n), np.arange(n)], axis=1) if index is None else index
+    return Events(
+        *np.asarray(index).T,
+        voxel=voxel,
+        frame=frame if frames is None else np.asarray(frames)[frame],
+        evidence=evidence[seen],
+        pixels=np.ones(len(voxel)),
+        voxel_size=voxel_size,
+    )
+
+
+def grid(side):
+    """Indices (side * side, 3) of a floor of voxels, sorted."""
+    x, y = np.divmod(np.arange(side * side), side)
+    return np.stack([x, y, np.zeros_like(x)], axis=1)
+
+
+def soft(rng, n, F, K=3, alpha=0.5):
+    """Random evidence (n, F, K) that is not one-hot."""
+    return rng.dirichlet(np.full(K, alpha), size=(n, F))

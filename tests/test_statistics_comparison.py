@@ -1,0 +1,216 @@
+"""Comparison of backbones: standardisation, paired differences, tests and ranks, on simulated maps."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from simulated_events import grid, log_of
+from statsmodels.stats.multitest import multipletests
+
+from semstab.errors import ConfigError, DataError
+from semstab.metrics import vss
+from semstab.statistics import coverage, paired, psa, sign_flip_test, standardised
+from semstab.statistics.comparison import EDGES, holm, standard_weights
+from semstab.statistics.matching import shared_rows
+
+SIDE = 24
+
+
+def noisy(rng, F, error, side=SIDE, seen=None, K=3):
+    """A floor seen by F frames, whose labels err with that probability (a number, or one a voxel)."""
+    own = rng.integers(0, K, size=(side * side, 1))
+    wrong = rng.random((side * side, F)) < np.broadcast_to(error, (side * side,))[:, None]
+    labels = np.where(wrong, rng.integers(0, K, size=wrong.shape), own)
+    if seen is not None:
+        labels = np.where(seen, labels, -1)
+    return log_of(labels, K=K, index=grid(side)).table()
+
+
+def often(rng, F, low):
+    """Which of F frames see which voxel: each at least `low` of them, from the first on."""
+    return np.arange(F) < rng.integers(low, F + 1, size=(SIDE * SIDE, 1))
+
+
+# --- The same voxels --------------------------------------------------------------------------------------------------
+
+
+def table_of(voxels, op=2):
+    return log_of(np.zeros((len(voxels), op), dtype=int), index=np.array(voxels)).table()
+
+
+def test_shared_rows_are_the_voxels_that_all_maps_hold():
+    a = table_of([(-5, 0, 0), (0, 0, 1), (0, 1, 0), (7, 7, 7)])
+    b = table_of([(0, 0, 1), (0, 0, 2), (7, 7, 7)])
+    c = table_of([(-9, 9, 9), (0, 0, 1), (0, 0, 2), (7, 7, 7)])
+    assert [rows.tolist() for rows in shared_rows(a, b, c)] == [[1, 3], [0, 2], [1, 3]]
+    assert [rows.tolist() for rows in shared_rows(a, table_of([(1, 1, 1)]))] == [[], []]
+
+
+def test_maps_of_different_voxels_are_refused():
+    a = table_of([(0, 0, 0)])
+    with pytest.raises(DataError, match="fuse both alike"):
+        shared_rows(a, dataclasses.replace(a, voxel_size=0.4))
+
+
+def test_coverage_by_hand():
+    labels = [[0, 0, 0], [0, 0, -1], [0, -1, -1]]
+    a = log_of(labels, index=np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2)])).table()
+    b = log_of(labels[:2], index=np.array([(0, 0, 1), (5, 0, 0)])).table()
+    first, second = coverage({"a": a, "b": b})
+    assert (first.voxels, first.observations, first.mean_op, first.repeated, first.recurrent) == (3, 6, 2, 2, 1)
+    assert (first.common_share, first.alone) == (pytest.approx(1 / 3), 2)
+    assert (second.common_share, second.alone) == (1 / 2, 1)
+
+
+# --- Standardisation --------------------------------------------------------------------------------------------------
+
+
+def test_standardised_values_of_one_model_seen_more_or_less_often_are_the_same():
+    """VSS falls with OP; at a common distribution of OP the difference is gone."""
+    rng = np.random.default_rng(0)
+    tables = {
+        "rarely": noisy(rng, 8, 0.7, seen=np.arange(8) < rng.choice([2, 8], p=[0.8, 0.2], size=(SIDE**2, 1))),
+        "often": noisy(rng, 8, 0.7, seen=np.arange(8) < rng.choice([2, 8], p=[0.2, 0.8], size=(SIDE**2, 1))),
+    }
+    raw = {name: vss(table).mean() for name, table in tables.items()}
+    at_common = standardised(tables, "vss")
+    assert raw["rarely"] - raw["often"] > 0.05
+    difference = at_common["rarely"].value - at_common["often"].value
+    spread = (at_common["rarely"].high - at_common["rarely"].low) / 2
+    assert abs(difference) < 1.5 * spread < 0.04
+
+
+def test_standardised_value_by_hand():
+    """Strata OP = 2 and OP = 4 with weights 2/3 and 1/3; PSA there is 1/2 and 1 in a, 1 and 1/2 in b."""
+    index = np.stack([np.zeros(3), np.zeros(3), np.arange(3)], axis=1)
+    a = log_of([[0, 0, -1, -1], [0, 1, -1, -1], [0, 0, 0, 0]], index=index).table()
+    b = log_of([[0, 0, -1, -1], [1, 1, -1, -1], [0, 0, 0, 1]], index=index).table()
+    np.testing.assert_allclose(standard_weights({"a": a, "b": b})[[0, 2]], [2 / 3, 1 / 3])
+    values = standardised({"a": a, "b": b}, "psa")
+    assert values["a"].value == pytest.approx(2 / 3 * 1 / 2 + 1 / 3)
+    assert values["b"].value == pytest.approx(2 / 3 + 1 / 3 * 1 / 2)
+
+
+def test_a_stratum_that_one_map_lacks_counts_for_none():
+    index = np.stack([np.zeros(2), np.zeros(2), np.arange(2)], axis=1)
+    a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index).table()
+    b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index).table()
+    assert standard_weights({"a": a, "b": b}).tolist() == [1.0] + [0.0] * len(EDGES)
+    assert standardised({"a": a, "b": b}, "psa")["a"].value == 1
+    never = log_of([[0, -1]], index=index[:1]).table()
+    assert math.isnan(standardised({"a": a, "b": never}, "psa")["a"].value)
+
+
+def test_edges_that_do_not_ascend_are_refused():
+    with pytest.raises(ConfigError, match="must ascend from 2"):
+        standardised({"a": table_of([(0, 0, 0)])}, "psa", edges=(1, 5))
+
+
+# --- Paired comparison ------------------------------------------------------------------------------------------------
+
+
+def two_backbones(rng, gap, side=32, F=4):
+    """Two backbones that err block by block of 4 x 4 voxels; the second errs more by `gap`."""
+    blocks = rng.beta(2, 6, size=(side // 4, side // 4))
+    error = np.kron(blocks, np.ones((4, 4))).ravel()
+    shift = np.kron(rng.normal(0, 0.05, size=blocks.shape), np.ones((4, 4))).ravel()
+    return {
+        "a": noisy(rng, F, np.clip(error, 0, 1), side),
+        "b": noisy(rng, F, np.clip(error + gap + shift, 0, 1), side),
+    }
+
+
+def test_paired_differences_cover_and_their_test_keeps_its_level():
+    """Two backbones of the same quality, 100 times: the interval holds 0, and the test says so, 95 times."""
+    rng = np.random.default_rng(1)
+    held, rejected = 0, 0
+    for _ in range(100):
+        tables = two_backbones(rng, 0.0)
+        result = paired(tables, replicates=150, flips=199)
+        (psa_difference,) = (row for row in result.differences if row.measure == "psa")
+        held += psa_difference.difference.low <= 0 <= psa_difference.difference.high
+        rejected += psa_difference.p_value <= 0.05
+    assert held >= 88
+    assert rejected <= 12
+
+
+def test_a_worse_backbone_is_found_by_difference_test_and_rank():
+    tables = two_backbones(np.random.default_rng(2), 0.15)
+    result = paired(tables)
+    by_measure = {row.measure: row for row in result.differences}
+    assert by_measure["psa"].difference.low > 0
+    assert by_measure["alpha"].difference.low > 0
+    assert by_measure["entropy"].difference.high < 0
+    assert by_measure["psa"].p_value < 0.001
+    for ranking in result.rankings:
+        assert [rank.backbone for rank in ranking.ranks] == ["a", "b"]
+        assert ranking.ranks[0].best > 0.95
+
+
+def test_backbones_are_compared_by_accuracy_where_there_is_a_truth():
+    rng = np.random.default_rng(5)
+    true = rng.integers(0, 3, size=(SIDE**2, 1))
+    wrong = rng.random((SIDE**2, 1)) < 0.2
+    a, b = (log_of(np.repeat(labels, 3, axis=1), index=grid(SIDE)).table() for labels in (true, (true + wrong) % 3))
+    result = paired({"a": a, "b": b}, a)
+    (accuracy,) = (row for row in result.differences if row.measure == "accuracy")
+    assert accuracy.difference.value == pytest.approx(wrong.mean())
+    assert accuracy.difference.low <= 0.2 <= accuracy.difference.high
+    assert accuracy.p_value < 0.001
+    (agreement,) = (row for row in result.differences if row.measure == "psa")
+    assert agreement.difference.value == 0
+    assert agreement.p_value == 1
+
+
+def test_only_voxels_that_all_saw_twice_are_compared():
+    index = np.stack([np.zeros(4), np.zeros(4), np.arange(4)], axis=1)
+    a = log_of([[0, 0], [0, 1], [0, -1], [0, 0]], index=index).table()
+    b = log_of([[0, 1], [0, 1], [0, 0]], index=index[[0, 1, 2]]).table()
+    result = paired({"a": a, "b": b})
+    assert result.voxels == 2
+    assert result.values["psa"]["a"].value == pytest.approx(psa(a)[:2].mean())
+    assert result.values["psa"]["b"].value == 0
+
+
+def test_ranks_are_uncertain_where_backbones_are_alike_and_certain_where_not():
+    rng = np.random.default_rng(3)
+    twins = two_backbones(rng, 0.0)
+    worst = two_backbones(rng, 0.4)["b"]
+    (by_psa,) = (r for r in paired({**twins, "worst": worst}).rankings if r.measure == "psa")
+    ranks = {rank.backbone: rank for rank in by_psa.ranks}
+    assert ranks["worst"].rank == ranks["worst"].low == 3
+    assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
+    assert {ranks["a"].low, ranks["b"].low} == {1}
+    assert {ranks["a"].high, ranks["b"].high} == {2}
+
+
+def test_maps_without_a_common_voxel_leave_everything_undefined():
+    tables = {"a": table_of([(0, 0, 0)]), "b": table_of([(9, 9, 9)])}
+    result = paired(tables)
+    assert result.voxels == result.blocks == 0
+    assert math.isnan(result.values["psa"]["a"].value)
+    assert all(math.isnan(row.p_value) for row in result.differences)
+    assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)
+
+
+# --- Tests ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_sign_flip_test_is_that_over_all_signs():
+    differences = np.array([0.5, 1.0, -0.2, 0.7, 0.9, 0.1, -0.3])
+    sums = [abs(np.dot(signs, differences)) for signs in itertools.product((-1, 1), repeat=7)]
+    exact = np.mean(np.array(sums) >= abs(differences.sum()) - 1e-9)
+    assert sign_flip_test(differences) == pytest.approx(exact, abs=4 * math.sqrt(exact / 9999))
+    assert sign_flip_test(np.zeros(5)) == 1
+    assert sign_flip_test(np.ones(20)) == pytest.approx(1e-4)
+    assert math.isnan(sign_flip_test(np.zeros(0)))
+
+
+def test_holm_is_that_of_statsmodels():
+    p = [0.01, 0.2, 0.03, 0.5, 0.002]
+    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
+    assert holm([math.nan, 0.02]) == [pytest.approx(math.nan, nan_ok=True), 0.02]

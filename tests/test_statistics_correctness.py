@@ -1,0 +1,159 @@
+"""Right beside stable: against scikit-learn, by hand, and where a simulated model is stably wrong."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from simulated_events import grid, log_of, log_of_evidence
+from sklearn.metrics import accuracy_score, jaccard_score
+
+from semstab.errors import DataError
+from semstab.information import normalise
+from semstab.statistics import (
+    BlockBootstrap,
+    correctness,
+    join_truth,
+    quadrants,
+    reliability,
+    spatial_blocks,
+    stable_wrong,
+)
+from semstab.statistics.correctness import by_stratum
+
+
+def random_beliefs(n=400, K=4, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.dirichlet(np.full(K, 0.5), size=n), rng.integers(0, K - 1, size=n)
+
+
+# --- Truth ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
+    table = log_of([[0], [0], [0], [0]]).table()
+    index = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 9, 9]])
+    truth = log_of([[1, 1, 0], [2, -1, -1], [0, 1, -1], [2, 2, 2]], index=index).table()
+    joined = join_truth(table, truth)
+    assert joined.label.tolist() == [1, 2, -1, -1]
+    assert joined.known.tolist() == [True, True, False, False]
+
+
+def test_truth_of_other_voxels_is_refused():
+    with pytest.raises(DataError, match="of 3 classes"):
+        join_truth(log_of([[0]]).table(), log_of([[0]], K=4).table())
+
+
+# --- Measures ---------------------------------------------------------------------------------------------------------
+
+
+def test_accuracy_and_miou_are_those_of_scikit_learn():
+    belief, label = random_beliefs()
+    found = correctness(belief, label)
+    predicted = belief.argmax(axis=1)
+    assert found.accuracy == pytest.approx(accuracy_score(label, predicted))
+    assert found.miou == pytest.approx(jaccard_score(label, predicted, average="macro"))
+
+
+def test_classes_that_are_neither_true_nor_predicted_do_not_count():
+    belief = np.array([[0.9, 0.1, 0.0], [0.8, 0.2, 0.0]])
+    assert correctness(belief, np.array([0, 1])).miou == pytest.approx((1 / 2 + 0) / 2)
+
+
+def test_brier_score_by_hand():
+    belief = np.array([[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]])
+    assert correctness(belief, np.array([0, 0, 0])).brier == pytest.approx((0.5 + 0 + 2) / 3)
+
+
+def test_calibration_error_by_hand():
+    """Ten voxels of confidence 0.9, six right; ten of 0.5 and all right: (0.3 + 0.5) / 2."""
+    belief = np.array([[0.9, 0.1]] * 10 + [[0.5, 0.5]] * 10)
+    label = np.array([0] * 6 + [1] * 4 + [0] * 10)
+    assert correctness(belief, label).ece == pytest.approx(0.4)
+    bins = [row for row in reliability(belief, label) if row.voxels]
+    assert [(row.voxels, row.confidence, row.accuracy) for row in bins] == [
+        (10, 0.5, 1.0),
+        (10, pytest.approx(0.9), 0.6),
+    ]
+    assert all(row.low < row.confidence <= row.high for row in bins)
+
+
+def test_a_calibrated_model_has_hardly_any_calibration_error():
+    rng = np.random.default_rng(1)
+    belief = rng.dirichlet(np.ones(3), size=50_000)
+    label = (rng.random((50_000, 1)) > np.cumsum(belief, axis=1)[:, :-1]).sum(axis=1)
+    found = correctness(belief, label)
+    assert found.ece < 0.01
+    assert found.brier == pytest.approx((1 - (belief**2).sum(axis=1)).mean(), abs=0.01)
+
+
+def test_every_voxel_is_in_one_bin():
+    belief, label = random_beliefs(seed=2)
+    belief[:3] = np.eye(4)[:3]
+    assert sum(row.voxels for row in reliability(belief, label)) == len(belief)
+
+
+def test_strata_hold_the_voxels_of_their_op():
+    table = log_of([[0, -1, -1], [1, 1, -1], [2, 2, 2], [0, 0, 1]]).table()
+    truth = join_truth(table, log_of([[0], [0], [2], [1]]).table())
+    rows = {row.name: (row.voxels, row.accuracy) for row in by_stratum(table, truth, (1, 2, 5))}
+    assert rows["all"] == (4, 0.5)
+    assert rows["OP=1"] == (1, 1.0)
+    assert rows["OP=2"] == (1, 0.0)
+    assert rows["3<=OP<=5"] == (2, 0.5)
+    assert rows["OP>5"][0] == 0
+    assert math.isnan(rows["OP>5"][1])
+
+
+# --- Quadrants --------------------------------------------------------------------------------------------------------
+
+
+def test_quadrants_by_hand():
+    """Of five voxels one is seen twice only, and one has no truth."""
+    labels = [[0, 0, 0], [1, 1, 1], [0, 0, 1], [0, 1, 1], [2, 2, -1], [2, 2, 2]]
+    table = log_of(labels).table()
+    truth = join_truth(table, log_of([[0], [0], [0], [0], [0]]).table())
+    found = quadrants(table, truth, BlockBootstrap(spatial_blocks(table.index, 0.2)))
+    assert found.voxels == 4
+    shares = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
+    assert [share.value for share in shares] == [0.25, 0.25, 0.25, 0.25]
+    assert found.wrong_of_stable.value == 0.5
+    assert stable_wrong(table, truth).tolist() == [False, True, False, False, False, False]
+
+
+def test_one_of_ten_frames_may_disagree_at_a_stable_voxel():
+    table = log_of([[0] * 9 + [1], [0] * 8 + [1, 1]]).table()
+    truth = join_truth(table, log_of([[1], [1]]).table())
+    assert stable_wrong(table, truth).tolist() == [True, False]
+
+
+def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
+    """30 % of the places are wrong in all frames, 10 % of the labels at random."""
+    rng = np.random.default_rng(3)
+    side, F = 40, 8
+    true = rng.integers(0, 3, size=(side**2, 1))
+    place = rng.random((side**2, 1)) < 0.3
+    flicker = rng.random((side**2, F)) < 0.1
+    labels = np.where(flicker, rng.integers(0, 3, size=flicker.shape), (true + place) % 3)
+    table = log_of(labels, index=grid(side)).table()
+    truth = join_truth(table, log_of(true, index=grid(side)).table())
+    found = quadrants(table, truth, BlockBootstrap(spatial_blocks(table.index, 0.2)))
+    assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
+    assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
+
+
+def test_without_a_voxel_that_counts_quadrants_are_undefined():
+    table = log_of([[0, 0]]).table()
+    found = quadrants(table, join_truth(table, table), BlockBootstrap(spatial_blocks(table.index, 0.2)))
+    assert found.voxels == 0
+    assert math.isnan(found.stable_wrong.value)
+    assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
+
+
+def test_the_belief_is_the_normalised_evidence():
+    events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
+    table = events.table()
+    truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
+    (everything, *_) = by_stratum(table, truth, (1, 2, 5))
+    assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)

@@ -1,0 +1,223 @@
+"""Everything about a map as content for JSON, the verdict, and the command that prints them."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import tiny_scene
+from simulated_events import grid, log_of
+
+import semstab
+from semstab.config import Config
+from semstab.errors import ConfigError, DataError
+from semstab.files import read_json, write_json
+from semstab.metrics import sbd
+from semstab.statistics import Estimate, analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
+from semstab.statistics.__main__ import main
+from semstab.statistics.blocks import UNDEFINED
+from semstab.statistics.text import comparison_lines, lines
+from semstab.voxels import VoxelTable
+
+SIDE, F = 24, 8
+
+
+def backbone(flicker, seed, place=0.0, seen=0.8):
+    """The log of a simulated model on a floor: labels that flicker, and places that are wrong in every frame."""
+    rng = np.random.default_rng(seed)
+    true = np.random.default_rng(99).integers(0, 3, size=(SIDE**2, 1))
+    stuck = rng.random((SIDE**2, 1)) < place
+    noise = rng.random((SIDE**2, F)) < flicker
+    labels = np.where(noise, rng.integers(0, 3, size=noise.shape), (true + stuck) % 3)
+    labels[:, 1:][rng.random((SIDE**2, F - 1)) > seen] = -1
+    return log_of(labels, index=grid(SIDE))
+
+
+def ground_truth():
+    return backbone(0.0, 1, seen=1.0).table()
+
+
+@pytest.fixture(scope="module")
+def described():
+    events = backbone(0.2, 0, place=0.2)
+    return analyse(events.table(), events, ground_truth(), limit=ground_truth(), name="sim")
+
+
+# --- One map ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_description_is_content_for_json_and_undefined_numbers_are_null(described, tmp_path):
+    write_json(tmp_path / "statistics.json", described.summary)
+    content = read_json(tmp_path / "statistics.json")
+    assert content["agreement"]["alpha"]["value"] == described.summary["agreement"]["alpha"]["value"]
+    assert content["strata"][0]["psa"] is None
+    assert math.isnan(described.summary["strata"][0]["psa"])
+    assert json.loads(json.dumps(described.summary))["name"] == "sim"
+
+
+def test_a_description_holds_what_the_functions_say(described):
+    events = backbone(0.2, 0, place=0.2)
+    table, summary = events.table(), described.summary
+    repeated = table.op >= 2
+    assert summary["repeated"] == {"voxels": int(repeated.sum()), "share": pytest.approx(repeated.mean())}
+    assert summary["agreement"]["alpha"]["value"] == pytest.approx(krippendorff_alpha(table))
+    assert summary["drift"]["excess"]["value"] == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
+    parts = summary["uncertainty"]
+    assert parts["entropy"]["value"] == pytest.approx(parts["within"]["value"] + parts["between"]["value"])
+    geometry = summary["geometry"]
+    assert geometry["geometry"]["value"] == 0
+    assert geometry["total"]["value"] == pytest.approx(1 - summary["agreement"]["psa"]["value"])
+    shares = [summary["correctness"]["quadrants"][name]["value"] for name in
+              ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")]  # fmt: skip
+    assert sum(shares) == pytest.approx(1)
+    assert summary["drift"]["tests"]["drifting_voxels"] == 0
+    assert [row["rule"] for row in summary["fusion_rules"]] == ["averaging", "majority", "product", "geometric"]
+
+
+def test_every_map_has_a_value_for_every_voxel(described):
+    assert {len(values) for values in described.maps.values()} == {SIDE**2}
+    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(described.maps)
+    assert described.maps["stable_wrong"].sum() > 10
+
+
+def test_the_same_seed_gives_the_same_description():
+    events = backbone(0.2, 3)
+    a, b, other = (describe(events.table(), events, seed=seed) for seed in (4, 4, 5))
+    assert json.dumps(a) == json.dumps(b)
+    assert a["agreement"]["psa"]["low"] != other["agreement"]["psa"]["low"]
+
+
+def test_a_table_alone_is_described_as_far_as_it_goes():
+    events = backbone(0.2, 0)
+    alone, logged = describe(events.table()), describe(events.table(), events)
+    for section in ("fusion_rules", "correctness", "geometry"):
+        assert alone[section] is None
+    assert alone["drift"]["tests"] is None
+    assert alone["drift"]["null"] == logged["drift"]["null"]
+    assert alone["agreement"] == logged["agreement"]
+
+
+@pytest.mark.parametrize("labels", [np.zeros((0, 2), dtype=int), [[0, -1]], [[0, 0], [0, 0]]])
+def test_maps_that_say_nothing_are_described_too(labels):
+    events = log_of(labels)
+    table = events.table()
+    summary = describe(table, events, table, limit=table)
+    assert summary["verdict"]["level"] == "no verdict"
+    assert "no verdict" in lines(summary)[0]
+
+
+def test_events_of_another_map_are_refused():
+    with pytest.raises(DataError, match="take both from one backend"):
+        describe(log_of([[0, 1]]).table(), log_of([[0, -1]]))
+
+
+# --- Several maps -----------------------------------------------------------------------------------------------------
+
+
+def test_backbones_beside_each_other():
+    logs = {"steady": backbone(0.1, 5), "flickering": backbone(0.4, 6), "stuck": backbone(0.1, 7, place=0.3)}
+    tables = {name: log.table() for name, log in logs.items()}
+    content = compare_backbones(tables, logs, ground_truth())
+    json.dumps(content)
+    by_alpha = next(row for row in content["paired"]["rankings"] if row["measure"] == "alpha")
+    assert by_alpha["ranks"][-1]["backbone"] == "flickering"
+    assert len(content["paired"]["differences"]) == 3 * 6
+    assert content["standardised"]["values"]["psa"]["steady"]["value"] > 0.8
+    rules = content["fusion_rules"]
+    assert rules["orders"]["accuracy"]["averaging"][0] == "steady"
+    assert rules["values"]["averaging"]["stuck"]["accuracy"] < 0.8
+    assert rules["order_changes"].keys() == rules["orders"].keys()
+    assert any("steady" in line for line in comparison_lines(content))
+    assert compare_backbones(tables)["fusion_rules"] is None
+
+
+def test_one_backbone_cannot_be_compared():
+    with pytest.raises(ConfigError, match="give two or more"):
+        compare_backbones({"a": ground_truth()})
+
+
+# --- The verdict ------------------------------------------------------------------------------------------------------
+
+
+def judged(low, high, wrong=UNDEFINED, voxels=5000, blocks=40):
+    middle = Estimate((low + high) / 2, low, high)
+    return verdict(
+        "net", alpha=middle, psa=middle, voxels=voxels, share=0.5, blocks=blocks, wrong_of_stable=wrong
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "level"),
+    [
+        (0.81, 0.9, "stable"), (0.79, 0.9, "usable"), (0.67, 0.7, "usable"), (0.6, 0.9, "undecided"),
+        (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
+    ],
+)  # fmt: skip
+def test_the_interval_decides_the_level(low, high, level):
+    assert judged(low, high).level == level
+
+
+def test_what_is_stably_wrong_is_not_called_stable():
+    assert judged(0.9, 0.95, Estimate(0.2, 0.1, 0.3)).level == "misleading"
+    assert judged(0.9, 0.95, Estimate(0.06, 0.04, 0.1)).level == "stable"
+    assert "20% of the stable places are wrong (10% to 30%)" in judged(0.9, 0.95, Estimate(0.2, 0.1, 0.3)).line
+
+
+def test_there_is_no_verdict_from_few_places():
+    assert judged(0.9, 0.95, voxels=99).level == judged(0.9, 0.95, blocks=15).level == "no verdict"
+    assert "fly with more overlap" in judged(0.9, 0.95, voxels=99).line
+    assert "one class" in judged(math.nan, math.nan).line
+
+
+def test_the_line_says_what_to_do_and_why():
+    assert judged(0.5, 0.6).line == (
+        "net: unstable, do not act on its labels: two frames agree on 55% of the places (50% to 60%),"
+        " alpha 0.55 (0.50 to 0.60); 5000 places seen twice or more, 50% of the map"
+    )
+
+
+def test_voxels_seen_once_change_no_verdict():
+    events = backbone(0.3, 8, seen=0.3)
+    table = events.table()
+    again = table.op >= 2
+    columns = ("ix", "iy", "iz", "op", "evidence", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum",
+               "frame_entropy_sum")  # fmt: skip
+    only = VoxelTable(*(getattr(table, name)[again] for name in columns), voxel_size=table.voxel_size)
+    assert (~again).any()
+    a, b = describe(table), describe(only)
+    assert a["verdict"]["level"] == b["verdict"]["level"]
+    assert a["agreement"] == b["agreement"]
+
+
+# --- The command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_reads_a_run_folder(tmp_path, capsys, monkeypatch):
+    scene = tiny_scene.write(tmp_path / "wall")
+    config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": 0.25}
+    content = config | {"backbones": ["a", "b", "gt"], "backends": ["numpy"], "check": None, "events": True}
+    semstab.run(Config.build(content, "test"), out=tmp_path / "run")
+    monkeypatch.setattr(
+        "sys.argv",
+        ["", str(tmp_path / "run"), "--json", str(tmp_path / "found.json"), "--maps", str(tmp_path / "maps")],
+    )
+    assert main() == 0
+    out = capsys.readouterr().out
+    assert "wall, a, numpy" in out
+    assert "Krippendorff's alpha" in out
+    assert "by alpha: 1." in out
+    found = read_json(tmp_path / "found.json")
+    assert [row["backbone"] for row in found["maps"]] == ["a", "b", "gt"]
+    assert found["maps"][2]["correctness"] is None
+    assert found["maps"][0]["correctness"]["accuracy"]["value"] > 0.5
+    assert found["comparisons"][0]["fusion_rules"]["voxels"] > 0
+    (path,) = (tmp_path / "maps").glob("wall__a__*.parquet")
+    assert len(VoxelTable.load(path)) == found["maps"][0]["voxels"]
+
+
+def test_the_command_says_in_one_line_what_is_wrong(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["", str(tmp_path)])
+    assert main() == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -1,0 +1,294 @@
+"""Drift against its null: the null against all orders, tests that keep their level, and drift that is found."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numba
+import numpy as np
+import pytest
+from scipy.stats import false_discovery_control
+from simulated_events import log_of, log_of_evidence, soft
+
+from semstab.errors import ConfigError
+from semstab.information import js_divergence, normalise
+from semstab.metrics import sbd, vss
+from semstab.statistics import benjamini_hochberg, expected_sbd, flips, scene_drift, voxel_drift
+from semstab.voxels import Events
+
+
+def sbd_of(evidence):
+    """SBD of one voxel from its definition."""
+    belief = normalise(np.cumsum(evidence, axis=0))
+    return js_divergence(belief[1:], belief[:-1]).mean()
+
+
+def r_squared(evidence):
+    """R^2 of evidence (T, K) on the number of the observation, by least squares."""
+    design = np.stack([np.ones(len(evidence)), np.arange(len(evidence))], axis=1)
+    fitted = design @ np.linalg.lstsq(design, evidence, rcond=None)[0]
+    return ((fitted - evidence.mean(axis=0)) ** 2).sum() / ((evidence - evidence.mean(axis=0)) ** 2).sum()
+
+
+def over_all_orders(evidence):
+    """Null, two-sided p-value of SBD, and p-value of the trend, over all T! orders."""
+    orders = [evidence[list(order)] for order in itertools.permutations(range(len(evidence)))]
+    drifts, trends = np.array([sbd_of(o) for o in orders]), np.array([r_squared(o) for o in orders])
+    low, high = np.mean(drifts <= drifts[0] + 1e-9), np.mean(drifts >= drifts[0] - 1e-9)
+    return drifts.mean(), min(1, 2 * min(low, high)), np.mean(trends >= trends[0] - 1e-9)
+
+
+def drifting(rng, n, T):
+    """Labels (n, T) of two classes whose belief moves one way: the second one's share rises from 0.1 to 0.9."""
+    return (rng.random((n, T)) < np.linspace(0.1, 0.9, T)).astype(int)
+
+
+def shuffled(rng, labels):
+    return rng.permuted(labels, axis=1)
+
+
+def small(events, **settings):
+    return voxel_drift(events.table(), events, **settings)
+
+
+# --- The null ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("T", [2, 3, 4, 5])
+def test_few_observations_are_compared_with_all_orders_exactly(T):
+    rng = np.random.default_rng(T)
+    evidence = np.concatenate([soft(rng, 6, T), np.eye(3)[[[0] + [1] * (T - 1), [0, 1] * (T // 2) + [2] * (T % 2)]]])
+    drift = small(log_of_evidence(evidence))
+    null, p_value, trend_p = np.transpose([over_all_orders(e) for e in evidence])
+    np.testing.assert_allclose(drift.null, null)
+    np.testing.assert_allclose(drift.excess, [sbd_of(e) for e in evidence] - null, atol=1e-12)
+    np.testing.assert_allclose(drift.p_value, p_value)
+    if T > 2:
+        np.testing.assert_allclose(drift.trend, [r_squared(e) for e in evidence])
+        np.testing.assert_allclose(drift.trend_p, trend_p)
+    else:
+        assert np.isnan([drift.trend, drift.trend_p]).all()
+
+
+def test_many_observations_are_compared_with_random_orders():
+    """All 5040 orders of 7 observations against 1999 random ones: within 4 standard errors."""
+    evidence = soft(np.random.default_rng(0), 3, 7)
+    events = log_of_evidence(evidence)
+    drift = small(events, least=1999, most=1999, enough=1999)
+    for i, e in enumerate(evidence):
+        null, p_value, trend_p = over_all_orders(e)
+        assert drift.null[i] == pytest.approx(null, rel=0.05)
+        assert drift.p_value[i] == pytest.approx(p_value, abs=2 * 4 * math.sqrt(0.25 / 1999))
+        assert drift.trend_p[i] == pytest.approx(trend_p, abs=4 * math.sqrt(0.25 / 1999))
+
+
+@pytest.mark.parametrize("labels", [[0, 1], [0, 0, 1], [0, 1, 2, 2], [0, 0, 0, 1, 1, 2], [0, 1, 1, 1, 1, 1, 1]])
+def test_the_null_of_one_hot_observations_is_known_from_their_counts(labels):
+    evidence = np.eye(3)[labels]
+    orders = set(itertools.permutations(labels))
+    expected = np.mean([sbd_of(np.eye(3)[list(order)]) for order in orders])
+    table = log_of([labels]).table()
+    np.testing.assert_allclose(expected_sbd(table), [expected])
+    np.testing.assert_allclose(small(log_of_evidence(evidence[None])).null, [expected])
+
+
+def test_the_null_from_counts_is_what_random_orders_give_on_average():
+    rng = np.random.default_rng(1)
+    labels = np.repeat([[0] * 25 + [1] * 10 + [2] * 5], 4000, axis=0)
+    table = log_of(shuffled(rng, labels)).table()
+    drawn = sbd(table)
+    assert drawn.mean() == pytest.approx(expected_sbd(table)[0], abs=4 * drawn.std() / math.sqrt(len(drawn)))
+
+
+def test_the_null_is_undefined_where_a_frame_disagrees_with_itself_and_zero_where_all_agree():
+    events = log_of_evidence([[[1, 0], [0.5, 0.5]], [[1, 0], [1, 0]], [[1, 0], [0, 1]]])
+    np.testing.assert_allclose(expected_sbd(events.table()), [np.nan, 0, 0.311278], atol=1e-6)
+    drift = small(events)
+    assert drift.null[1] == drift.excess[1] == 0
+    assert math.isnan(drift.p_value[1])
+    assert math.isnan(small(log_of([[0, -1]])).null[0])
+
+
+def test_very_many_observations():
+    """Beyond 256 the table of drifts ends, and drawn orders take over."""
+    rng = np.random.default_rng(2)
+    events = log_of(rng.integers(0, 2, size=(3, 300)))
+    assert np.isnan(expected_sbd(events.table())).all()
+    drift = small(events)
+    assert (np.abs(drift.excess) < 0.5 * drift.null).all()
+
+
+def test_in_every_stratum_the_mean_sbd_of_noise_is_what_random_order_gives():
+    """The fall of SBD with OP is arithmetic: the very same noise, seen more often."""
+    rng = np.random.default_rng(3)
+    means = []
+    for T in (2, 4, 8, 16):
+        table = log_of(rng.choice(3, size=(4000, T), p=[0.7, 0.2, 0.1])).table()
+        excess = sbd(table) - expected_sbd(table)
+        assert excess.mean() == pytest.approx(0, abs=4 * excess.std() / math.sqrt(len(table)) + 1e-12)
+        means.append(sbd(table).mean())
+    assert all(fewer > 1.5 * more for fewer, more in itertools.pairwise(means))
+
+
+# --- Tests of voxels --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("T", [5, 9])
+def test_p_values_keep_their_level_under_noise(T):
+    rng = np.random.default_rng(T)
+    events = log_of(rng.choice(3, size=(2500, T), p=[0.5, 0.3, 0.2]))
+    drift = small(events, most=499)
+    for p in (drift.p_value, drift.trend_p):
+        tested = p[~np.isnan(p)]
+        for level in (0.01, 0.05, 0.2):
+            assert np.mean(tested <= level) <= level + 3 * math.sqrt(level * (1 - level) / len(tested))
+
+
+def test_a_belief_that_moves_one_way_is_found_where_vss_cannot_tell_it_from_noise():
+    rng = np.random.default_rng(4)
+    moving = drifting(rng, 300, 40)
+    noise = shuffled(rng, moving)
+    events = log_of(np.concatenate([moving, noise]), K=2)
+    table = events.table()
+    assert np.array_equal(vss(table)[:300], vss(table)[300:])
+    drift = small(events)
+    found = benjamini_hochberg(drift.trend_p) <= 0.05
+    assert found[:300].mean() > 0.75
+    assert found[300:].sum() <= 0.05 * found.sum() + 3 * math.sqrt(0.05 * found.sum())
+    assert drift.excess[:300].mean() < 0, "late evidence moves the belief less, so SBD falls below its null"
+    assert (drift.p_value[:300] <= 0.05).mean() > 3 * (drift.p_value[300:] <= 0.05).mean()
+
+
+def test_trend_is_one_over_steps_in_random_order_and_one_for_a_straight_move():
+    rng = np.random.default_rng(5)
+    noise = small(log_of(rng.integers(0, 2, size=(4000, 6))), most=100)
+    excess = (noise.trend - noise.trend_null)[~np.isnan(noise.trend)]
+    assert excess.mean() == pytest.approx(0, abs=4 * excess.std() / math.sqrt(len(excess)))
+    share = np.linspace(0, 1, 8)
+    straight = small(log_of_evidence(np.stack([1 - share, share], axis=1)[None]))
+    assert straight.trend[0] == pytest.approx(1)
+    assert straight.trend_p[0] <= 0.005
+
+
+def test_the_same_seed_gives_the_same_numbers_for_any_number_of_threads():
+    events = log_of_evidence(soft(np.random.default_rng(6), 100, 8))
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        alone = small(events, seed=7)
+    finally:
+        numba.set_num_threads(threads)
+    together, other = small(events, seed=7), small(events, seed=8)
+    np.testing.assert_array_equal(alone.p_value, together.p_value)
+    np.testing.assert_array_equal(alone.null, together.null)
+    assert not np.array_equal(together.null, other.null)
+    a, b = (scene_drift(events.table(), events, together, seed=1, frame_orders=50) for _ in range(2))
+    assert a == b
+
+
+def test_an_empty_log_and_one_without_disagreement():
+    for labels in (np.zeros((0, 3), dtype=int), [[1, 1, 1]]):
+        events = log_of(labels)
+        drift = small(events)
+        scene = scene_drift(events.table(), events, drift)
+        assert math.isnan(scene.p_value)
+        assert math.isnan(scene.trend)
+        assert len(flips(events).rate) == len(labels)
+
+
+def test_settings_that_make_no_sense_are_refused():
+    events = log_of([[0, 1]])
+    with pytest.raises(ConfigError, match="least = 10, most = 5"):
+        voxel_drift(events.table(), events, least=10, most=5)
+
+
+# --- Tests of the scene -----------------------------------------------------------------------------------------------
+
+
+def scene(labels, K=2, frame_orders=99):
+    events = log_of(labels, K=K)
+    table = events.table()
+    return scene_drift(table, events, small(events, least=1, most=1), seed=0, frame_orders=frame_orders)
+
+
+def test_the_scene_test_keeps_its_level_when_voxels_err_together():
+    """40 voxels with one and the same labels are one voxel, not 40."""
+    rng = np.random.default_rng(10)
+    p_values = [scene(np.repeat(rng.integers(0, 2, size=(1, 9)), 40, axis=0)) for _ in range(150)]
+    slack = 3 * math.sqrt(0.05 * 0.95 / 150)
+    assert np.mean([s.p_value <= 0.05 for s in p_values]) <= 0.05 + slack
+    assert np.mean([s.trend_p <= 0.05 for s in p_values]) <= 0.05 + slack
+
+
+def test_the_scene_test_finds_a_common_drift():
+    rng = np.random.default_rng(11)
+    labels = drifting(rng, 200, 12)
+    seen = rng.random(labels.shape) < 0.6
+    seen[:, 0] = True
+    moving = scene(np.where(seen, labels, -1))
+    noise = scene(np.where(seen, shuffled(rng, labels), -1))
+    assert moving.trend_p == 0.01
+    assert moving.trend > moving.trend_null + 0.1
+    assert noise.trend_p > 0.05
+    assert moving.sbd < moving.null
+    assert moving.p_value == 0.02
+
+
+def test_the_statistics_of_the_scene_are_means_over_its_voxels():
+    rng = np.random.default_rng(12)
+    events = log_of(rng.integers(-1, 2, size=(60, 7)).clip(min=[0] + [-1] * 6))
+    table, drift = events.table(), small(events)
+    found = scene_drift(table, events, drift, frame_orders=9)
+    assert found.sbd == pytest.approx(np.nanmean(sbd(table)))
+    assert found.null == pytest.approx(np.nanmean(drift.null))
+
+
+def test_frames_need_not_be_numbered_from_zero_nor_come_in_order():
+    """The observed order is the order of integration; the null does not depend on the frames' numbers."""
+    labels = [[0, 0, 0, 1, 1, 1], [1, 1, 0, 0, 0, 0]]
+    plain = log_of(labels)
+    other = Events(
+        plain.ix, plain.iy, plain.iz, plain.voxel, 1000 - plain.frame, plain.evidence, plain.pixels, plain.voxel_size
+    )
+    a, b = (scene_drift(e.table(), e, small(e), frame_orders=199) for e in (plain, other))
+    assert a.sbd == b.sbd
+    assert a.trend == b.trend
+    assert a.trend_p == pytest.approx(b.trend_p, abs=0.1)
+
+
+# --- Flips ------------------------------------------------------------------------------------------------------------
+
+
+def test_flips_by_hand():
+    events = log_of([[0, 0, 1, 1, -1, 1], [0, 1, 0, -1, -1, -1], [2, -1, -1, -1, -1, -1], [1, 1, -1, -1, -1, -1]])
+    changes = flips(events)
+    np.testing.assert_allclose(changes.rate, [1 / 4, 1, np.nan, 0])
+    np.testing.assert_allclose(changes.null, [3 * 2 / 10, 2 / 3, np.nan, 0])
+    np.testing.assert_allclose(changes.since, [3, 0, np.nan, np.nan])
+
+
+def test_a_flip_is_a_change_of_the_largest_evidence():
+    events = log_of_evidence([[[0.6, 0.4], [0.9, 0.1], [0.5, 0.5], [0.4, 0.6]]])
+    assert flips(events).rate[0] == pytest.approx(1 / 3)
+
+
+def test_noise_flips_as_often_as_random_order_does_and_lasting_labels_less():
+    rng = np.random.default_rng(13)
+    noise = flips(log_of(rng.integers(0, 3, size=(5000, 6))))
+    excess = noise.rate - noise.null
+    assert excess.mean() == pytest.approx(0, abs=4 * excess.std() / math.sqrt(5000))
+    lasting = flips(log_of(np.sort(rng.integers(0, 3, size=(500, 6)), axis=1)))
+    assert (lasting.rate - lasting.null).mean() < -0.2
+
+
+# --- Many tests at once -----------------------------------------------------------------------------------------------
+
+
+def test_benjamini_hochberg_is_that_of_scipy_and_leaves_out_what_was_not_tested():
+    p = np.random.default_rng(14).random(50) ** 3
+    np.testing.assert_allclose(benjamini_hochberg(p), false_discovery_control(p))
+    with_gaps = np.insert(p, [0, 10, 50], np.nan)
+    np.testing.assert_allclose(benjamini_hochberg(with_gaps)[~np.isnan(with_gaps)], false_discovery_control(p))
+    assert np.isnan(benjamini_hochberg(with_gaps)).sum() == 3
+    assert len(benjamini_hochberg(np.zeros(0))) == 0
