@@ -1,0 +1,131 @@
+"""Segmentation models behind one protocol: `create("segformer", model="models/segformer-b0")`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ValidationError
+
+from semstab.config import explain
+from semstab.errors import ConfigError
+from semstab.labels import IGNORE_8BIT, LabelSpace
+from semstab.registry import Entry, Registry
+
+REGISTRY = Registry(
+    "backbone",
+    {
+        "colour-clusters": Entry(
+            "semstab.backbones.colour_clusters:ColourClusters",
+            "k-means of colour and texture, one codebook a sequence: a baseline without weights",
+        ),
+        "segformer": Entry(
+            "semstab.backbones.segformer:Segformer",
+            "any transformers checkpoint for semantic segmentation: SegFormer, BEiT, DPT, UPerNet, ...",
+            install="pip install 'semstab[segformer]'",
+        ),
+        "sam-raw": Entry(
+            "semstab.backbones.sam_raw:SamRaw",
+            "Segment Anything's proposals as regions without classes",
+            install="pip install 'semstab[sam]'",
+        ),
+        "sam-heuristic": Entry(
+            "semstab.backbones.sam_heuristic:SamHeuristic",
+            "Segment Anything's proposals with classes from rules on colour, size and shape",
+            install="pip install 'semstab[sam]'",
+        ),
+        "sam-vote": Entry(
+            "semstab.backbones.sam_vote:SamVote",
+            "another backbone's labels, by majority inside Segment Anything's proposals",
+            install="pip install 'semstab[sam]'",
+        ),
+        "segearth-ov": Entry(
+            "semstab.backbones.segearth_ov:SegEarthOV",
+            "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
+            install="pip install 'semstab[segearth]'",
+        ),
+    },
+)
+
+Image = npt.NDArray[np.uint8]
+"""(H, W, 3) uint8 RGB."""
+
+Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+UNASSIGNED = 0
+"""The id of a pixel without a region, in the maps of backbones without classes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a backbone says about one image.
+
+    labels  (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a backbone without
+            classes, region ids from 1, `UNASSIGNED` where there is no region
+    scores  (H, W, K) float32 that sum to 1 over the classes, or None where they were not asked for
+    """
+
+    labels: Labels
+    scores: npt.NDArray[np.float32] | None = None
+
+
+class Backbone(Protocol):
+    """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
+
+    label_space   the classes of its labels and scores, or None where it predicts regions without classes
+    gives_scores  whether `predict` can give scores
+    fit_frames    how many images `fit` wants, 0 for most
+    """
+
+    label_space: LabelSpace | None
+    gives_scores: bool
+    fit_frames: int
+
+    def fit(self, images: Sequence[Image]) -> Backbone:
+        """The backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
+
+        Called once a sequence, before the first `predict`, whatever frames are predicted later.
+        """
+        ...
+
+    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+        """One prediction an image, in order, of the image's size. The images have one size.
+
+        The result does not depend on how images are put together into batches, but for rounding.
+        """
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """All that its output depends on beside the image, for JSON: settings, and what they name by its content.
+
+        Predictions are kept and reused under it.
+        """
+        ...
+
+
+def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
+    """Class ids as the narrowest type that holds so many classes and the ignore id."""
+    return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
+
+
+def options_model(name: str) -> type[BaseModel]:
+    """The pydantic model of a backbone's options. Raises ConfigError, MissingDependencyError."""
+    return cast("type[BaseModel]", REGISTRY.load(name).Options)
+
+
+def create(name: str, **options: Any) -> Backbone:
+    """Load a backbone by name with its options.
+
+    Raises ConfigError for an unknown name or option, DataError for a model that cannot be loaded,
+    MissingDependencyError where its packages are not installed.
+    """
+    cls = REGISTRY.load(name)
+    model = cast("type[BaseModel]", cls.Options)
+    try:
+        validated = model.model_validate(options)
+    except ValidationError as error:
+        raise ConfigError(f"backbone '{name}': {explain(error, model)}") from error
+    return cast(Backbone, cls(validated))

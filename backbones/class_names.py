@@ -1,0 +1,151 @@
+"""From a model's own classes to those of a taxonomy, by name: what Cityscapes and ADE20K call UAVid's classes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.resources
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from semstab.backbones import Backbone, Image, Prediction
+from semstab.errors import ConfigError
+from semstab.files import parse_yaml
+from semstab.labels import LabelMapping, LabelSpace
+
+Leniency = Literal["strict", "lenient"]
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """What one family of models calls the classes of UAVid; see configs/backbones/class_names.yaml.
+
+    recognised_by  names that only this vocabulary has, and always has
+    rest           the class of what no class takes
+    strict         class to the names that certainly are it; `lenient` to the names that are it on a generous view
+    """
+
+    recognised_by: Sequence[str]
+    rest: str
+    strict: Mapping[str, Sequence[str]]
+    lenient: Mapping[str, Sequence[str]]
+
+    def matches(self, space: LabelSpace) -> bool:
+        """Whether a model's classes come from this vocabulary."""
+        return {_key(name) for name in self.recognised_by} <= {key for name in space.classes for key in _keys(name)}
+
+    def target_of(self, name: str, leniency: Leniency) -> str | None:
+        """The class of UAVid that a name is, None where it is none."""
+        tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
+        found = {_key(member): target for table in tables for target, names in table.items() for member in names}
+        return next((found[key] for key in _keys(name) if key in found), None)
+
+
+@functools.cache
+def vocabularies() -> Mapping[str, Vocabulary]:
+    """Those that ship, by name."""
+    file = importlib.resources.files("semstab.configs") / "backbones" / "class_names.yaml"
+    content = parse_yaml(file.read_text(encoding="utf-8"), file.name)
+    return {name: Vocabulary(**entry) for name, entry in content.items()}
+
+
+def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "strict") -> LabelMapping:
+    """Map a model's classes to a taxonomy by name.
+
+    A class goes where its vocabulary says, or to the class of `target` with its name or among whose members it is; one
+    of which the vocabulary says nothing else goes to its rest. Where `target` knows none of these, strict raises
+    ConfigError and names the class, lenient leaves the class out.
+    """
+    vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
+    rows, lost = [], []
+    for name in source.classes:
+        candidates = _candidates(name, vocabulary, leniency)
+        found = next((row for candidate in candidates if (row := _row(candidate, target)) is not None), None)
+        if found is None:
+            lost.append(name)
+        rows.append(None if found == LEFT_OUT else found)
+    if lost and leniency == "strict":
+        raise ConfigError(
+            f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {source.name}; add the names to a class's"
+            " members or to ignored, or leave them out with the lenient mapping"
+        )
+    return LabelMapping(source, target, tuple(rows))
+
+
+LEFT_OUT = -1
+"""The row of a class that the target ignores."""
+
+
+def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
+    """What a class may be called in the target, the best first."""
+    own = [name, *_parts(name)]
+    if vocabulary is None:
+        return own
+    said = vocabulary.target_of(name, leniency)
+    return [*own, vocabulary.rest] if said is None else [said, *own]
+
+
+def _row(name: str, target: LabelSpace) -> int | None:
+    """The row of the class of that name or member, LEFT_OUT where it is ignored, None where it is not known."""
+    key = _key(name)
+    for row, (own, members) in enumerate(zip(target.classes, target.members, strict=True)):
+        if key in {_key(own), *(_key(member) for member in members)}:
+            return row
+    return LEFT_OUT if key in {_key(ignored) for ignored in target.ignored} else None
+
+
+class InTaxonomy:
+    """A backbone whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
+
+    Labels are the mapped classes of the model's own decision; scores of classes that fall together are added up.
+    Raises ConfigError for a backbone without classes, and what `class_mapping` raises.
+    """
+
+    def __init__(self, backbone: Backbone, target: LabelSpace, leniency: Leniency) -> None:
+        if backbone.label_space is None:
+            raise ConfigError("regions without classes cannot be brought into a taxonomy; leave it out")
+        self._backbone = backbone
+        self._leniency: Leniency = leniency
+        self._mapping = class_mapping(backbone.label_space, target, leniency)
+        self.label_space: LabelSpace | None = dataclasses.replace(target, ids=tuple(range(len(target))))
+        self.gives_scores = backbone.gives_scores
+        self.fit_frames = backbone.fit_frames
+
+    def fit(self, images: Sequence[Image]) -> Backbone:
+        """The inner backbone, fitted."""
+        return InTaxonomy(self._backbone.fit(images), self._mapping.target, self._leniency)
+
+    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+        """See `Backbone`."""
+        return [self._mapped(prediction) for prediction in self._backbone.predict(images, scores=scores)]
+
+    def identity(self) -> dict[str, Any]:
+        """That of the inner backbone, and where each class goes."""
+        rows = list(self._mapping.rows)
+        return {**self._backbone.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
+
+    def _mapped(self, prediction: Prediction) -> Prediction:
+        labels = self._mapping.labels(prediction.labels, "prediction")
+        if prediction.scores is None:
+            return Prediction(labels)
+        scores = self._mapping.scores(prediction.scores, "prediction")
+        return Prediction(labels, np.asarray(scores, dtype=np.float32))
+
+
+def _keys(name: str) -> list[str]:
+    return [_key(name), *(_key(part) for part in _parts(name))]
+
+
+def _parts(name: str) -> list[str]:
+    """The synonyms of a name like 'door;double door' or 'building, edifice'."""
+    parts = [part.strip() for part in re.split(r"[;,]", name)]
+    return parts if len(parts) > 1 else []
+
+
+def _key(name: str) -> str:
+    """As `semstab.labels` compares names."""
+    return " ".join(name.replace("_", " ").replace("-", " ").lower().split())

@@ -1,0 +1,242 @@
+"""Segment Anything's proposals: masks at a grid of points, the sure and stable ones, each once (Kirillov et al. 2023).
+
+The point grid, the stability score and the suppression of duplicates are done here, after section 5 and appendix B of
+the article, without the crops of its largest setting.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import transformers
+from pydantic import Field
+from torch import nn
+
+from semstab.backbones import UNASSIGNED, Image
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions
+from semstab.errors import DataError
+from semstab.files import atomic_path
+
+Mask = npt.NDArray[np.bool_]
+Array = npt.NDArray[np.float64]
+
+MOST_REGIONS = 65535
+
+
+class SamOptions(ModelOptions):
+    """Which checkpoint, and which of its masks are kept."""
+
+    points_per_side: int = Field(32, ge=1, le=256, description="the image is asked at a grid of so many points a side")
+    points_per_batch: int = Field(64, ge=1, description="points at a time; changes speed and memory, not the masks")
+    pred_iou: float = Field(0.88, ge=0, le=1, description="masks that the model itself rates lower are dropped")
+    stability: float = Field(0.95, ge=0, le=1, description="masks that change more with the threshold are dropped")
+    stability_offset: float = Field(1.0, ge=0, description="by how much the threshold is moved up and down, logits")
+    nms_iou: float = Field(0.7, ge=0, le=1, description="of masks whose boxes overlap more the better rated one stays")
+    min_area: int = Field(100, ge=0, description="masks of fewer pixels are dropped")
+    cache: Path | None = Field(None, description="folder that keeps proposals, for other uses of the same ones")
+
+    def identity(self) -> dict[str, Any]:
+        """The options that the regions depend on, without those that a use of the regions adds."""
+        own = set(SamOptions.model_fields) - {"cache", "points_per_batch"}
+        return {name: value for name, value in super().identity().items() if name in own}
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Masks of one image, packed to bits.
+
+    shape   (H, W) of the image
+    packed  (n, ceil(H W / 8)) uint8
+    scores  (n,) the model's own estimate of each mask's IoU
+    boxes   (n, 4) x0, y0, x1, y1 of their pixels, both ends included
+    """
+
+    shape: tuple[int, int]
+    packed: npt.NDArray[np.uint8]
+    scores: Array
+    boxes: Array
+
+    def __len__(self) -> int:
+        return len(self.packed)
+
+    def mask(self, k: int) -> Mask:
+        """(H, W) the pixels of one."""
+        H, W = self.shape
+        return np.unpackbits(self.packed[k], count=H * W).reshape(H, W).astype(np.bool_)
+
+    @property
+    def areas(self) -> npt.NDArray[np.int64]:
+        """(n,) pixels of each."""
+        areas: npt.NDArray[np.int64] = np.bitwise_count(self.packed).sum(axis=1, dtype=np.int64)
+        return areas
+
+    def by_area(self, min_area: int) -> Iterator[Mask]:
+        """The masks of at least that many pixels, the largest first; of equal ones the better rated first."""
+        areas = self.areas
+        for k in np.lexsort((-self.scores, -areas)):
+            if areas[k] >= max(1, min_area):
+                yield self.mask(int(k))
+
+
+class SamProposer:
+    """A Segment Anything model that proposes masks, and keeps them in a folder where one is named."""
+
+    def __init__(self, options: SamOptions) -> None:
+        self.options = options
+        self.checkpoint = Checkpoint.find(options)
+        self._processor = self.checkpoint.load(transformers.AutoImageProcessor)
+        self._model = self.checkpoint.load_model(transformers.AutoModelForMaskGeneration, options)
+        if not isinstance(self._model, transformers.SamModel):
+            kind = self._model.config.model_type
+            raise DataError(
+                f"{self.checkpoint.folder}: a '{kind}' model; name one of the first Segment Anything ('sam')"
+            )
+
+    def identity(self) -> dict[str, Any]:
+        """The checkpoint's revision and the settings."""
+        return {"revision": self.checkpoint.revision, **self.options.identity()}
+
+    def propose(self, image: Image) -> Proposals:
+        """The proposals of an image; `min_area` is left to whoever uses them."""
+        if self.options.cache is None:
+            return self._propose(image)
+        file = self.options.cache / self._key() / f"{_digest(image)}.npz"
+        if file.is_file():
+            with np.load(file) as kept:
+                return Proposals((int(kept["shape"][0]), int(kept["shape"][1])), *(kept[name] for name in KEPT))
+        proposals = self._propose(image)
+        with atomic_path(file) as temporary:
+            arrays = {name: getattr(proposals, name) for name in KEPT}
+            np.savez_compressed(temporary, shape=np.array(proposals.shape), **arrays)
+        return proposals
+
+    def _key(self) -> str:
+        """Of the settings that proposals depend on."""
+        settings = {name: value for name, value in self.identity().items() if name != "min_area"}
+        return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+    @torch.inference_mode()
+    def _propose(self, image: Image) -> Proposals:
+        inputs = self._processor(images=image, input_data_format="channels_last", return_tensors="pt")
+        resized = tuple(int(side) for side in inputs["reshaped_input_sizes"][0])
+        pixels = inputs["pixel_values"].to(self._model.device, self._model.dtype)
+        embedding = self._model.get_image_embeddings(pixels)
+        points = point_grid(self.options.points_per_side) * np.array(resized[::-1])
+        sizes = (tuple(pixels.shape[-2:]), resized, image.shape[:2])
+        kept = [
+            found
+            for start in range(0, len(points), self.options.points_per_batch)
+            for found in self._ask(embedding, points[start : start + self.options.points_per_batch], sizes)
+        ]
+        return _without_duplicates(kept, (image.shape[0], image.shape[1]), self.options.nms_iou)
+
+    def _ask(self, embedding: torch.Tensor, points: Array, sizes: Any) -> Iterator[_Found]:
+        """The masks at these points that the model rates well and that are stable."""
+        where = torch.as_tensor(points, dtype=embedding.dtype, device=embedding.device)
+        found = self._model(image_embeddings=embedding, input_points=where[None, :, None, :], multimask_output=True)
+        scores = found.iou_scores[0].flatten().float()
+        masks = found.pred_masks[0].flatten(0, 1)
+        for k in torch.nonzero(scores > self.options.pred_iou).flatten().tolist():
+            logits = full_size(masks[k].float(), *sizes)
+            if stability_score(logits, self.options.stability_offset) >= self.options.stability:
+                mask = (logits > 0).cpu().numpy()
+                if mask.any():
+                    yield _Found(np.packbits(mask), float(scores[k]), _box(mask))
+
+
+KEPT = ("packed", "scores", "boxes")
+
+
+def region_map(proposals: Proposals, min_area: int) -> npt.NDArray[np.uint16]:
+    """(H, W) uint16 regions 1, 2, ...: masks painted by area, the largest first; UNASSIGNED where there is none."""
+    regions = np.full(proposals.shape, UNASSIGNED, dtype=np.uint16)
+    for k, mask in enumerate(proposals.by_area(min_area), start=1):
+        if k > MOST_REGIONS:
+            break
+        regions[mask] = k
+    return regions
+
+
+def point_grid(side: int) -> Array:
+    """(side^2, 2) centres (x, y) of the cells of a grid, the image being 1 wide and 1 high.
+
+    >>> point_grid(2).tolist()
+    [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
+    """
+    centres = (np.arange(side) + 0.5) / side
+    x, y = np.meshgrid(centres, centres)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def full_size(logits: torch.Tensor, padded: Any, resized: Any, image: Any) -> torch.Tensor:
+    """Mask logits (h, w) of the padded square, without the padding, at the image's size; bilinear each time."""
+    square = nn.functional.interpolate(logits[None, None], size=padded, mode="bilinear", align_corners=False)
+    inside = square[..., : resized[0], : resized[1]]
+    return nn.functional.interpolate(inside, size=image, mode="bilinear", align_corners=False)[0, 0]
+
+
+def stability_score(logits: torch.Tensor, offset: float) -> float:
+    """IoU of the masks at thresholds `offset` above and below 0; 0 where the larger one is empty."""
+    larger = int((logits > -offset).sum())
+    return int((logits > offset).sum()) / larger if larger else 0.0
+
+
+def suppress(boxes: Array, scores: Array, iou: float) -> list[int]:
+    """Greedy non-maximum suppression: the rows that stay, the best first; the first one on ties.
+
+    boxes   (n, 4) x0, y0, x1, y1
+    """
+    order = np.argsort(-scores, kind="stable")
+    stay: list[int] = []
+    while order.size:
+        best, order = int(order[0]), order[1:]
+        stay.append(best)
+        order = order[_box_iou(boxes[best], boxes[order]) <= iou]
+    return stay
+
+
+def _box_iou(box: Array, others: Array) -> Array:
+    """(n,) IoU of a box with each of (n, 4) others; 0 where both are empty."""
+    sides = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    shared = np.maximum(sides, 0).prod(axis=1)
+    whole = (box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1) - shared
+    iou: Array = np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0)
+    return iou
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A mask, packed, before duplicates are taken out."""
+
+    packed: npt.NDArray[np.uint8]
+    score: float
+    box: tuple[int, int, int, int]
+
+
+def _without_duplicates(found: list[_Found], shape: tuple[int, int], iou: float) -> Proposals:
+    boxes = np.array([mask.box for mask in found], dtype=np.float64).reshape(-1, 4)
+    scores = np.array([mask.score for mask in found], dtype=np.float64)
+    stay = suppress(boxes, scores, iou)
+    width = -(-shape[0] * shape[1] // 8)
+    packed = np.array([found[k].packed for k in stay], dtype=np.uint8).reshape(-1, width)
+    return Proposals(shape, packed, scores[stay], boxes[stay])
+
+
+def _box(mask: Mask) -> tuple[int, int, int, int]:
+    """Of a mask that is not empty."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
+
+
+def _digest(image: Image) -> str:
+    content = hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16)
+    content.update(str(image.shape).encode())
+    return content.hexdigest()

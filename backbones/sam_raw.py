@@ -1,0 +1,40 @@
+"""Backbone `sam-raw`: Segment Anything's proposals as regions without classes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from semstab.backbones import Backbone, Image, Prediction
+from semstab.backbones.sam_proposals import SamOptions, SamProposer, region_map
+from semstab.labels import LabelSpace
+
+
+class SamRaw:
+    """Regions 1, 2, ... from the largest mask to the smallest, smaller ones over larger ones, 0 where there is none.
+
+    Ids mean nothing across frames: `semstab.metrics.matched_region_flicker` compares such maps.
+    """
+
+    Options: type[BaseModel] = SamOptions
+    gives_scores = False
+    fit_frames = 0
+
+    def __init__(self, options: SamOptions) -> None:
+        self.label_space: LabelSpace | None = None
+        self._proposer = SamProposer(options)
+
+    def fit(self, images: Sequence[Image]) -> Backbone:
+        """Itself."""
+        return self
+
+    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+        """See `Backbone`; there are no scores."""
+        min_area = self._proposer.options.min_area
+        return [Prediction(region_map(self._proposer.propose(image), min_area)) for image in images]
+
+    def identity(self) -> dict[str, Any]:
+        """The checkpoint's revision and the settings."""
+        return self._proposer.identity()

@@ -1,0 +1,72 @@
+"""Backbone `sam-vote`: another backbone's labels, made one inside each of Segment Anything's proposals by majority."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from semstab.backbones import Backbone, Image, Labels, Prediction, create
+from semstab.backbones.sam_proposals import Proposals, SamOptions, SamProposer
+from semstab.errors import ConfigError
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+
+
+class SamVoteOptions(SamOptions):
+    """The proposals, and who votes."""
+
+    voter: str = Field(description="the backbone whose labels vote, e.g. segformer")
+    voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {model: FOLDER}")
+
+
+class SamVote:
+    """Masks painted by area, the largest first, each in the label that most of its pixels have (ties: the lowest id).
+
+    Pixels that the voter ignores do not vote; outside the masks its labels stay.
+    Raises ConfigError for a voter without classes.
+    """
+
+    Options: type[BaseModel] = SamVoteOptions
+    gives_scores = False
+
+    def __init__(
+        self, options: SamVoteOptions, proposer: SamProposer | None = None, voter: Backbone | None = None
+    ) -> None:
+        self.options = options
+        self._voter = voter or create(options.voter, **options.voter_options)
+        if self._voter.label_space is None:
+            raise ConfigError(f"sam-vote: the voter '{options.voter}' has no classes; choose one that has")
+        self._proposer = proposer or SamProposer(options)
+        self.label_space: LabelSpace | None = self._voter.label_space
+        self.fit_frames = self._voter.fit_frames
+
+    def fit(self, images: Sequence[Image]) -> Backbone:
+        """With the fitted voter."""
+        return SamVote(self.options, self._proposer, self._voter.fit(images))
+
+    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+        """See `Backbone`; there are no scores."""
+        min_area = self._proposer.options.min_area
+        votes = self._voter.predict(images)
+        return [
+            Prediction(majority(vote.labels, self._proposer.propose(image), min_area))
+            for image, vote in zip(images, votes, strict=True)
+        ]
+
+    def identity(self) -> dict[str, Any]:
+        """Those of the proposals and of the voter."""
+        return self._proposer.identity() | {"voter": self.options.voter, "voter_options": self._voter.identity()}
+
+
+def majority(labels: Labels, proposals: Proposals, min_area: int) -> Labels:
+    """The labels (H, W) with each mask in the label that most of its pixels had, the largest mask first."""
+    ignore = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+    voted = labels.copy()
+    for mask in proposals.by_area(min_area):
+        inside = labels[mask]
+        votes = np.bincount(inside[inside != ignore])
+        if votes.size:
+            voted[mask] = votes.argmax()
+    return voted

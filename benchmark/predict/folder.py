@@ -1,0 +1,140 @@
+"""A folder of predictions: the maps, their classes, and what they depend on, so that others never mix with them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from semstab.datasets.images import LABEL_SUFFIXES, SCORE_SUFFIXES
+from semstab.datasets.scene_files import LABEL_SPACE_FILE
+from semstab.errors import ConfigError, DataError
+from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.labels import LabelSpace
+
+SCHEMA = 1
+"""Version of predictions.json."""
+
+MANIFEST_FILE = "predictions.json"
+SAVE_SECONDS = 5.0
+"""How much work a killed process may lose at most."""
+
+Kind = Literal["labels", "scores", "regions"]
+ScoreType = Literal["float16", "float32"]
+
+
+class PredictionFolder:
+    """labels/NAME, scores/NAME or regions/NAME of a scene; what an earlier start of the same finished is kept.
+
+    path      the folder
+    kind      of maps: PNG ids, .npz scores (K, H, W), PNG region ids
+    settings  all that the maps depend on beside the image, for JSON
+    about     what else the manifest says
+    space     the classes; None for regions
+
+    Raises ConfigError where the folder holds maps of other settings or of other origin.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        kind: Kind,
+        settings: Mapping[str, Any],
+        about: Mapping[str, Any],
+        space: LabelSpace | None,
+        *,
+        score_type: ScoreType = "float16",
+        overwrite: bool = False,
+    ) -> None:
+        self.path = path
+        self.kind = kind
+        self._suffix = ".npz" if kind == "scores" else ".png"
+        self._score_type = np.dtype(score_type)
+        said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
+        self._content: dict[str, Any] = {"schema": SCHEMA, "kind": kind, "key": _key(said), "settings": said, **about}
+        self._frames: dict[str, dict[str, Any]] = self._claim(overwrite)
+        self._space = space
+        self._saved = -math.inf
+
+    def has(self, name: str, image: str) -> bool:
+        """Whether the map of that frame is there, predicted from an image of that digest."""
+        return self._frames.get(name, {}).get("image") == image and self.file(name).is_file()
+
+    def file(self, name: str) -> Path:
+        """Where a frame's map is."""
+        return self.path / f"{name}{self._suffix}"
+
+    def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
+        """Keep a frame's map: ids (H, W), or scores (H, W, K)."""
+        with atomic_path(self.file(name)) as temporary:
+            if self.kind == "scores":
+                np.savez(temporary, scores=values.transpose(2, 0, 1).astype(self._score_type))
+            else:
+                temporary.write_bytes(cv2.imencode(".png", values)[1].tobytes())
+        self._frames[name] = {"image": image, "seconds": round(seconds, 4)}
+        if time.monotonic() - self._saved > SAVE_SECONDS:
+            self.save()
+
+    def save(self) -> None:
+        """Write the classes and the manifest, once there is a map: what is not in the manifest is predicted again."""
+        if not self._frames:
+            return
+        if self._space is not None:
+            text = yaml.safe_dump(self._space.to_dict(), sort_keys=False, allow_unicode=True)
+            write_text(self.path / LABEL_SPACE_FILE, text)
+        write_json(self.path / MANIFEST_FILE, self._content | {"frames": self._frames})
+        self._saved = time.monotonic()
+
+    def _claim(self, overwrite: bool) -> dict[str, dict[str, Any]]:
+        """The frames that an earlier start finished."""
+        manifest = self.path / MANIFEST_FILE
+        if not manifest.is_file():
+            suffixes = SCORE_SUFFIXES if self.kind == "scores" else LABEL_SUFFIXES
+            if any(file.suffix.lower() in suffixes for file in _files(self.path)):
+                raise ConfigError(f"{self.path}: holds maps that were not predicted here; choose another --name")
+            return {}
+        there = read_json(manifest)
+        frames = there.get("frames") if isinstance(there, dict) else None
+        if not isinstance(frames, dict):
+            raise DataError(f"{manifest}: no manifest of predictions; delete the folder, or choose another --name")
+        if there.get("key") == self._content["key"]:
+            return frames
+        if not overwrite:
+            change = _first_change(there.get("settings", {}), self._content["settings"])
+            raise ConfigError(
+                f"{self.path}: holds predictions with other settings ({change}); choose another --name, or --overwrite"
+            )
+        for file in (*map(self.file, frames), manifest):
+            file.unlink(missing_ok=True)
+        return {}
+
+
+def _files(path: Path) -> list[Path]:
+    return [file for file in path.iterdir() if not file.name.startswith(".")] if path.is_dir() else []
+
+
+def _key(settings: Mapping[str, Any]) -> str:
+    return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """The first setting that differs, with both values, in a few words."""
+    for key in [*new, *(key for key in old if key not in new)]:
+        if old.get(key) != new.get(key):
+            there, here = (_short(values.get(key)) for values in (old, new))
+            return f"{key}: {there} there, {here} here"
+    return "another version"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,70 @@
+"""What a prediction command does: which images of which sequence, and where their predictions go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from semstab.config import DatasetConfig, FrameSelection
+from semstab.datasets.selection import select_frames
+from semstab.errors import ConfigError
+from semstab.predict.sources import ImageFiles, ImageSequence, SceneImages, chosen, open_images
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One sequence: which of its images, and the folder above labels/, scores/ and regions/."""
+
+    sequence: ImageSequence
+    indices: list[int]
+    out: Path
+
+
+@runtime_checkable
+class InFolder(Protocol):
+    """A scene whose files lie in a folder, where its label maps are looked for."""
+
+    folder: Path
+
+
+def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
+    """Images by a pattern. Raises ConfigError without `out`, or where no image is selected."""
+    if out is None:
+        raise ConfigError("--images: predictions of single images need a place; name it with --out")
+    files = ImageFiles(pattern)
+    return Job(files, _some(frames.indices(len(files)), files), out)
+
+
+def scene_jobs(
+    dataset: DatasetConfig, scenes: Sequence[str] | None, frames: FrameSelection, out: Path | None
+) -> list[Job]:
+    """The scenes of a dataset; predictions go into the scene's own folder, into `out`, or of several into out/SCENE.
+
+    Raises ConfigError for a dataset without folders of its own where there is no `out`, and for a scene or frames that
+    are not there.
+    """
+    opened = open_images(dataset)
+    names = chosen(scenes, opened.scenes, dataset.name)
+    jobs = []
+    for name in names:
+        images = opened.images(name)
+        indices = _some(select_frames(images.scene(), frames), images)
+        jobs.append(Job(images, indices, _place(images, out if out is None or len(names) == 1 else out / name)))
+    return jobs
+
+
+def _place(images: SceneImages, out: Path | None) -> Path:
+    scene = images.scene()
+    if out is not None:
+        return out
+    if not isinstance(scene, InFolder):
+        raise ConfigError(f"{images.name}: has no folder of its own; say with --out where its predictions go")
+    return scene.folder
+
+
+def _some(indices: list[int], sequence: ImageSequence) -> list[int]:
+    if not indices:
+        raise ConfigError(f"{sequence.name}: the selection of frames leaves none of its {len(sequence)}; mend --frames")
+    return indices

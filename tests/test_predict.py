@@ -1,0 +1,662 @@
+"""Models over sequences: what is left on disk, what is kept, what is refused; and predictions inside a run."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import predicted_scene
+import pytest
+import yaml
+from PIL import Image
+
+from semstab.backbones import Prediction, create
+from semstab.config import Config, DatasetConfig, FrameSelection
+from semstab.datasets import open_dataset
+from semstab.datasets.images import read_labels
+from semstab.errors import ConfigError, DataError
+from semstab.labels import LabelSpace
+from semstab.metrics import matched_region_flicker
+from semstab.pipeline import run
+from semstab.predict import (
+    ImageFiles,
+    PredictionObserver,
+    PredictorConfig,
+    SequenceOptions,
+    load_predictor,
+    open_images,
+    parse_predictor,
+    predict_sequence,
+    predicted_config,
+)
+from semstab.predict.jobs import file_job, scene_jobs
+from semstab.warp import warp
+
+COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return predicted_scene.write(tmp_path / "flight")
+
+
+def images_of(folder: Path, **options):
+    dataset = open_images(DatasetConfig(name="posed_folder", options={"root": str(folder), **options}))
+    return dataset.images(dataset.scenes[0])
+
+
+def clusters(**options):
+    return create("colour-clusters", **{**CLUSTERS, **options})
+
+
+def predict(folder: Path, backbone=None, indices=range(6), out=None, observers=(), **options):
+    options = SequenceOptions(**{"name": "clusters", **options})
+    return predict_sequence(images_of(folder), backbone or clusters(), indices, out or folder, options, observers)
+
+
+def manifest(folder: Path) -> dict:
+    return json.loads((folder / "predictions.json").read_text())
+
+
+class Shifting:
+    """A backbone with known output: the label is the column modulo 3; scores say so; it counts what it sees."""
+
+    label_space = LabelSpace("thirds", ("a", "b", "c"))
+    gives_scores = True
+    fit_frames = 0
+
+    def __init__(self, setting=1, fails_at=None):
+        self.setting = setting
+        self.fails_at = fails_at
+        self.seen = []
+
+    def fit(self, images):
+        return self
+
+    def predict(self, images, *, scores=False):
+        self.seen.append(len(images))
+        if self.fails_at is not None and sum(self.seen) > self.fails_at:
+            raise DataError("out of paint")
+        labels = np.tile((np.arange(images[0].shape[1]) % 3).astype(np.uint8), (images[0].shape[0], 1))
+        soft = np.eye(3, dtype=np.float32)[labels] if scores else None
+        return [Prediction(labels, soft)] * len(images)
+
+    def identity(self):
+        return {"setting": self.setting}
+
+
+# --- What is left on disk ---------------------------------------------------------------------------------------------
+
+
+def test_labels_lie_where_a_run_reads_them(scene):
+    report = predict(scene)
+    assert (report.predicted, report.kept, report.sequence) == (6, 0, "flight")
+    assert report.folders == (scene / "labels" / "clusters",)
+    opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    assert opened.backbones == ("clusters",)
+    assert opened.label_space("clusters").classes == ("cluster 0", "cluster 1", "cluster 2", "cluster 3")
+    fitted = clusters().fit([predicted_scene.image(k) for k in range(2)])
+    for k in range(6):
+        expected = fitted.predict([predicted_scene.image(k)])[0].labels
+        np.testing.assert_array_equal(opened.frame(k, "clusters").labels, expected)
+
+
+def test_scores_lie_beside_them(scene):
+    report = predict(scene, scores=True, indices=[3])
+    assert report.folders == (scene / "labels" / "clusters", scene / "scores" / "clusters")
+    opened = open_dataset("posed_folder", {"root": scene, "incomplete": "skip"}).scene("flight")
+    frame = opened.frame(0, "clusters-scores")
+    assert frame.scores.dtype == np.float16
+    assert opened.label_space("clusters-scores") == opened.label_space("clusters")
+    fitted = clusters().fit([predicted_scene.image(k) for k in range(2)])
+    (expected,) = fitted.predict([predicted_scene.image(3)], scores=True)
+    np.testing.assert_allclose(frame.scores, expected.scores, atol=1e-3)
+    np.testing.assert_array_equal(opened.frame(0, "clusters").labels, expected.labels)
+
+
+def test_scores_in_full_precision(scene):
+    predict(scene, Shifting(), scores=True, indices=[0], score_type="float32")
+    with np.load(scene / "scores/clusters/000.npz") as file:
+        assert file["scores"].dtype == np.float32
+        assert file["scores"].shape == (3, 48, 80)
+
+
+def test_the_manifest_says_what_the_maps_depend_on(scene):
+    predict(scene, batch=2, command=["semstab-bench", "predict"])
+    said = manifest(scene / "labels/clusters")
+    assert said["settings"]["clusters"] == 4
+    assert said["command"] == ["semstab-bench", "predict"]
+    assert said["packages"]["numpy"] == np.__version__
+    assert sorted(said["frames"]) == [f"{k:03d}" for k in range(6)]
+    assert len({frame["image"] for frame in said["frames"].values()}) == 6
+
+
+def test_the_first_frames_of_the_sequence_make_the_codebook_whatever_is_selected(scene, tmp_path):
+    predict(scene, indices=[4, 5], out=tmp_path / "some")
+    predict(scene, out=tmp_path / "all")
+    a, b = (read_labels(tmp_path / out / "labels/clusters/005.png") for out in ("some", "all"))
+    np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(("batch", "sizes"), [(1, [1] * 6), (4, [4, 2]), (10, [6])])
+def test_batches(scene, batch, sizes):
+    backbone = Shifting()
+    predict(scene, backbone, batch=batch)
+    assert backbone.seen == sizes
+
+
+def test_a_batch_has_images_of_one_size(tmp_path):
+    for k, width in enumerate((8, 8, 9, 9, 9, 8)):
+        Image.fromarray(np.zeros((6, width, 3), dtype=np.uint8)).save(tmp_path / f"{k}.png")
+    backbone = Shifting()
+    predict_sequence(ImageFiles(str(tmp_path / "*.png")), backbone, range(6), tmp_path, SequenceOptions("x", batch=4))
+    assert backbone.seen == [2, 3, 1]
+    assert read_labels(tmp_path / "labels/x/2.png").shape == (6, 9)
+
+
+# --- Going on, and not mixing -----------------------------------------------------------------------------------------
+
+
+def test_finished_frames_are_kept(scene):
+    predict(scene, Shifting(), indices=range(4))
+    backbone = Shifting()
+    report = predict(scene, backbone)
+    assert (report.predicted, report.kept, backbone.seen) == (2, 4, [1, 1])
+
+
+def test_what_was_finished_before_an_error_is_kept(scene):
+    with pytest.raises(DataError, match="out of paint"):
+        predict(scene, Shifting(fails_at=3))
+    assert sorted(manifest(scene / "labels/clusters")["frames"]) == ["000", "001", "002"]
+    assert (predict(scene, Shifting()).predicted, len(list((scene / "labels/clusters").glob("*.png")))) == (3, 6)
+
+
+def test_an_image_that_changed_is_predicted_again(scene):
+    predict(scene, Shifting())
+    Image.fromarray(predicted_scene.image(2, seed=9)).save(scene / "color/002.png")
+    assert (predict(scene, Shifting()).predicted, predict(scene, Shifting()).predicted) == (1, 0)
+
+
+def test_a_map_that_was_deleted_is_predicted_again(scene):
+    predict(scene, Shifting())
+    (scene / "labels/clusters/004.png").unlink()
+    assert predict(scene, Shifting()).predicted == 1
+
+
+def test_scores_that_are_wanted_later_are_predicted(scene):
+    predict(scene, Shifting())
+    report = predict(scene, Shifting(), scores=True)
+    assert (report.predicted, report.kept) == (6, 0)
+
+
+def test_other_settings_do_not_mix(scene):
+    predict(scene, Shifting(setting=1), indices=[0, 1, 2])
+    message = (
+        r"labels/clusters: holds predictions with other settings \(setting: 1 there, 2 here\); choose another --name"
+    )
+    with pytest.raises(ConfigError, match=message):
+        predict(scene, Shifting(setting=2), indices=[0])
+    assert len(list((scene / "labels/clusters").glob("*.png"))) == 3
+    predict(scene, Shifting(setting=2), indices=[0], overwrite=True)
+    assert [file.name for file in (scene / "labels/clusters").glob("*.png")] == ["000.png"]
+
+
+def test_another_codebook_is_another_setting(scene):
+    predict(scene)
+    Image.fromarray(predicted_scene.image(0, seed=9)).save(scene / "color/000.png")
+    with pytest.raises(ConfigError, match=r"other settings \(codebook: "):
+        predict(scene)
+
+
+def test_maps_of_others_are_not_touched(scene):
+    (scene / "labels/clusters").mkdir(parents=True)
+    (scene / "labels/clusters/000.png").write_bytes(b"theirs")
+    with pytest.raises(ConfigError, match="holds maps that were not predicted here; choose another --name"):
+        predict(scene, overwrite=True)
+    assert (scene / "labels/clusters/000.png").read_bytes() == b"theirs"
+
+
+def test_a_damaged_manifest_is_said(scene):
+    predict(scene)
+    (scene / "labels/clusters/predictions.json").write_text("[]")
+    with pytest.raises(DataError, match="no manifest of predictions; delete the folder"):
+        predict(scene)
+
+
+def test_observers_see_every_frame(scene):
+    class Counter(PredictionObserver):
+        def __init__(self):
+            self.said = []
+
+        def sequence_started(self, name, frames):
+            self.said.append((name, frames))
+
+        def frame_done(self, kept):
+            self.said.append(kept)
+
+    predict(scene, Shifting(), indices=[0, 2])
+    counter = Counter()
+    predict(scene, Shifting(), indices=range(3), observers=[counter])
+    assert counter.said == [("flight", 3), True, False, True]
+
+
+# --- Images -----------------------------------------------------------------------------------------------------------
+
+
+def test_image_files_come_in_natural_order(tmp_path):
+    for name in ("b2.png", "b10.png", "a.jpg", "note.txt"):
+        Image.fromarray(np.zeros((4, 5, 3), dtype=np.uint8)).save(
+            tmp_path / name, format="PNG" if "png" in name else "JPEG"
+        )
+    files = ImageFiles(str(tmp_path / "*"))
+    assert [files.image_name(k) for k in range(len(files))] == ["a", "b2", "b10"]
+    assert files.image(0).shape == (4, 5, 3)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"), [((), "no image of .png"), (("x/1.png", "y/1.png"), "has the same name")]
+)
+def test_image_files_that_cannot_be_used(tmp_path, names, message):
+    for name in names:
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match=message):
+        ImageFiles(str(tmp_path / "**/*.png"))
+
+
+def test_image_files_need_a_place_for_their_predictions(tmp_path):
+    with pytest.raises(ConfigError, match="name it with --out"):
+        file_job("*.png", FrameSelection(), None)
+
+
+def test_predictions_of_a_larger_image_have_the_depths_pixels(tmp_path):
+    folder = predicted_scene.write(tmp_path / "small", depth_scale=2)
+    predict(folder, Shifting(), indices=[0], scores=True)
+    labels = read_labels(folder / "labels/clusters/000.png")
+    assert labels.shape == (24, 40)
+    columns = np.arange(80) % 3
+    assert all(labels[0, x] in (columns[2 * x], columns[2 * x + 1]) for x in range(40))
+    with np.load(folder / "scores/clusters/000.npz") as file:
+        scores = file["scores"]
+    assert scores.shape == (3, 24, 40)
+    halves = (np.eye(3)[columns[0::2]] + np.eye(3)[columns[1::2]]) / 2
+    np.testing.assert_allclose(scores[:, 5], halves.T, atol=1e-3)
+
+
+def test_an_image_of_another_view_is_refused(scene):
+    Image.fromarray(np.zeros((48, 60, 3), dtype=np.uint8)).save(scene / "color/001.png")
+    with pytest.raises(DataError, match=r"color/001.png: the image is 60x48 but depth is 80x48, another view"):
+        predict(scene, Shifting(), indices=[1])
+
+
+def test_frames_without_colour_are_named(scene):
+    (scene / "color/003.png").unlink()
+    with pytest.raises(DataError, match=r"1 missing: .*color/003.png; add them, or set incomplete: skip"):
+        images_of(scene)
+    assert len(images_of(scene, incomplete="skip")) == 5
+
+
+def test_label_maps_that_are_incomplete_do_not_matter(scene):
+    predict(scene, Shifting(), indices=[0], name="other")
+    assert len(images_of(scene)) == 6
+
+
+def test_scenes_of_other_datasets(tmp_path):
+    city = DatasetConfig(name="city", options={"width": 64, "height": 36, "frames": 2})
+    with pytest.raises(ConfigError, match="scene0: has no folder of its own; say with --out"):
+        scene_jobs(city, ["scene0"], FrameSelection(), None)
+    jobs = scene_jobs(city, ["scene0", "scene1"], FrameSelection(), tmp_path)
+    assert [job.out for job in jobs] == [tmp_path / "scene0", tmp_path / "scene1"]
+    (job,) = scene_jobs(city, ["scene0"], FrameSelection(stop=1), tmp_path)
+    assert (job.out, job.indices) == (tmp_path, [0])
+    predict_sequence(job.sequence, Shifting(), job.indices, job.out, SequenceOptions("x"))
+    assert read_labels(tmp_path / "labels/x/000000.png").shape == (36, 64)
+    with pytest.raises(ConfigError, match="no scene 'scene9'; there is scene0"):
+        scene_jobs(city, ["scene9"], FrameSelection(), tmp_path)
+    with pytest.raises(ConfigError, match="leaves none of its 2"):
+        scene_jobs(city, ["scene0"], FrameSelection(start=5), tmp_path)
+
+
+def test_readers_of_other_formats_show_their_images_without_labels(tmp_path, scene):
+    """The same flight as DeepVideoMVS writes it, with depth of half the size."""
+    flight = tmp_path / "dvmvs" / "flight"
+    for part in ("images", "depth"):
+        (flight / part).mkdir(parents=True)
+    small = predicted_scene.write(tmp_path / "small", depth_scale=2)
+    poses = [np.loadtxt(file).ravel() for file in sorted((scene / "pose").iterdir())]
+    np.savetxt(flight / "poses.txt", poses)
+    np.savetxt(flight / "K.txt", np.loadtxt(small / "intrinsics.txt"))
+    for k in range(6):
+        (flight / f"images/{k:03d}.png").write_bytes((scene / f"color/{k:03d}.png").read_bytes())
+        (flight / f"depth/{k:03d}.png").write_bytes((small / f"depth/{k:03d}.png").read_bytes())
+    dataset = DatasetConfig(name="hololens", options={"root": str(tmp_path / "dvmvs")})
+    (job,) = scene_jobs(dataset, None, FrameSelection(), None)
+    predict_sequence(job.sequence, Shifting(), job.indices, job.out, SequenceOptions("thirds"))
+    assert read_labels(flight / "labels/thirds/003.png").shape == (48, 80)
+    opened = open_dataset("hololens", dataset.options)
+    stored = opened.scene(opened.scenes[0])
+    assert stored.label_space("thirds").classes == ("a", "b", "c")
+    live = job.sequence.predicted(3, labels=Shifting().predict([predicted_scene.image(3)])[0].labels)
+    np.testing.assert_array_equal(live.labels, stored.frame(3, "thirds").labels)
+    assert live.labels.shape == (24, 40)
+
+
+# --- Regions without classes ------------------------------------------------------------------------------------------
+
+
+class Tiles(Shifting):
+    """Regions of 16 columns that stay on the wall while the camera moves 2 pixels a frame."""
+
+    label_space = None
+    gives_scores = False
+
+    def predict(self, images, *, scores=False):
+        frames = {predicted_scene.image(k).tobytes(): k for k in range(6)}
+        shifts = [2 * frames[image.tobytes()] for image in images]
+        return [Prediction(np.tile(((np.arange(80) + s) // 16 + 1).astype(np.uint16), (48, 1))) for s in shifts]
+
+
+def test_regions_are_not_labels_and_come_with_their_changes(scene):
+    report = predict(scene, Tiles())
+    assert report.folders == (scene / "regions" / "clusters",)
+    assert not (scene / "labels").exists()
+    regions = [read_labels(scene / f"regions/clusters/{k:03d}.png") for k in range(6)]
+    assert regions[0].dtype == np.uint16
+    plain = [matched_region_flicker(a, b) for a, b in itertools.pairwise(regions)]
+    assert report.regions.plain == tuple(plain)
+    assert report.regions.flicker_percent == pytest.approx(np.mean([change.flicker_percent for change in plain]))
+    assert report.regions.flicker_percent > 5
+    assert report.regions.compensated_flicker_percent == 0  # the regions stay on the wall
+    rows = list(csv.DictReader((scene / "regions/clusters/changes.csv").read_text().splitlines()))
+    assert len(rows) == 10
+    assert (rows[0]["kind"], rows[0]["previous"], rows[0]["frame"]) == ("plain", "000", "001")
+    assert float(rows[0]["flicker_percent"]) == pytest.approx(plain[0].flicker_percent)
+
+
+def test_region_changes_with_camera_motion_taken_out(scene):
+    predict(scene, Tiles(), indices=[0, 3])
+    report = predict(scene, Tiles(), indices=[0, 3])
+    assert report.kept == 2
+    images = images_of(scene)
+    a, b = (images.predicted(k, labels=read_labels(scene / f"regions/clusters/{k:03d}.png")) for k in (0, 3))
+    brought, visible = warp(a.labels, a, b)
+    assert report.regions.compensated == (matched_region_flicker(brought, b.labels, visible),)
+    assert visible.mean() == pytest.approx(1 - 6 / 80)
+
+
+def test_regions_of_single_images_have_no_camera(scene, tmp_path):
+    files = ImageFiles(str(scene / "color/*.png"))
+    report = predict_sequence(files, Tiles(), range(3), tmp_path, SequenceOptions("tiles"))
+    assert len(report.regions.plain) == 2
+    assert report.regions.compensated == ()
+    assert np.isnan(report.regions.compensated_flicker_percent)
+
+
+# --- What is asked for ------------------------------------------------------------------------------------------------
+
+
+def test_a_predictor_in_one_word():
+    found = parse_predictor("segformer,model=models/b0,image_size=[512, 896],name=b0,scores=true,taxonomy=uavid3")
+    assert (found.backbone, found.label_name, found.scores, found.taxonomy) == ("segformer", "b0", True, "uavid3")
+    assert found.options == {"model": "models/b0", "image_size": [512, 896]}
+    assert parse_predictor("colour-clusters").label_name == "colour-clusters"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("segformer,model", "'model' has no '='"),
+        ("segformer,name=a/b", "name: it names a folder"),
+        ("segformer,name=gt", "name: it names a folder"),
+        ("segformer,mapping=lenient", "mapping: lenient needs a taxonomy"),
+        ("segformer,mapping=loose,taxonomy=uavid3", "mapping: "),
+    ],
+)
+def test_predictors_that_cannot_be_used(text, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_predictor(text)
+
+
+def test_scores_of_a_backbone_without_any_are_refused(monkeypatch):
+    monkeypatch.setattr("semstab.predict.predictor.create", lambda name, **options: Tiles())
+    with pytest.raises(ConfigError, match="'x' gives labels, no scores"):
+        load_predictor(PredictorConfig(backbone="x", scores=True))
+
+
+def test_every_option_of_a_predictor_is_filled_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").mkdir()
+    found = PredictorConfig(backbone="segformer", options={"model": "weights"}).resolved()
+    assert found.options["model"] == str(tmp_path / "weights")
+    assert found.options["dtype"] == "float32"
+    with pytest.raises(ConfigError, match="unknown setting 'modle'; did you mean 'model'"):
+        PredictorConfig(backbone="segformer", options={"model": "x", "modle": "x"}).resolved()
+
+
+# --- Inside a run -----------------------------------------------------------------------------------------------------
+
+
+def live_config(scene: Path, *predictors: str, **overrides) -> Config:
+    dataset = {"name": "posed_folder", "options": {"root": str(scene)}}
+    settings = {"dataset": dataset, "voxel_size": 0.25, "backends": ["numba"], "check": None, **overrides}
+    return predicted_config([parse_predictor(text) for text in predictors], None, settings)
+
+
+PREDICTOR = "colour-clusters,clusters=4,samples=500,fit_frames=2"
+
+
+def test_model_to_voxels_is_the_same_as_by_way_of_the_disk(scene):
+    (live,) = run(live_config(scene, PREDICTOR)).runs
+    before = sorted(path for path in scene.rglob("*"))
+    predict(scene, clusters())
+    dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
+    (stored,) = run(Config(dataset=dataset, voxel_size=0.25, check=None)).runs
+    assert live.unit.backbone == "colour-clusters"
+    assert live.table == stored.table
+    assert live.flicker_percent == stored.flicker_percent
+    assert not [path for path in before if "labels" in path.parts]
+
+
+def test_a_run_with_predictions_is_kept_and_reproduced(scene, tmp_path):
+    config = live_config(scene, PREDICTOR)
+    first = run(config, out=tmp_path / "run")
+    again = Config.build(yaml.safe_load((tmp_path / "run/config.yaml").read_text()))
+    assert run(again, out=tmp_path / "run").runs[0].table == first.runs[0].table
+    key = json.loads(next((tmp_path / "run/units").iterdir()).read_text())["key"]
+    Image.fromarray(predicted_scene.image(5, seed=9)).save(scene / "color/005.png")
+    run(config, out=tmp_path / "run")
+    assert json.loads(next((tmp_path / "run/units").iterdir()).read_text())["key"] != key
+
+
+def test_labels_and_scores_of_several_models(scene):
+    found = run(live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true", f"{PREDICTOR},seed=3,name=other"))
+    assert [unit.unit.backbone for unit in found.runs] == ["colour-clusters", "colour-clusters-scores", "other"]
+    hard, soft, _ = (unit.table for unit in found.runs)
+    assert soft.entropy > hard.entropy
+
+
+def test_the_ground_truth_stays_what_it_is(scene):
+    (scene / "scene.yaml").write_text("classes: [left, right]\n")
+    (scene / "labels/gt").mkdir(parents=True)
+    for k in range(6):
+        Image.fromarray(np.tile((np.arange(80) >= 40).astype(np.uint8), (48, 1))).save(scene / f"labels/gt/{k:03d}.png")
+    predicted = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options).scene("flight")
+    truth = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    np.testing.assert_array_equal(predicted.frame(2, "gt").labels, truth.frame(2, "gt").labels)
+    assert predicted.label_space("gt") == truth.label_space("gt")
+    assert predicted.digest([2], "gt") == truth.digest([2], "gt")
+    assert (predicted.backbones, predicted.ground_truth, len(predicted)) == (("colour-clusters",), True, 6)
+
+
+def test_the_digest_is_of_model_and_images(scene):
+    def digest(*predictors):
+        dataset = open_dataset("predicted", live_config(scene, *predictors).dataset.options)
+        opened = dataset.scene("flight")
+        return opened.digest([0, 1], opened.backbones[0])
+
+    usual = digest(PREDICTOR)
+    assert digest(PREDICTOR) == usual
+    assert digest(f"{PREDICTOR},seed=3") != usual
+    assert digest(f"{PREDICTOR},scores=true") != usual
+    opened = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options).scene("flight")
+    opened.frame(0, "colour-clusters")
+    opened.frame(1, "colour-clusters", color=False)
+    assert opened.digest([0, 1], "colour-clusters") == usual
+    np.savetxt(scene / "pose/001.txt", np.eye(4))
+    assert digest(PREDICTOR) != usual
+
+
+def test_frames_have_colour_where_it_is_wanted(scene):
+    opened = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options).scene("flight")
+    np.testing.assert_array_equal(opened.frame(1, "colour-clusters").color, predicted_scene.image(1))
+    assert opened.frame(1, "colour-clusters", color=False).color is None
+
+
+def test_a_frame_that_is_asked_for_again_is_predicted_once(scene, monkeypatch):
+    backbone = Shifting()
+    monkeypatch.setattr("semstab.predict.live.load_predictor", lambda config: backbone)
+    dataset = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options)
+    opened = dataset.scene("flight")
+    for index in (0, 1, 0, 1):
+        opened.frame(index, "colour-clusters")
+    assert len(backbone.seen) == 2
+    monkeypatch.setattr("semstab.predict.live.KEPT_BYTES", 48 * 80)
+    opened = dataset.scene("flight")
+    for index in (0, 1, 0, 1):
+        opened.frame(index, "colour-clusters")
+    assert len(backbone.seen) == 2 + 3
+
+
+def test_the_built_in_city_with_a_model():
+    settings = {"dataset": {"name": "city", "options": {"width": 64, "height": 36, "frames": 2}}}
+    config = predicted_config([parse_predictor(PREDICTOR)], None, {**settings, "scenes": ["scene0"], "check": None})
+    (found,) = run(config).runs
+    assert (found.unit.scene, found.unit.backbone, found.taxonomy) == ("scene0", "colour-clusters", "colour clusters")
+
+
+@pytest.mark.parametrize(
+    ("predictors", "message"),
+    [
+        ((PREDICTOR, PREDICTOR), "two backbones are called 'colour-clusters'; give one a name"),
+        (("colour-clusters,clusters=1",), "clusters: input should be greater"),
+        (("colourclusters",), "did you mean 'colour-clusters'"),
+    ],
+)
+def test_runs_that_cannot_predict(scene, predictors, message):
+    with pytest.raises(ConfigError, match=message):
+        run(live_config(scene, *predictors))
+
+
+def test_regions_cannot_be_fused(scene, monkeypatch):
+    monkeypatch.setattr("semstab.predict.live.load_predictor", lambda config: Tiles())
+    with pytest.raises(ConfigError, match="finds regions without classes, which cannot be fused"):
+        run(live_config(scene, PREDICTOR))
+
+
+# --- label_space.yaml -------------------------------------------------------------------------------------------------
+
+
+def test_each_backbone_of_a_posed_folder_can_have_classes_of_its_own(scene):
+    (scene / "scene.yaml").write_text("classes: [left, right]\n")
+    predict(scene, Shifting(), name="thirds")
+    (scene / "labels/plain").mkdir()
+    for k in range(6):
+        Image.fromarray(np.zeros((48, 80), dtype=np.uint8)).save(scene / f"labels/plain/{k:03d}.png")
+    opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    assert opened.label_space("thirds").classes == ("a", "b", "c")
+    assert opened.label_space("plain").classes == ("left", "right")
+    before = opened.digest([0], "thirds"), opened.digest([0], "plain")
+    space = LabelSpace("thirds", ("a", "b", "other"))
+    (scene / "labels/thirds/label_space.yaml").write_text(yaml.safe_dump(space.to_dict()))
+    opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    assert opened.digest([0], "thirds") != before[0]
+    assert opened.digest([0], "plain") == before[1]
+
+
+def test_a_damaged_label_space_is_named(scene):
+    predict(scene, Shifting(), name="thirds")
+    (scene / "labels/thirds/label_space.yaml").write_text("classes: 3")
+    with pytest.raises(ConfigError, match=r"labels/thirds/label_space.yaml: a taxonomy needs a list 'classes'"):
+        open_dataset("posed_folder", {"root": scene}).scene("flight").label_space("thirds")
+
+
+# --- The command line -------------------------------------------------------------------------------------------------
+
+
+def bench(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
+    words = [COMMAND, *map(str, arguments)]
+    return subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_predict_and_run_from_the_command_line(scene, tmp_path):
+    options = ("--set", "clusters=3", "--name", "three", "--frames", ":4")
+    result = bench("predict", "-m", "colour-clusters", "--data", scene, *options, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "flight: 4 frames predicted" in result.stdout
+    assert "frames/s (model" in result.stdout
+    command = next(line for line in result.stdout.splitlines() if line.startswith("fuse them: "))
+    words = command.removeprefix("fuse them: semstab-bench ").split()
+    result = bench(*words, "--rerun", "off", "--voxel-size", "0.25", "-q", "--out", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    runs = json.loads((tmp_path / "run/summary.json").read_text())["runs"]
+    assert {(unit["backbone"], unit["K"], unit["frames"]) for unit in runs} == {("three", 3, 4)}
+
+
+def test_run_with_a_model_from_the_command_line(scene, tmp_path):
+    arguments = ("--predict", "colour-clusters,clusters=3", "--data", scene, "--voxel-size", "0.25", "--rerun", "off")
+    result = bench(*arguments, "--out", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "agree" in result.stdout
+    assert not (scene / "labels").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-m", "colour-clusters"), "--images GLOB, or --data FOLDER, or --dataset NAME"),
+        (("-m", "colour-clusters", "--images", "*.png", "--data", "flight"), "--images GLOB, or --data FOLDER"),
+        (("-m", "colour-clusters", "--images", "*.png", "--out", "x"), "*.png: no image of .png"),
+        (("-m", "colour-clusters", "--data", "flight", "--model", "x"), "unknown setting 'model'"),
+        (
+            ("-m", "colour-clusters", "--data", "flight", "--image-size", "big"),
+            "--image-size big: write the shorter side",
+        ),
+        (("-m", "colour-clusters", "--data", "flight", "--name", ".."), "name: it names a folder"),
+        (("-m", "colour-clusters", "--data", "flight", "--set", "dataset.depth_skale=2"), "did you mean 'depth_scale'"),
+        (
+            ("-m", "segformer", "--data", "flight", "--model", "nowhere/at/all"),
+            "nowhere/at/all: there is no such folder",
+        ),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(scene, tmp_path, arguments, message):
+    result = bench("predict", *arguments, cwd=tmp_path)
+    assert result.returncode == 2, result.stderr
+    (line,) = result.stderr.strip().splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+
+
+def test_a_report_is_said_in_numbers():
+    from rich.console import Console
+
+    from semstab.predict.sequence import SequenceReport
+    from semstab.predict.terminal import print_report
+
+    report = SequenceReport("flight", (Path("labels/x"),), predicted=10, kept=2, model_seconds=2.0, seconds=4.0)
+    console = Console(record=True, width=100, file=io.StringIO())
+    print_report(report, console)
+    print_report(dataclasses.replace(report, predicted=0), console)
+    text = console.export_text()
+    assert "flight: 10 frames predicted, 2 kept from before, 2.50 frames/s (model 200 ms a frame)" in text
+    assert "flight: 0 frames predicted, 2 kept from before\n" in text
