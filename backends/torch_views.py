@@ -1,0 +1,175 @@
+"""What the torch backend fuses: a view (depth, camera and pose) and what backbones say of its pixels, as tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.utils.dlpack import from_dlpack
+
+from semstab.errors import DataError
+from semstab.frames import Frame, Intrinsics
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+
+INTEGERS = (torch.uint8, torch.uint16, torch.int8, torch.int16, torch.int32, torch.int64)
+
+Image = torch.Tensor | npt.NDArray[Any]
+"""An image as a tensor on any device, or as an array."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a backbone says of each pixel of a view: one of the three. A batch dimension of 1 is left away.
+
+    labels  (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative id,
+            and 255 (65535 where there are more classes than that)
+    scores  (K, H, W) float, non-negative; normalised per pixel, pixels without a finite positive sum left out
+    logits  (K, H, W) float, as models give them; softmax over the classes, in float32 unless they are float64
+
+    Raises DataError where none or several are given.
+    """
+
+    labels: Image | None = None
+    scores: Image | None = None
+    logits: Image | None = None
+
+    def __post_init__(self) -> None:
+        if len(self._given) != 1:
+            raise DataError(f"a prediction takes labels, scores or logits, one of them; got {self._given or 'none'}")
+
+    @property
+    def kind(self) -> str:
+        """'labels', 'scores' or 'logits'."""
+        return self._given[0]
+
+    @property
+    def image(self) -> Image:
+        """The one that is given."""
+        image: Image = getattr(self, self.kind)
+        return image
+
+    @property
+    def _given(self) -> list[str]:
+        return [name for name in ("labels", "scores", "logits") if getattr(self, name) is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A depth image on the device, with its camera.
+
+    depth   (H, W) float32, contiguous, metres along the optical axis
+    camera  a frame of one empty pixel, or the whole frame: index, intrinsics, pose, and the names of files
+    """
+
+    depth: torch.Tensor
+    camera: Frame
+
+    @classmethod
+    def of(cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device) -> View:
+        """A view of a depth image on any device, copied where it is elsewhere. Raises DataError as Frame does."""
+        if isinstance(T_wc, torch.Tensor):
+            T_wc = T_wc.detach().cpu().numpy()
+        no_depth, no_label = np.zeros((1, 1), dtype=np.float32), np.zeros((1, 1), dtype=np.uint8)
+        pose = np.asarray(T_wc, dtype=np.float64)
+        camera = Frame(index=index, depth=no_depth, labels=no_label, intrinsics=intrinsics, T_wc=pose)
+        image = without_batch(on_device(depth, device), dimensions=2)
+        if image.ndim != 2 or image.numel() == 0:
+            raise DataError(f"{camera.where('depth')}: depth must be (H, W), got shape {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise DataError(
+                f"{camera.where('depth')}: depth is {_type(image)}; convert it to metres (float32) with its depth scale"
+            )
+        return cls(image.to(torch.float32).contiguous(), camera)
+
+    @classmethod
+    def of_frame(cls, frame: Frame, device: torch.device) -> View:
+        """The view of a frame, which is valid already."""
+        return cls(on_device(frame.depth, device), frame)
+
+    @cached_property
+    def rays(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """(u - cx) / fx of each column and (v - cy) / fy of each row."""
+        v, u = (np.arange(size, dtype=np.float64) for size in self.depth.shape)
+        K = self.camera.intrinsics
+        return (u - K.cx) / K.fx, (v - K.cy) / K.fy
+
+    def frame(self, usable: torch.Tensor) -> Frame:
+        """The view as a frame in memory, in which the pixels (H, W) that are usable have the label 0."""
+        labels = torch.where(usable, 0, IGNORE_8BIT).to(torch.uint8)
+        return dataclasses.replace(
+            self.camera, depth=self.depth.cpu().numpy(), labels=labels.cpu().numpy(), scores=None, color=None
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Class ids of a view's P pixels: (P,) integers; `ignore` is one of them that means none, as all below 0 do."""
+
+    ids: torch.Tensor
+    ignore: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Class scores of a view's P pixels, (K, P) of any strides; `softmax` says that they are logits."""
+
+    values: torch.Tensor
+    softmax: bool
+
+
+def evidence_of(prediction: Prediction, view: View, num_classes: int, where: str) -> Labels | Scores:
+    """What a backbone says of the view's pixels, on the view's device; `where` is what an error calls it.
+
+    Raises DataError where the image does not fit the depth image, or is of a wrong type.
+    """
+    kind, device = prediction.kind, view.depth.device
+    image = without_batch(on_device(prediction.image, device), dimensions=2 if kind == "labels" else 3)
+    layout = "(H, W)" if kind == "labels" else "(K, H, W)"
+    fits = image.dtype in INTEGERS if kind == "labels" else image.is_floating_point()
+    if not fits or image.ndim != len(layout.split(",")):
+        wanted = "integers" if kind == "labels" else "float"
+        raise DataError(f"{where}: {kind} must be {wanted} {layout}, got {_type(image)} of shape {tuple(image.shape)}")
+    if image.shape[-2:] != view.depth.shape:
+        (H, W), (h, w) = view.depth.shape, image.shape[-2:]
+        raise DataError(f"{where}: {kind} are {w}x{h} but depth is {W}x{H}; bring them to one size")
+    if kind == "labels":
+        return Labels(image.reshape(-1), _ignored_id(image.dtype, num_classes))
+    return Scores(image.reshape(len(image), -1), softmax=kind == "logits")
+
+
+def evidence_of_frame(frame: Frame, device: torch.device) -> Labels | Scores:
+    """What a frame's labels or scores say of its pixels."""
+    if frame.labels is not None:
+        return Labels(on_device(frame.labels, device).reshape(-1), frame.ignore_id)
+    assert frame.scores is not None
+    scores = on_device(frame.scores, device)
+    return Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)
+
+
+def on_device(image: Image, device: torch.device) -> torch.Tensor:
+    """The image as a tensor on that device; one that is there already, or an array where that is memory, is shared."""
+    if isinstance(image, torch.Tensor):
+        return image.detach().to(device)
+    return from_dlpack(np.ascontiguousarray(image)).to(device)  # unlike from_numpy it takes read-only arrays
+
+
+def without_batch(image: torch.Tensor, dimensions: int) -> torch.Tensor:
+    """The image without a leading batch dimension of 1."""
+    return image[0] if image.ndim == dimensions + 1 and len(image) == 1 else image
+
+
+def _ignored_id(dtype: torch.dtype, num_classes: int) -> int:
+    if dtype == torch.uint8:
+        return IGNORE_8BIT
+    if dtype == torch.uint16 or num_classes > IGNORE_8BIT:
+        return IGNORE_16BIT
+    return IGNORE_8BIT
+
+
+def _type(image: torch.Tensor) -> str:
+    return str(image.dtype).removeprefix("torch.")

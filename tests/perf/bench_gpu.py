@@ -1,0 +1,203 @@
+"""Time of one frame through backend `torch`, its input on the device already, beside the floor and the CPU backends.
+
+    python tests/perf/bench_gpu.py [--json FILE] [--device CUDA:0] [--sizes 3840x2160] [--classes 7 20]
+                                   [--voxels 1000000 20000000] [--rounds 50] [--logits float16]
+
+The map grows by one view fused at ever new places; then places chosen at random are fused again, as ids, as logits, and
+as ids of three backbones at once. Medians of `rounds` frames by CUDA events, after a warm-up. The floor is the bytes
+that must move (depth, ids or logits, and the rows of the touched voxels, read and written) over the bandwidth of a copy
+on the device. At the end the maps of torch and numba are compared, voxel by voxel.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.metadata
+import logging
+from collections.abc import Callable
+from statistics import median
+from typing import Any
+
+import flight
+import numpy as np
+import torch
+
+import semstab
+from semstab import backends
+from semstab.backends.torch_map import TorchMap, TorchMaps
+from semstab.backends.torch_storage import Columns
+from semstab.backends.torch_views import Prediction
+from semstab.files import write_json
+from semstab.metrics import compare
+from semstab.results import Unit
+
+VOXEL_SIZE, APART, WARM_UP, BACKBONES = 0.2, 200.0, 5, 3
+
+
+@dataclasses.dataclass
+class Case:
+    """A view on the device: its frame, and what is fused of it at a place."""
+
+    frame: semstab.Frame
+    depth: torch.Tensor
+    ids: torch.Tensor
+    logits: torch.Tensor
+
+    @classmethod
+    def of(cls, frame: semstab.Frame, K: int, dtype: torch.dtype, device: torch.device) -> Case:
+        """Logits that favour the frame's labels."""
+        ids = torch.tensor(frame.labels, device=device)
+        logits = torch.empty((K, *frame.shape), dtype=dtype, device=device)
+        for k in range(K):
+            logits[k] = torch.randn(frame.shape, device=device) + 4 * (ids == k)
+        return cls(frame, torch.tensor(frame.depth, device=device), ids, logits)
+
+    def view(self, place: int) -> tuple[torch.Tensor, semstab.Intrinsics, np.ndarray[Any, Any]]:
+        """Depth and camera, moved by a whole number of voxels."""
+        T_wc = np.array(self.frame.T_wc)
+        T_wc[:2, 3] += APART * (place % 100), APART * (place // 100)
+        return self.depth, self.frame.intrinsics, T_wc
+
+
+def seconds(work: Callable[[int], Any], places: list[int], device: torch.device) -> float:
+    """Median time of `work` at these places, after a warm-up: by events on a CUDA device, else by the clock."""
+    times = []
+    warm_up = places[:WARM_UP]
+    for place in [*warm_up, *places]:
+        if device.type != "cuda":
+            times.append(flight.milliseconds(work, place) / 1e3)
+            continue
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        start.record()
+        work(place)
+        end.record()
+        end.synchronize()
+        times.append(start.elapsed_time(end) / 1e3)
+    return median(times[len(warm_up) :])
+
+
+def copy_bandwidth(device: torch.device, megabytes: int) -> float:
+    """Bytes a second, read and written, of a copy on the device: the best of several."""
+    source = torch.ones(megabytes * 2**18, dtype=torch.float32, device=device)
+    target = torch.empty_like(source)
+    best = min(seconds(lambda _: target.copy_(source), [0] * WARM_UP, device) for _ in range(3))
+    return 2 * source.numel() * source.element_size() / best
+
+
+def measure(case: Case, K: int, voxels: int, kernels: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of the table for one map: ids, logits, and ids of several backbones on a map of the first size."""
+    backend = TorchMap(VOXEL_SIZE, K, device=arguments.device, kernels=kernels, reserve=voxels + voxels // 5)
+    places = seen = 0
+    while seen < voxels:
+        report = backend.integrate_tensors(*case.view(places), index=places, labels=case.ids)
+        seen, touched = report.map_voxels, report.voxels
+        places += 1
+    visits = np.random.default_rng(0).integers(0, places, arguments.rounds).tolist()
+    row_bytes = Columns(K, torch.float64, torch.device("cpu")).row_bytes
+    of_rows, pixels = 2 * touched * row_bytes, case.depth.numel()
+
+    def fuse(place: int, **said: torch.Tensor) -> None:
+        backend.integrate_tensors(*case.view(place), index=place, **said)
+
+    several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:BACKBONES], K), device=arguments.device, kernels=kernels)
+
+    def fuse_several(place: int) -> None:
+        said = {name: Prediction(labels=case.ids) for name in "abc"[:BACKBONES]}
+        several.integrate_tensors(*case.view(place % 4), said, index=place)
+
+    works: dict[str, tuple[Callable[[int], None], int]] = {
+        "ids": (lambda place: fuse(place, labels=case.ids), pixels * 5 + of_rows),
+        f"{arguments.logits} logits": (
+            lambda place: fuse(place, logits=case.logits),
+            pixels * (4 + K * case.logits.element_size()) + of_rows,
+        ),
+    }
+    if voxels == min(arguments.voxels):
+        works[f"ids x{BACKBONES}"] = (fuse_several, pixels * (4 + BACKBONES) + BACKBONES * of_rows)
+    return [
+        {"voxels": seen, "input": name, "seconds": seconds(work, visits, backend.device), "bytes": size}
+        for name, (work, size) in works.items()
+    ]
+
+
+def on_the_cpu(frame: semstab.Frame, K: int, name: str, rounds: int) -> dict[str, Any]:
+    """The row of another backend: the median time of a frame that it has seen before."""
+    backend = backends.create(name, voxel_size=VOXEL_SIZE, num_classes=K)
+    voxels = backend.integrate(frame).map_voxels
+    times = [flight.milliseconds(backend.integrate, frame) for _ in range(rounds)]
+    return {"voxels": voxels, "input": "ids", "seconds": median(times) / 1e3, "bytes": None}
+
+
+def agreement(K: int, size: tuple[int, int], arguments: argparse.Namespace) -> bool:
+    """Whether torch and numba leave the same map of four frames."""
+    tables = []
+    for name, options in (("torch", {"device": arguments.device}), ("numba", {})):
+        backend = backends.create(name, voxel_size=VOXEL_SIZE, num_classes=K, **options)
+        for index in range(4):
+            backend.integrate(flight.frame(index, *size, K))
+        tables.append(backend.table())
+    units = (Unit("flight", "", "torch"), Unit("flight", "", "numba"))
+    return compare(tables[0], tables[1], units).agrees
+
+
+def version(package: str) -> str:
+    """The version of a package, or 'none'."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "none"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", help="also write the figures there")
+    parser.add_argument("--device", default="CUDA:0" if torch.cuda.is_available() else "CPU:0")
+    parser.add_argument("--kernels", nargs="+", help="torch, triton; both where Triton runs")
+    parser.add_argument("--sizes", nargs="+", default=["3840x2160"])
+    parser.add_argument("--classes", nargs="+", type=int, default=[7, 20])
+    parser.add_argument("--voxels", nargs="+", type=int, default=[1_000_000, 20_000_000])
+    parser.add_argument("--rounds", type=int, default=50)
+    parser.add_argument("--logits", choices=["float16", "bfloat16", "float32"], default="float16")
+    parser.add_argument("--cpu-backends", nargs="*", default=["numba", "open3d"])
+    parser.add_argument("--copied-megabytes", type=int, default=1024)
+    arguments = parser.parse_args()
+    logging.getLogger("semstab").setLevel(logging.ERROR)
+    device = TorchMap(VOXEL_SIZE, 2, device=arguments.device).device
+    on_cuda = device.type == "cuda"
+    kernels = arguments.kernels or (["triton", "torch"] if on_cuda and version("triton") != "none" else ["torch"])
+    bandwidth = copy_bandwidth(device, arguments.copied_megabytes)
+    name = torch.cuda.get_device_name(device) if on_cuda else "CPU"
+    print(f"{name}, torch {torch.__version__}, triton {version('triton')}; a copy moves {bandwidth / 1e9:.0f} GB/s")
+    print(f"{'size':>10} {'K':>4} {'voxels':>12}  {'input':<16} {'by':<8} {'ms':>9} {'floor ms':>9} {'ratio':>7}")
+    rows = []
+
+    def say(size: str, K: int, row: dict[str, Any], by: str) -> None:
+        floor = row["bytes"] / bandwidth if row["bytes"] else None
+        rows.append(row | {"size": size, "K": K, "by": by, "floor_seconds": floor})
+        beside = f"{1e3 * floor:9.3f} {row['seconds'] / floor:6.1f}x" if floor else ""
+        line = (
+            f"{size:>10} {K:>4} {row['voxels']:>12,}  {row['input']:<16} {by:<8} {1e3 * row['seconds']:9.3f} {beside}"
+        )
+        print(line.rstrip(), flush=True)
+
+    for size in arguments.sizes:
+        width, height = map(int, size.split("x"))
+        for K in arguments.classes:
+            case = Case.of(flight.frame(0, width, height, K), K, getattr(torch, arguments.logits), device)
+            for voxels in arguments.voxels:
+                for by in kernels:
+                    for row in measure(case, K, voxels, by, arguments):
+                        say(size, K, row, by)
+            for by in arguments.cpu_backends:
+                say(size, K, on_the_cpu(case.frame, K, by, min(arguments.rounds, 10)), by)
+    agrees = agreement(arguments.classes[0], (width, height), arguments)
+    print(f"torch and numba {'agree' if agrees else 'DISAGREE'}")
+    if arguments.json:
+        about = {"device": name, "torch": torch.__version__, "triton": version("triton")}
+        write_json(arguments.json, about | {"copy_bytes_per_second": bandwidth, "agrees": agrees, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
