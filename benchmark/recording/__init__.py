@@ -1,0 +1,21 @@
+"""The rerun recording of a run, written while it goes on. Only this package imports rerun.
+
+Entities, all below the scene's name:
+
+camera, camera/color                    Transform3D and Pinhole, EncodedImage (JPEG)
+camera/BACKBONE/labels, .../drift       SegmentationImage: classes; drift that the frame caused at each pixel's voxel
+depth, trajectory                       EncodedDepthImage, LineStrips3D
+map/BACKBONE/BACKEND/MEASURE/CHUNK      VoxelGridMap: class, vss, sbd, entropy, op, category
+series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
+flips/BACKBONE/voxel N                  StateChange: the dominant class of the voxels that drifted most
+flips_report/BACKBONE, flips_at/...     TextDocument: the frames that caused each flip; Points3D: where those voxels are
+difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
+legend, log                             Points2D: the classes and their colours; TextLog: each unit's final numbers
+"""
+
+from semstab.recording.observer import Recording
+from semstab.recording.series import SERIES
+from semstab.recording.target import Target
+from semstab.recording.voxel_maps import MEASURES
+
+__all__ = ["MEASURES", "SERIES", "Recording", "Target"]

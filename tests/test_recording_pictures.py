@@ -1,0 +1,372 @@
+"""The recording's pictures, flips, growing maps and comparisons, against what was fused, computed another way."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+import tiny_scene
+from test_recording import config_of, grid, notes, read, series, verify
+
+import semstab
+from semstab import backends, metrics
+from semstab.backends.numba_hash import NumbaHash
+from semstab.errors import ConfigError
+from semstab.frames import Frame, Intrinsics
+from semstab.labels import LabelSpace
+from semstab.metrics import compensated_flicker
+from semstab.plan import load_config, make_plan
+from semstab.plan import read as read_frame
+from semstab.recording import Recording, Target, camera, flips, voxel_maps
+from semstab.recording.entities import Clock
+from semstab.recording.flips import FlipLog
+from semstab.recording.tracker import Tracker
+
+CLASSES = LabelSpace("abc", ("a", "b", "c"))
+
+
+def config_with(root: Path, *names: str) -> Any:
+    return config_of(root).model_copy(
+        update={"backends": load_config(overrides={"backends": list(names)}).backends, "check": None}
+    )
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A run of one backbone with colour, through two backends that differ by design."""
+    folder = tmp_path_factory.mktemp("compared")
+    root = tiny_scene.write(folder / "data" / "wall", backbones=("a",))
+    (root / "color").mkdir()
+    for i in range(tiny_scene.FRAMES):
+        picture = np.full((8 * tiny_scene.HEIGHT, 8 * tiny_scene.WIDTH, 3), (10, 20, 200), np.uint8)
+        cv2.imwrite(str(root / "color" / f"{i:04d}.jpg"), picture)
+    config = config_with(root, "numba", "open3d-projective")
+    out = folder / "run"
+    semstab.run(config, out=out, observers=[Recording(out / "recording.rrd", run=out)])
+    return config, out
+
+
+def frames_of(config: Any) -> list[Frame]:
+    (task,) = make_plan(config).tasks
+    return [read_frame(task, index) for index in task.indices]
+
+
+def image(row: dict[str, Any], kind: str) -> np.ndarray:
+    W, H = row[f"{kind}:format"][0]["width"], row[f"{kind}:format"][0]["height"]
+    return np.frombuffer(bytes(row[f"{kind}:buffer"][0]), np.uint8).reshape(H, W)
+
+
+def test_the_drift_picture_is_the_drift_of_the_pixels_voxel(compared) -> None:
+    config, out = compared
+    rows = [row for row in read(out / "recording.rrd")["/wall/camera/a/drift"] if "SegmentationImage:buffer" in row]
+    reference = backends.create("numpy", voxel_size=0.25, num_classes=3)
+    for frame, row in zip(frames_of(config), rows, strict=True):
+        before = {tuple(index): drift for index, drift in zip(*state(reference.table()), strict=True)}
+        reference.integrate(frame)
+        after = {tuple(index): drift for index, drift in zip(*state(reference.table()), strict=True)}
+        shown = image(row, "SegmentationImage")
+        v, u = np.mgrid[: frame.shape[0], : frame.shape[1]]
+        K, T = frame.intrinsics, frame.T_wc
+        points = (
+            np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(frame.shape)], axis=-1) * frame.depth[..., None]
+        )
+        voxels = np.floor((points @ T[:3, :3].T + T[:3, 3]) / 0.25).astype(int)
+        for at in np.ndindex(*frame.shape):
+            voxel = tuple(voxels[at])
+            assert shown[at] == level(after[voxel] - before[voxel] if voxel in before else None)
+
+
+def state(table: semstab.VoxelTable) -> tuple[list[list[int]], list[float]]:
+    return table.index.tolist(), table.drift_sum.tolist()
+
+
+def level(drift: float | None) -> int:
+    """By the definition of the levels: the k-th begins at SBD_MAX (k / LEVELS)^2."""
+    if drift is None:
+        return camera.FIRST_SEEN
+    if drift < 1e-9:
+        return camera.NO_DRIFT
+    return camera.NO_DRIFT + 1 + min(int(camera.LEVELS * (drift / voxel_maps.SBD_MAX) ** 0.5 + 1e-9), camera.LEVELS - 1)
+
+
+def test_labels_camera_and_colour_are_those_of_the_frames(compared) -> None:
+    config, out = compared
+    rows = read(out / "recording.rrd")
+    labels = [row for row in rows["/wall/camera/a/labels"] if "SegmentationImage:buffer" in row]
+    poses = [row for row in rows["/wall/camera"] if "Transform3D:translation" in row]
+    colors = [row for row in rows["/wall/camera/color"] if "EncodedImage:blob" in row]
+    depths = [row for row in rows["/wall/depth"] if "EncodedDepthImage:blob" in row]
+    for frame, label, pose, color, depth in zip(frames_of(config), labels, poses, colors, depths, strict=True):
+        assert {row["frame"] for row in (label, pose, color, depth)} == {frame.index}
+        np.testing.assert_array_equal(image(label, "SegmentationImage"), frame.labels)
+        np.testing.assert_allclose(pose["Transform3D:translation"][0], frame.T_wc[:3, 3], rtol=1e-6)
+        decoded = cv2.imdecode(np.frombuffer(bytes(color["EncodedImage:blob"][0]), np.uint8), cv2.IMREAD_COLOR)
+        assert decoded.shape[:2] == frame.shape
+        np.testing.assert_allclose(decoded.mean(axis=(0, 1)), (10, 20, 200), atol=4)
+        units = cv2.imdecode(np.frombuffer(bytes(depth["EncodedDepthImage:blob"][0]), np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(units / depth["EncodedDepthImage:meter"][0], frame.depth[::2, ::2], atol=1e-3)
+
+
+def test_compensated_flicker_is_that_of_the_metric(compared) -> None:
+    config, out = compared
+    frames = frames_of(config)
+    expected = {b.index: compensated_flicker(a, b).flicker_percent for a, b in itertools.pairwise(frames)}
+    assert series(read(out / "recording.rrd"), "/wall/series/compensated_flicker/a") == expected
+
+
+def test_backends_that_differ_are_laid_over_each_other(compared) -> None:
+    _, out = compared
+    rows = read(out / "recording.rrd")
+    first, second = (
+        semstab.VoxelTable.load(out / "voxels" / f"wall__a__{name}.parquet") for name in ("numba", "open3d-projective")
+    )
+    a, b = ({tuple(index) for index in table.index.tolist()} for table in (first, second))
+    shown = {
+        part: {tuple(index) for row in rows[rf"/wall/difference/a/numba\ and\ open3d-projective/{part}"]
+               for index in row["VoxelGridMap:voxel_indices"]}
+        for part in ("only_first", "only_second", "changed")
+    }  # fmt: skip
+    assert shown["only_first"] == a - b
+    assert shown["only_second"] == b - a
+    vss = [dict(zip(map(tuple, t.index.tolist()), metrics.vss(t), strict=True)) for t in (first, second)]
+    assert shown["changed"] == {voxel for voxel in a & b if abs(vss[0][voxel] - vss[1][voxel]) > 1e-9}
+    assert any("numba and open3d-projective" in note for note in notes(rows))
+    np.testing.assert_array_equal(grid(rows, "/wall/map/a/open3d-projective/op")["values"], second.op)
+
+
+# From here on frames are made by hand.
+
+
+def frame(index: int, labels: np.ndarray, files: dict[str, str] | None = None) -> Frame:
+    depth = np.full(labels.shape, 2.0, dtype=np.float32)
+    T_wc = np.eye(4)
+    T_wc[:3, 3] = 0.01
+    H, W = labels.shape
+    camera_ = Intrinsics(8.0, 8.0, W / 2, H / 2)
+    return Frame(index, depth, camera_, T_wc, labels=labels.astype(np.uint8), files=files or {})
+
+
+@pytest.mark.parametrize("evidence", ["float64", "float32"])
+def test_what_numba_says_of_a_frame_is_what_happened(evidence) -> None:
+    rng = np.random.default_rng(5)
+    reference = backends.create("numpy", voxel_size=0.5, num_classes=4)
+    fused = NumbaHash(voxel_size=0.5, num_classes=4, evidence=evidence)
+    for index in range(5):
+        view = frame(index, rng.integers(0, 4, (10, 14)))
+        old = {tuple(i): (d, k) for i, d, k in described(reference.table())}
+        reference.integrate(view)
+        assert fused.integrate(view).fused_into is fused
+        new = {tuple(i): (d, k) for i, d, k in described(reference.table())}
+        changes = fused.changes
+        assert len(changes.row) == len(new)
+        for voxel, drift, before, after in zip(
+            fused.index_of(changes.row).tolist(), changes.drift, changes.before, changes.after, strict=True
+        ):
+            assert after == new[tuple(voxel)][1]
+            if tuple(voxel) in old:
+                assert before == old[tuple(voxel)][1]
+                assert drift == pytest.approx(new[tuple(voxel)][0] - old[tuple(voxel)][0], abs=1e-6)
+            else:
+                assert np.isnan(drift)
+                assert before == after
+
+
+def described(table: semstab.VoxelTable) -> list[tuple[list[int], float, int]]:
+    return list(zip(table.index.tolist(), table.drift_sum.tolist(), metrics.dominant(table).tolist(), strict=True))
+
+
+def test_rows_at_finds_the_voxel_of_every_pixel() -> None:
+    fused = NumbaHash(voxel_size=0.5, num_classes=4)
+    labels = np.random.default_rng(1).integers(0, 4, (9, 12))
+    labels[0, :3] = 255
+    view = frame(0, labels)
+    assert (fused.rows_at(view) == -1).all()
+    fused.integrate(view)
+    rows = fused.rows_at(view)
+    np.testing.assert_array_equal(rows == -1, ~view.valid)
+    np.testing.assert_array_equal(fused.rows_at(view, 3), rows[::3, ::3])
+    counted = np.bincount(rows[rows >= 0], minlength=len(fused))
+    by_row = {tuple(i): n for i, n in zip(fused.index_of(np.arange(len(fused))).tolist(), counted, strict=True)}
+    table = fused.table()
+    assert by_row == {tuple(i): n for i, n in zip(table.index.tolist(), table.pixels.tolist(), strict=True)}
+
+
+def alternating(count: int) -> list[Frame]:
+    """One voxel's class alternates from frame to frame; the others stay."""
+    views = []
+    for index in range(count):
+        labels = np.zeros((6, 8))
+        labels[2:4, 2:4] = 1 if index % 2 else 2
+        views.append(frame(index, labels, {"labels": f"somewhere/{index:03d}.png"}))
+    return views
+
+
+def tracked(views: list[Frame]) -> tuple[Tracker, FlipLog]:
+    tracker, log = Tracker(1.0, 3), FlipLog()
+    for view in views:
+        tracker.integrate(view)
+        tracker.note()
+        log.update(tracker, view)
+    return tracker, log
+
+
+def test_the_voxel_that_flickers_is_the_first_suspect_with_the_frames_to_blame(tmp_path) -> None:
+    tracker, log = tracked(alternating(6))
+    suspects = list(log.suspects(tracker))
+    table = tracker.map.table()
+    worst = suspects[0]
+    np.testing.assert_allclose(worst.center, table.centers[table.drift_sum.argmax()])
+    assert worst.bits == pytest.approx(table.drift_sum.max(), rel=1e-6)
+    assert [s.bits for s in suspects] == sorted((s.bits for s in suspects), reverse=True)
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "flips.rrd")
+    log.log(stream, "s", "net", suspects, CLASSES, np.zeros(3), Clock())
+    stream.flush()
+    stream.disconnect()
+    verify(tmp_path / "flips.rrd")
+    rows = read(tmp_path / "flips.rrd")
+    reference = backends.create("numpy", voxel_size=1.0, num_classes=3)
+    expected = {}
+    for view in alternating(6):  # the lane has a state where the reference's dominant class changes
+        reference.integrate(view)
+        now = reference.table()
+        (row,) = np.flatnonzero((np.abs(now.centers - worst.center) < 1e-6).all(axis=1))
+        name = CLASSES.classes[metrics.dominant(now)[row]]
+        if name != next(reversed(expected.values()), None):
+            expected[view.index] = name
+    lane = {row["frame"]: row["StateChange:state"][0] for row in rows[r"/s/flips/net/voxel\ 1"] if "frame" in row}
+    assert lane == expected
+    (report,) = (row["TextDocument:text"][0] for row in rows["/s/flips_report/net"])
+    for index in list(expected)[1:]:
+        assert f"frame {index} ({index:03d}.png)" in report
+
+
+def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -> None:
+    tracker, log = tracked(alternating(12))
+    monkeypatch.setattr(flips, "MAX_FLIPS", 12)
+    tracker_bounded, bounded = tracked(alternating(12))
+    kept = sum(len(part) for part in bounded._parts)
+    assert kept <= 12
+    first, second = (next(each.suspects(t)) for each, t in ((log, tracker), (bounded, tracker_bounded)))
+    np.testing.assert_array_equal(first.center, second.center)
+
+
+def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(voxel_maps, "BUDGET", 600)
+    monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 2000)
+    fused = NumbaHash(voxel_size=0.25, num_classes=3)
+    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "grown.rrd")
+    rng = np.random.default_rng(0)
+    for index in range(20):  # every voxel changes with every frame
+        stream.set_time("frame", sequence=index)
+        fused.integrate(frame(index, rng.integers(0, 3, (12, 16))))
+        growing.update(stream, fused)
+        assert growing.logged <= 600 * (index + 1) / 20
+    assert growing.logged > 300
+    growing.finish(stream, fused)
+    assert growing.logged <= 600 + len(fused)
+    stream.flush()
+    stream.disconnect()
+    rows = read(tmp_path / "grown.rrd")
+    logged = sum(
+        len(row["VoxelGridMap:voxel_indices"]) for at in rows for row in rows[at] if at.startswith("/map/vss/")
+    )
+    assert logged == growing.logged
+    np.testing.assert_allclose(grid(rows, "/map/vss")["values"], metrics.vss(fused.table()), rtol=1e-6)
+    np.testing.assert_array_equal(grid(rows, "/map/op")["voxel_indices"], fused.table().index)
+
+
+def test_a_killed_run_leaves_a_recording_that_optimize_makes_whole(tmp_path) -> None:
+    """Without its footer `verify` complains of that alone; `rerun rrd optimize` writes one."""
+    root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
+    path = tmp_path / "killed.rrd"
+    program = f"""
+import os, signal, time, semstab
+from semstab.pipeline import Observer
+from semstab.plan import load_config
+from semstab.recording import Recording
+class Killing(Observer):
+    def unit_finished(self, unit, table, summary):
+        time.sleep(1)
+        os.kill(os.getpid(), signal.SIGKILL)
+config = load_config(overrides={{"dataset": {{"name": "posed_folder", "options": {{"root": {str(root)!r}}}}},
+    "backends": ["numba"], "check": None, "voxel_size": 0.25}})
+semstab.run(config, observers=[Recording({str(path)!r}), Killing()])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGKILL
+    rerun = Path(sys.executable).with_name("rerun")
+    said = subprocess.run([rerun, "rrd", "verify", path], capture_output=True, text=True, check=False).stderr
+    assert "Missing RRD footer" in said
+    assert "1 errors" in said
+    whole = tmp_path / "whole.rrd"
+    subprocess.run([rerun, "rrd", "optimize", path, "-o", whole], capture_output=True, check=True)
+    verify(whole)
+    assert set(series(read(whole), "/wall/series/map_vss/a/numba")) == {0, 1, 2}
+
+
+# Where a recording goes.
+
+
+def test_what_rerun_may_say() -> None:
+    default = Path("run/recording.rrd")
+    assert Target.parse(None, default) == Target(default)
+    assert Target.parse("here.rrd", default) == Target(Path("here.rrd"))
+    assert Target.parse("spawn", default) == Target(default, "spawn")
+    assert Target.parse("serve", default) == Target(default, "serve")
+    url = "rerun+http://10.0.0.7:9876/proxy"
+    assert Target.parse(url, default) == Target.parse(f"connect {url}", default) == Target(default, url)
+    assert Target.parse("connect", default).viewer == "rerun+http://127.0.0.1:9876/proxy"
+    for wrong in ("spwan", "folder", "connect http://10.0.0.7", "rerun+http://10.0.0.7:9876"):
+        with pytest.raises(ConfigError, match="--rerun"):
+            Target.parse(wrong, default)
+
+
+def test_a_viewer_that_is_not_there_is_said_at_once(tmp_path) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+    target = Target(tmp_path / "x.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
+    with pytest.raises(ConfigError, match="no rerun viewer listens there"):
+        target.open()
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    saved = tmp_path / "received.rrd"
+    command = [Path(sys.executable).with_name("rerun"), "--port", str(port), "--save", saved]
+    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 20
+        while not listens(port) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        target = Target(tmp_path / "own.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
+        root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
+        semstab.run(config_with(root, "numba"), observers=[Recording(target)])
+        time.sleep(1)
+    finally:
+        viewer.send_signal(signal.SIGINT)
+        viewer.wait(20)
+    verify(tmp_path / "own.rrd")
+    expected = series(read(tmp_path / "own.rrd"), "/wall/series/map_vss/a/numba")
+    assert len(expected) == 3
+    assert saved.stat().st_size > 10_000
