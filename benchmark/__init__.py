@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from semstab import backbones, backends, datasets, metrics
+    from semstab import backbones, backends, datasets, metrics, statistics, study
     from semstab.config import Config
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
     from semstab.frames import Frame, Intrinsics
@@ -32,6 +32,8 @@ __all__ = [
     "datasets",
     "metrics",
     "run",
+    "statistics",
+    "study",
 ]
 
 _HOMES = {
@@ -51,7 +53,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import the public names when they are first used: `import semstab` stays instant."""
-    if name in ("backbones", "backends", "datasets", "metrics"):
+    if name in ("backbones", "backends", "datasets", "metrics", "statistics", "study"):
         return importlib.import_module(f"semstab.{name}")
     if name in _HOMES:
         value = getattr(importlib.import_module(f"semstab.{_HOMES[name]}"), name)
