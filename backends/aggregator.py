@@ -214,4 +214,5 @@ def _widened(scores: Any) -> Any:
 
 
 def _slots_for(entries: int) -> int:
-    return 1 << max(10, int(2 * entries - 1).bit_length())
+    """Slots of a hash table that doubles whenever more than half of it is taken, the last time for its last entry."""
+    return 1 << max(10, (2 * entries).bit_length())

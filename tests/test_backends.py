@@ -14,12 +14,14 @@ from hypothesis.extra import numpy as hnp
 from oracle import Oracle
 
 from semstab import backends
+from semstab.backends import aggregator
 from semstab.backends.numpy_reference import NumpyReference
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json
 from semstab.frames import Frame, Intrinsics
 from semstab.metrics import dominant, entropy, sbd, vss
 from semstab.testing import EXACT, SUMS, BackendConformance, checks, random_frames, sight_line, voxels
+from semstab.testing.builders import assert_same_map
 
 K = 3
 
@@ -296,3 +298,29 @@ def test_points_beyond_the_reach_are_refused_with_their_extent():
     with pytest.raises(DataError, match=r"frame 7 spans .* more than 2\^20 voxels of 0\.001 m .* use larger voxels"):
         backend.integrate(sight_line(7, [(0.5, 0), (5000.0, 1)]))
     assert len(backend.table()) == 1
+
+
+@pytest.mark.parametrize("entries", [1, 511, 512, 513, 1000, 1024, 4096, 8191, 8192, 8193])
+def test_the_table_of_a_band_never_outgrows_its_memory(entries):
+    mask = 1023
+    for n in range(1, entries + 1):  # as in kernels.find_entries
+        if 2 * n > mask:
+            mask = 2 * mask + 1
+    assert mask < aggregator._slots_for(entries)
+
+
+@pytest.mark.parametrize("columns", [1024, 1500])
+def test_a_band_in_which_every_pixel_is_a_voxel(columns):
+    """As many voxels as a band has room for at first, and more than that."""
+    rng = np.random.default_rng(5)
+    frame = Frame(
+        index=0,
+        depth=rng.uniform(1, 100, (8, columns)).astype(np.float32),
+        labels=rng.integers(0, 3, (8, columns)).astype(np.uint8),
+        intrinsics=Intrinsics(columns, columns, columns / 2, 4),
+        T_wc=np.eye(4),
+    )
+    reference, fast = (backends.create(name, voxel_size=0.01, num_classes=3) for name in ("numpy", "numba"))
+    for backend in (reference, fast):
+        assert backend.integrate(frame).voxels > 0.99 * frame.depth.size
+    assert_same_map(fast.table(), reference.table(), 1e-12)
