@@ -150,8 +150,9 @@ class TorchMaps:
         self._kernels: Any = kernels_for(kernels, self.device)
         self._associate = self._kernels.Associator()
         self._grid: Grid | None = None
-        self._map = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
-        self._map.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or FIRST_ROWS)
+        with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
+            self._map = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
+            self._map.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or FIRST_ROWS)
         self._totals = {name: _Totals() for name in num_classes}
 
     @property
@@ -173,20 +174,18 @@ class TorchMaps:
         Raises DataError, with all maps unchanged, where one of them cannot be fused, ConfigError for an unknown name.
         """
         started = time.perf_counter()
-        for name in predictions:
-            if name not in self._map.columns:
-                raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self._map.columns)}")
         view = View.of(depth, intrinsics, T_wc, index, self.device)
         said = {
-            name: evidence_of(of_name, view, self._map.columns[name].num_classes, _where(view, of_name.kind, name))
+            name: evidence_of(of_name, view, self._columns_of(name).num_classes, _where(view, of_name.kind, name))
             for name, of_name in predictions.items()
         }
         return self.fuse(view, said, started)
 
     def fuse(self, view: View, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
         """Fuse a view that is on the device, with what some backbones say of its pixels; timed from `started`."""
-        with torch.no_grad(), torch.cuda.device(self.device.index if self.device.index is not None else -1):
-            return self._fuse(view, said, started)  # Triton launches on the current device
+        on_device = torch.cuda.device(-1 if self.device.index is None else self.device.index)  # for Triton's launches
+        with torch.inference_mode(False), torch.no_grad(), on_device:
+            return self._fuse(view, said, started)
 
     def _fuse(self, view: View, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
         grid = self._grid or self._first_grid(view)
@@ -207,8 +206,8 @@ class TorchMaps:
         return {name: self._report(name, sums[name], view.camera.index, times) for name in said}
 
     def table(self, name: str) -> VoxelTable:
-        """The map of a backbone so far, brought to memory."""
-        columns = self._map.columns[name]
+        """The map of a backbone so far, brought to memory. Raises ConfigError for an unknown name."""
+        columns = self._columns_of(name)
         used = torch.nonzero(self._map.hash.keys != EMPTY)[:, 0]
         keys, order = torch.sort(self._map.hash.keys[used])  # packed keys sort like (ix, iy, iz)
         rows = self._map.hash.rows[used[order]].to(torch.int64)
@@ -217,6 +216,11 @@ class TorchMaps:
         values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES}
         values["evidence"] = values["evidence"].astype(np.float64, copy=False)
         return VoxelTable(**index_columns(self._index_of(keys.numpy())), **values, voxel_size=self.voxel_size)
+
+    def _columns_of(self, name: str) -> Columns:
+        if name not in self._map.columns:
+            raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self._map.columns)}")
+        return self._map.columns[name]
 
     def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: View) -> Evidence:
         K = self._map.columns[name].num_classes

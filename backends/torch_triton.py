@@ -13,7 +13,7 @@ import triton
 from semstab.backends import torch_eager
 from semstab.backends import torch_triton_kernels as kernels
 from semstab.backends.torch_eager import SUMS, Association, Evidence, camera_terms, camera_terms_single, score_scale
-from semstab.backends.torch_storage import Columns, Grid, VoxelHash
+from semstab.backends.torch_storage import EMPTY, Columns, Grid, VoxelHash
 from semstab.backends.torch_views import Labels, Scores, View
 
 FIRST_SLOTS = 1 << 19
@@ -49,7 +49,7 @@ class Associator:
         """The voxels of a view, in the order of the hash's slots, and the one of each pixel."""
         while True:
             key, table, overflow = self._insert(view, grid)
-            place = torch.ne(table, torch_eager.EMPTY).cumsum(dim=0, dtype=torch.int32)
+            place = torch.ne(table, EMPTY).cumsum(dim=0, dtype=torch.int32)
             voxels, lacks_room = torch.cat([place[-1:], overflow]).tolist()
             if not lacks_room:
                 break
@@ -62,7 +62,7 @@ class Associator:
         H, W = view.depth.shape
         device = view.depth.device
         key = torch.empty((H, W), dtype=torch.int64, device=device)
-        table = torch.full((self.slots,), torch_eager.EMPTY, dtype=torch.int64, device=device)
+        table = torch.full((self.slots,), EMPTY, dtype=torch.int64, device=device)
         overflow = torch.zeros(1, dtype=torch.int32, device=device)
         block = 256
         double = grid.dtype == torch.float64
@@ -107,7 +107,7 @@ def sum_scores(seen: Association, said: Scores, num_classes: int) -> Evidence:
     flags = seen.keys.new_zeros(3)
     classes = triton.next_power_of_2(num_classes)
     columns = max(32, min(128, 4096 // classes))
-    warps = max(4, classes * columns // 1024)  # a thread holds the scores of one pixel, 32 classes of them at most
+    warps = 4 if classes <= 32 else classes * columns // 512  # so that a thread holds one pixel, 32 classes at most
     kernels.add_scores[(triton.cdiv(W, columns), triton.cdiv(H, ROWS))](
         seen.voxel, said.values, said.values.stride(0), said.values.stride(1), sums, pixels, flags, H, W,
         n, scale, num_classes, said.softmax, double, ROWS, columns, classes, num_warps=warps, **SEPARATE,

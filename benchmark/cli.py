@@ -170,14 +170,12 @@ def study(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
-    from semstab.study import DaskCluster, InProcess, LocalProcesses, load_study
+    from semstab.study import load_study
 
     config = load_study(file, _overrides({}, settings or []))
     if only is not None:
         config = config.only(only)
-    if scheduler is not None and jobs > 1:
-        raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
-    executor = DaskCluster(scheduler) if scheduler is not None else LocalProcesses(jobs) if jobs > 1 else InProcess()
+    executor = _executor(jobs, scheduler)
     out = out or Path("studies") / config.name
     result = _study(config, out, executor, quiet)
     if result.failures:
@@ -374,6 +372,20 @@ def _run(config: Config, out: Path, rerun: str | None, quiet: bool) -> RunResult
         for observer in closing:
             observer.close()
     return result
+
+
+def _executor(jobs: int, scheduler: str | None) -> Executor:
+    import logging
+
+    from semstab.study import DaskCluster, InProcess, LocalProcesses
+
+    if scheduler is None:
+        return LocalProcesses(jobs) if jobs > 1 else InProcess()
+    if jobs > 1:
+        raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
+    cluster = DaskCluster(scheduler)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what becomes of a unit is said in one line
+    return cluster
 
 
 def _study(config: StudyConfig, out: Path, executor: Executor, quiet: bool) -> StudyResult:

@@ -104,6 +104,13 @@ class Tracked(Protocol):
         ...
 
 
+@runtime_checkable
+class Regional(Protocol):
+    """A scene that also has maps of regions without classes: `frame` reads them by name, nothing fuses them."""
+
+    regions: tuple[str, ...]
+
+
 class Dataset(Protocol):
     """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it."""
 

@@ -19,7 +19,7 @@ from semstab.datasets.cameras import Camera
 from semstab.datasets.colmap_depth import read_depth_map
 from semstab.datasets.file_options import FileOptions
 from semstab.datasets.images import Labels, read_color, read_depth, read_labels, read_mask, read_scores
-from semstab.datasets.label_source import LabelSource, ScenePlace, find_masks, find_sources, label_spaces
+from semstab.datasets.label_source import LabelSource, ScenePlace, find_masks, find_regions, find_sources, label_spaces
 from semstab.datasets.poses import Poses, to_camera_to_world
 from semstab.datasets.ray_depth import planar
 from semstab.datasets.resampling import fit_labels, fit_scores
@@ -87,7 +87,9 @@ class FileScene:
         self.options = options
         self._class_ids = class_ids or {}
         self._labels = find_sources(options, place, [frame.name for frame in frames])
+        self._regions = find_regions(options, place, [frame.name for frame in frames])
         self.backbones: tuple[str, ...] = tuple(name for name in self._labels if name != GROUND_TRUTH)
+        self.regions: tuple[str, ...] = tuple(name for name in self._regions if name not in self._labels)
         self.ground_truth: bool = GROUND_TRUTH in self._labels
         self.up: npt.NDArray[np.float64] | None = None
         if options.up_axis:
@@ -115,9 +117,12 @@ class FileScene:
     def label_space(self, backbone: str) -> LabelSpace:
         """The classes of that label source.
 
-        Raises DataError where neither classes nor taxonomy is set, ConfigError where there is no such source.
+        Raises DataError where neither classes nor taxonomy is set, ConfigError where there is no such source, or it
+        has none.
         """
         self._source(backbone)
+        if backbone in self.regions:
+            raise ConfigError(f"{self.folder}: '{backbone}' holds regions without classes, which cannot be fused")
         space = self._spaces[backbone]
         if space is None:
             raise DataError(
@@ -135,7 +140,7 @@ class FileScene:
         source = self._frame(index)
         depth = self.depth(index)
         labelled = self._label_file(source, backbone)
-        kind = self._labels[backbone].kind
+        kind = self._source(backbone).kind
         files = {"depth": source.depth, "pose": source.pose_file, kind: labelled}
         if source.color is not None and color:
             files["color"] = source.color
@@ -248,7 +253,7 @@ class FileScene:
         return data
 
     def _read_labels(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Labels:
-        labels = read_labels(path, self._spaces[backbone], self._read)
+        labels = read_labels(path, self._spaces.get(backbone), self._read)
         if backbone in self._class_ids:
             labels = _translated(labels, self._class_ids[backbone], path)
         if void := self.options.void_ids.get(backbone):
@@ -291,16 +296,17 @@ class FileScene:
         return label_spaces(self.options, self._labels)
 
     def _source(self, backbone: str) -> LabelSource:
-        if backbone not in self._labels:
-            hint = nearest(backbone, self._labels) if self._labels else "say where its label maps are: option labels"
+        known = {**self._regions, **self._labels}
+        if backbone not in known:
+            hint = nearest(backbone, known) if known else "say where its label maps are: option labels"
             raise ConfigError(f"{self.folder}: backbone '{backbone}' is not there; {hint}")
-        return self._labels[backbone]
+        return known[backbone]
 
     def _label_file(self, source: FrameSource, backbone: str) -> Path:
         labels = self._source(backbone)
-        if source.name not in labels.files:  # only of the ground truth: the other sources are complete
+        if source.name not in labels.files:  # only of the ground truth and of regions: the others are complete
             lost = [path for frame in self._frames for path in labels.missing(frame.name)]
-            raise DataError(f"{self.folder}: {listed(lost)}; choose frames that have ground truth, or add it")
+            raise DataError(f"{self.folder}: {listed(lost)}; choose frames that have them, or add them")
         return labels.files[source.name]
 
     def _frame(self, index: int) -> FrameSource:

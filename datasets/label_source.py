@@ -21,6 +21,7 @@ logger = logging.getLogger("semstab")
 Kind = Literal["labels", "scores"]
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES}
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
+REGIONS = "regions/{backbone}/{name}"
 SEPARATE = "{scene}/{backbone}/{name}"
 """The template of label maps in a folder of their own."""
 
@@ -79,6 +80,18 @@ def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) 
         source = _source("labels", place.folder, truth.filled(scene=place.below_root), names, folders)
         found |= {GROUND_TRUTH: source} if source.files else {}
     return found
+
+
+def find_regions(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> dict[str, LabelSource]:
+    """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none."""
+    folders = Folders()
+    base = place.folder if options.labels_root is None else options.labels_root
+    template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
+    found = {
+        backbone: _source("labels", base, filled, names, folders)
+        for backbone, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
+    }
+    return {backbone: source for backbone, source in found.items() if source.files}
 
 
 def find_masks(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> Mapping[str, Path]:

@@ -86,6 +86,7 @@ class PosedScene:
         self._intrinsics = read_intrinsics(folder / "intrinsics.txt")
         self._names = self._files.complete(options.incomplete, needs)
         self.backbones = tuple(self._files.sources)
+        self.regions = tuple(self._files.regions)
         self.ground_truth = self._files.ground_truth is not None
         up = self.settings.up_axis
         self._digests: dict[Path, bytes] = {}
@@ -99,8 +100,10 @@ class PosedScene:
     def label_space(self, backbone: str) -> LabelSpace:
         """The classes of the backbone's own label_space.yaml, else those of the scene.
 
-        Raises DataError where none of them says any, ConfigError where there is no such backbone.
+        Raises DataError where none of them says any, ConfigError where there is no such backbone, or it has none.
         """
+        if backbone in self.regions:
+            raise ConfigError(f"{self.folder}: '{backbone}' holds regions without classes, which cannot be fused")
         space = self._space_of(backbone)
         if space is None:
             raise DataError(
@@ -222,7 +225,8 @@ class PosedScene:
         """The classes of a backbone's label maps, None where nothing says them; its file is read once."""
         file = self._files.source(backbone).folder / LABEL_SPACE_FILE
         if backbone not in self._spaces:
-            self._spaces[backbone] = LabelSpace.load(file) if file.is_file() else self._space
+            shared = None if backbone in self.regions else self._space
+            self._spaces[backbone] = LabelSpace.load(file) if file.is_file() else shared
         return self._spaces[backbone]
 
     def _effective_settings(self, backbone: str) -> dict[str, Any]:
@@ -240,9 +244,9 @@ class PosedScene:
         """Depth, pose, labels or scores, and colour where there is any, by kind."""
         name = self._name(index)
         source = self._files.source(backbone)
-        if name not in source.files:  # only of the ground truth: the other sources are complete
+        if name not in source.files:  # only of the ground truth and of regions: the others are complete
             missing = [str(source.folder / f"{other}.png") for other in self._names if other not in source.files]
-            raise DataError(f"{self.folder}: {listed(missing)}; choose frames that have ground truth, or add it")
+            raise DataError(f"{self.folder}: {listed(missing)}; choose frames that have them, or add them")
         parts: list[FrameFiles] = [self._files.depth, self._files.pose, source, self._files.color, self._files.mask]
         return {part.kind: part.files[name] for part in parts if name in part.files}
 

@@ -66,12 +66,13 @@ class SceneFiles:
         self.color = FrameFiles.of("color", folder / "color")
         self.mask = FrameFiles.of("mask", folder / "mask")
         self.sources = _sources(folder)
+        self.regions = _regions(folder, self.sources)
         truth = folder / "labels" / GROUND_TRUTH
         self.ground_truth = FrameFiles.of("labels", truth) if truth.is_dir() else None
 
     def source(self, backbone: str) -> FrameFiles:
-        """The label maps or scores of a backbone. Raises ConfigError where there is none of that name."""
-        known = dict(self.sources)
+        """The label maps, scores or regions of a backbone. Raises ConfigError where there is none of that name."""
+        known = {**self.sources, **self.regions}
         if self.ground_truth is not None:
             known[GROUND_TRUTH] = self.ground_truth
         if backbone not in known:
@@ -125,6 +126,15 @@ def _sources(folder: Path) -> dict[str, FrameFiles]:
         if name != GROUND_TRUTH:
             sources[backbone] = FrameFiles.of("scores", scores / name)
     return sources
+
+
+def _regions(folder: Path, sources: Mapping[str, FrameFiles]) -> dict[str, FrameFiles]:
+    """regions/X is read under the name 'X'."""
+    regions = folder / "regions"
+    found = {name: FrameFiles.of("labels", regions / name) for name in subfolders(regions)}
+    if both := sorted({*found} & {*sources}):
+        raise DataError(f"{regions / both[0]}: {sources[both[0]].folder} is called '{both[0]}' too; rename one")
+    return found
 
 
 def listed(missing: list[str]) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 
+import dataset_writers
 import numpy as np
 import pytest
+from dataset_writers import FORMATS, source
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from room_scene import AXES, CAMERA, HEIGHT, RAY_LENGTH, WIDTH, Room, opened, rigid, turn, walk, write
@@ -141,6 +143,23 @@ def test_large_coordinates_do_not_matter():
     assert checked(Room(told_pose=lambda T: far @ T)).state == "sound"
     verdict = checked(Room(told_pose=lambda T: np.linalg.inv(far @ T)))
     assert quicker(verdict.mend) == ["pose_convention: world_to_camera"]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_wrong_option_of_any_dataset_is_taken_back(tmp_path, name):
+    """The formats differ in what their poses map and in axes; the advice is what each of them needs."""
+    form, other = FORMATS[name], {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
+    form.write(tmp_path / "data", source(form.scale))
+    right = dataset_writers.opened(form, tmp_path / "data").options
+    for option, wrong in (
+        ("pose_convention", other[right.pose_convention]),
+        ("camera_axes", "opengl" if right.camera_axes != "opengl" else "opencv"),
+        (None, None),
+    ):
+        scene = dataset_writers.opened(form, tmp_path / "data", **({option: wrong} if option else {}))
+        verdict = quick_check(scene, range(4), "net", scene.options.model_dump())
+        mend = () if option is None else (f"dataset.options.{option}: {getattr(right, option)}",)
+        assert (verdict.state, verdict.mend) == ("unsound" if option else "sound", mend)
 
 
 # --- what frames cannot tell

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import tiny_scene
 from PIL import Image
-from room_scene import AXES, CAMERA, CLASSES, RAY_LENGTH, Room, rigid, walk, write
+from room_scene import AXES, CAMERA, CLASSES, RAY_LENGTH, Room, opened, rigid, walk, write
 from typer.testing import CliRunner
 
 import semstab
-from semstab.check import check, check_scene
+from semstab.check import check, check_scene, quick_check
 from semstab.check.coverage import SIZES, plane_residuals
 from semstab.check.histogram import Tally
 from semstab.check.views import View
@@ -392,8 +392,6 @@ def test_what_cannot_be_told_does_not_stop_a_run(tmp_path):
 def test_depth_along_the_ray_gives_the_same_frames(tmp_path):
     rays = write(tmp_path / "rays", Room(walk(2), told_depth=lambda z: z * RAY_LENGTH), depth_kind="ray")
     planar = write(tmp_path / "planar", Room(walk(2)))
-    from room_scene import opened
-
     a, b = opened(rays), opened(planar)
     np.testing.assert_allclose(a.frame(1, "net").depth, b.frame(1, "net").depth, rtol=1e-6)
     assert a.frame(1, "net").depth.dtype == np.float32
@@ -405,36 +403,38 @@ def test_depth_along_the_ray_gives_the_same_frames(tmp_path):
 # --- real data
 
 
-def real(name, **options):
+def real(name) -> Path:
     if not (DATA / name).is_dir():
         pytest.skip(f"no {DATA / name}; set SEMSTAB_DATA to the folder that holds {name}/")
-    dataset = {"name": "posed_folder", "options": {"root": str(DATA / name), **options}}
-    (checked,) = check(resolve(load_config(None, {"dataset": dataset})))
-    return checked
+    return DATA / name
 
 
 @pytest.mark.parametrize(("name", "error"), [("apc_shelf", 0.007), ("hololens", 0.003)])
 def test_real_scenes_are_sound_with_the_errors_of_their_notes(name, error):
-    checked = real(name)
+    (checked,) = check(configured(real(name)))
     assert checked.problems == ()
     assert checked.overlaps[0].error == pytest.approx(error, abs=0.002)
     assert checked.verdict.undetermined == ()
 
 
-MISTAKES = {
-    "pose_convention": ("world_to_camera", "camera_to_world"),
-    "camera_axes": ("ned", "opencv"),
-    "depth_scale": (100, "1000"),
-    "depth_kind": ("ray", "planar"),
-}
-
-
 @pytest.mark.parametrize("name", ["apc_shelf", "hololens"])
-@pytest.mark.parametrize("setting", MISTAKES)
-def test_a_mistake_in_a_real_scene_is_named(name, setting):
-    wrong, right = MISTAKES[setting]
-    checked = real(name, **{setting: wrong})
-    assert checked.verdict.mend == (f"dataset.options.{setting}: {right}",)
+@pytest.mark.parametrize(
+    ("setting", "wrong", "right"),
+    [
+        ("pose_convention", "world_to_camera", "camera_to_world"),
+        ("camera_axes", "opengl", "opencv"),
+        ("camera_axes", "ned", "opencv"),
+        ("depth_scale", 100, "1000"),
+        ("depth_scale", 10_000, "1000"),
+        ("depth_scale", 1, "1000"),
+        ("depth_kind", "ray", "planar"),
+    ],
+)
+def test_a_mistake_in_a_real_scene_is_named(name, setting, wrong, right):
+    options = {setting: wrong}
+    scene = opened(real(name), **options)
+    verdict = quick_check(scene, range(len(scene)), "none", options)
+    assert verdict.mend == (f"dataset.options.{setting}: {right}",)
 
 
 def test_the_dictionary_is_plain_json(sound):

@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import dataset_writers
 import numpy as np
 import pytest
 import tiny_scene
+from dataset_writers import CLASSES as FORMAT_CLASSES
+from dataset_writers import FORMATS, source, write_labels
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -414,3 +417,20 @@ def test_a_damaged_source_is_one_line_and_leaves_nothing_half_written(tmp_path):
     assert "labels/b/0001.png: not a PNG image" in line
     assert not list((tmp_path / "out").rglob(".*"))
     assert len(list((tmp_path / "out/wall/labels/a").glob("*.png"))) == 3
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_voxels(tmp_path, name):
+    form = FORMATS[name]
+    frames = source(form.scale)
+    write_labels(tmp_path / "data", form.write(tmp_path / "data", frames), frames)
+    needed = {key: value() if callable(value) else value for key, value in form.options.items()}
+    config = configured(form.dataset, {"root": str(tmp_path / "data"), "classes": FORMAT_CLASSES, **needed})
+    (converted,) = convert(config, tmp_path / "out")
+    reader, scene = dataset_writers.opened(form, tmp_path / "data"), opened(converted.folder)
+    assert scene.backbones == reader.backbones == ("net",)
+    table = fused(scene, "net", 0.1)
+    assert len(table) > 500
+    assert_same_map(table, fused(reader, "net", 0.1), 0.0)
+    if form.scale is not None:
+        assert converted.depth == f"16-bit PNG, {form.scale:g} units a metre"

@@ -345,6 +345,12 @@ def test_readers_of_other_formats_show_their_images_without_labels(tmp_path, sce
     opened = open_dataset("hololens", dataset.options)
     stored = opened.scene(opened.scenes[0])
     assert stored.label_space("thirds").classes == ("a", "b", "c")
+    predict_sequence(job.sequence, Tiles(), job.indices, job.out, SequenceOptions("tiles"))
+    stored = open_dataset("hololens", dataset.options).scene(opened.scenes[0])
+    assert (stored.backbones, stored.regions) == (("thirds",), ("tiles",))
+    assert stored.frame(3, "tiles").labels[0, :8].tolist() == [1] * 5 + [2] * 3
+    with pytest.raises(ConfigError, match="'tiles' holds regions without classes"):
+        stored.label_space("tiles")
     live = job.sequence.predicted(3, labels=Shifting().predict([predicted_scene.image(3)])[0].labels)
     np.testing.assert_array_equal(live.labels, stored.frame(3, "thirds").labels)
     assert live.labels.shape == (24, 40)
@@ -391,6 +397,43 @@ def test_region_changes_with_camera_motion_taken_out(scene):
     brought, visible = warp(a.labels, a, b)
     assert report.regions.compensated == (matched_region_flicker(brought, b.labels, visible),)
     assert visible.mean() == pytest.approx(1 - 6 / 80)
+
+
+def test_regions_are_read_by_name_and_never_fused(scene):
+    predict(scene, Tiles(), name="tiles")
+    predict(scene, Shifting(), name="thirds")
+    opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    assert (opened.backbones, opened.regions) == (("thirds",), ("tiles",))
+    np.testing.assert_array_equal(opened.frame(2, "tiles").labels, read_labels(scene / "regions/tiles/002.png"))
+    with pytest.raises(ConfigError, match="'tiles' holds regions without classes, which cannot be fused"):
+        opened.label_space("tiles")
+    dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
+    (found,) = run(Config(dataset=dataset, voxel_size=0.25, check=None)).runs
+    assert found.unit.backbone == "thirds"
+    predict(scene, Shifting(), name="tiles")
+    with pytest.raises(DataError, match=r"regions/tiles: .*labels/tiles is called 'tiles' too; rename one"):
+        open_dataset("posed_folder", {"root": scene}).scene("flight")
+
+
+def test_regions_that_lack_frames_stop_nobody_else(scene):
+    predict(scene, Tiles(), name="tiles", indices=[0, 1])
+    predict(scene, Shifting(), name="thirds")
+    opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    assert len(opened) == 6
+    with pytest.raises(DataError, match=r"4 missing: .*regions/tiles/002.png.*choose frames that have them"):
+        opened.frame(2, "tiles")
+
+
+def test_a_study_measures_regions_by_name(scene):
+    from semstab.study import StudyConfig
+    from semstab.study.grid import make_grid
+
+    predict(scene, Tiles(), name="tiles")
+    predict(scene, Shifting(), name="thirds")
+    content = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "region_maps": ["tiles"]}
+    grid = make_grid(StudyConfig.build(content))
+    assert [cell.backbone for cell in grid.regions] == ["tiles"]
+    assert {cell.unit.backbone for cell in grid.cells} == {"thirds"}
 
 
 def test_regions_of_single_images_have_no_camera(scene, tmp_path):

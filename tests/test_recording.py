@@ -80,7 +80,9 @@ def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]
 def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
     """What the chunks of a map show at last, voxels sorted, by short component names."""
     last = [
-        max(reversed(found), key=lambda row: row["frame"]) for at, found in rows.items() if at.startswith(f"{path}/")
+        max(found, key=lambda row: (row["frame"], row["rerun.controls.RowId"]))
+        for at, found in rows.items()
+        if at.startswith(f"{path}/")
     ]
     shown_last = [row for row in last if "VoxelGridMap:voxel_indices" in row]  # others were cleared
     chunks = [{name.removeprefix("VoxelGridMap:"): value for name, value in row.items()} for row in shown_last]

@@ -123,6 +123,14 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
     assert summary(tmp_path / "tight") == summary(tmp_path / "whole")
 
 
+def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path) -> None:
+    config = configure(root, backends=[], sweeps={"pixel_stride": [8]}, memory_gb=0.00003)
+    result = run_study(config, tmp_path / "out")
+    assert {failure.variation.sweep for failure in result.failures} == {"base"}
+    assert "would take" in result.failures[0].message
+    assert [record.variation.sweep for record in result.records] == ["pixel_stride"] * 2
+
+
 def test_an_interrupted_study_goes_on_where_it_was(root, tmp_path) -> None:
     config, out = configure(root), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):

@@ -41,7 +41,7 @@ def expected(root, tmp_path):
 
 def children() -> set[int]:
     found = subprocess.run(
-        ["ps", "-o", "pid=,args=", "--ppid", str(os.getpid())], capture_output=True, text=True, check=False
+        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(os.getpid())], capture_output=True, text=True, check=False
     )
     return {int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line}
 

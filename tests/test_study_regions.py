@@ -62,6 +62,14 @@ def test_they_are_kept_and_computed_again_like_units(root, tmp_path) -> None:
     assert result.regions[0].compensated_flicker_percent > 0
 
 
+def test_settings_of_the_map_do_not_touch_them(root, tmp_path) -> None:
+    run_study(configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[]), tmp_path / "out")
+    other = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[], voxel_size=0.7, strata=[1])
+    counting = Counting()
+    run_study(other, tmp_path / "out", observers=[counting])
+    assert counting.computed == ["wall__a__numpy base None"]
+
+
 def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
     (root / "labels/regions/0002.png").write_bytes(b"no image")
     config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[])

@@ -41,7 +41,8 @@ WON_PAIRS = 0.8
 """An alternative must also be better in this share of the pairs of frames that both see, of those with ..."""
 
 PAIR_POINTS = 20
-"""... at least as many points seen again."""
+LEAST_PAIRS = 3
+"""... at least as many points seen again; where fewer pairs have, it must stand out from all others instead."""
 
 GOOD = 0.05
 """A convention with a larger error is not proposed, and as configured it is not called sound."""
@@ -254,7 +255,8 @@ class Judgement:
     def _is_confirmed(self, fit: Fit) -> bool:
         if fit.convention.factor != 1 and not self._scale_is_told(fit):
             return False
-        return self._wins_pairs(fit) if self.configured.has_evidence else self._stands_out(fit)
+        won = self._won_pairs(fit) if self.configured.has_evidence else []
+        return sum(won) >= WON_PAIRS * len(won) if len(won) >= LEAST_PAIRS else self._stands_out(fit)
 
     def _scale_is_told(self, fit: Fit) -> bool:
         """Whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
@@ -270,14 +272,13 @@ class Judgement:
         )
         return all(_one_hypothesis(fit, other) or self._moves_alike(fit, other) for other in same_depth)
 
-    def _wins_pairs(self, fit: Fit) -> bool:
-        """Whether the alternative is the better one pair by pair, too."""
+    def _won_pairs(self, fit: Fit) -> list[bool]:
+        """For each pair of frames where both see enough, whether the alternative has the lower error."""
         errors = [
             self.sample.errors(one.convention, np.array([one.convention.factor])) for one in (fit, self.configured)
         ]
         rows = [[(float(median_of_seen(e)[0]), int(np.isfinite(e).sum())) for e in es] for es in errors]
-        both = [(a, b) for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
-        return bool(both) and sum(a < b for a, b in both) >= WON_PAIRS * len(both)
+        return [a < b for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
 
     def _moves_alike(self, fit: Fit, other: Fit) -> bool:
         """Whether two conventions give the same motion between the frames; then they make the same map, but turned."""

@@ -46,7 +46,7 @@ LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
 
 QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
-"""The quick check looks at one place, and before it refuses data at so many."""
+"""The quick check looks at one place with so many points, and before it refuses data at so many places."""
 
 LABELLED_FRAMES = 8
 """Frames in which the labels of every backbone but the first are counted."""
@@ -161,7 +161,7 @@ def quick_check(
     sources = _cheap_sources(scene, backbone)
     verdict = Verdict("unclear", "it takes two frames to tell whether depth and poses agree")
     for count in (1, CONFIRMING_CLUSTERS):
-        look = Look(scene, indices, sources, clusters(len(indices), count), QUICK_POINTS, passing_over=True)
+        look = Look(scene, indices, sources, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
         if len(look.views) < 2:
             continue
         verdict = judge(look.sample(options or {}), look.reading(options or {}), thorough=False)

@@ -32,8 +32,8 @@ LEVELS = 24
 LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
 """Bits at which one level of drift ends and the next begins: finer where drift is small; the last one is open."""
 
-# Black, red, yellow, white: from the one to the next as a glowing body does it.
-GLOW = np.array([(60, 0, 0), (200, 20, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230)], dtype=np.float64)
+# Red, orange, yellow, white: what drifts lights up like a glowing body.
+GLOW = np.array([(150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230)], dtype=np.float64)
 
 
 def stride_of(shape: tuple[int, int]) -> int:
@@ -75,7 +75,7 @@ def label_context(classes: LabelSpace) -> rr.AnnotationContext:
 class Camera:
     """The camera of a scene: its pictures are logged once a frame, whichever backbones and backends fuse it."""
 
-    def __init__(self, scene: Scene, translation: npt.NDArray[np.float64]) -> None:
+    def __init__(self, scene: Scene, translation: npt.NDArray[np.floating[Any]]) -> None:
         self.scene = scene
         self.poses: list[npt.NDArray[np.float64]] = []
         """(4, 4) each, relative to the map's origin."""
@@ -178,7 +178,7 @@ def _decoded(data: bytes, reduction: int) -> npt.NDArray[np.uint8] | None:
         8: cv2.IMREAD_REDUCED_COLOR_8,
     }[max(step for step in (1, 2, 4, 8) if step <= max(reduction, 1))]  # fmt: skip
     try:
-        image: npt.NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         return None
-    return image
+    return None if image is None else np.asarray(image, dtype=np.uint8)

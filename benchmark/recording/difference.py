@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
@@ -32,7 +34,7 @@ def log_difference(
         "only_second": np.delete(second.index, in_second, axis=0),
         "changed": first.index[in_first[differs]],
     }
-    looks = {
+    looks: dict[str, dict[str, Any]] = {
         "only_first": {"colors": ONLY_FIRST},
         "only_second": {"colors": ONLY_SECOND},
         "changed": {"colormap": rr.components.Colormap.Inferno, "value_range": VSS_RANGE},
@@ -40,7 +42,7 @@ def log_difference(
     for part in DIFFERENCE:
         index = parts[part] - origin
         factor, rows = thinned(index)
-        values = {"values": change[differs][rows].astype(np.float32)} if part == "changed" else {}
+        values: dict[str, Any] = {"values": change[differs][rows].astype(np.float32)} if part == "changed" else {}
         cells = (index[rows] // factor).astype(np.int32)
         size = [first.voxel_size * factor] * 3
         stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **looks[part]))

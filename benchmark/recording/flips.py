@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -93,7 +94,7 @@ class FlipLog:
         backbone: str,
         suspects: list[Suspect],
         classes: LabelSpace,
-        translation: npt.NDArray[np.float64],
+        translation: npt.NDArray[np.floating[Any]],
         clock: Clock,
     ) -> None:
         """A lane with each suspect's dominant class, a line of text for each flip, and where the suspects are."""
@@ -110,9 +111,9 @@ class FlipLog:
         if suspects:
             at = np.array([suspect.center - translation for suspect in suspects])
             labels = [f"{suspect.number}" for suspect in suspects]
-            colors = [COLORS[k % len(COLORS)] for k in range(len(suspects))]
+            marks = [COLORS[k % len(COLORS)] for k in range(len(suspects))]
             radii = rr.Radius.ui_points([5.0] * len(suspects))
-            points = rr.Points3D(at, labels=labels, colors=colors, radii=radii, show_labels=True)
+            points = rr.Points3D(at, labels=labels, colors=marks, radii=radii, show_labels=True)
             stream.log(path(scene, "flips_at", backbone), points, static=True)
 
     def _log_state(self, stream: rr.RecordingStream, lane: str, frame: int, name: str, clock: Clock) -> None:

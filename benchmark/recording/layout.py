@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
+from semstab.labels import LabelSpace
 from semstab.plan import Plan, Task
 from semstab.recording.entities import path
 from semstab.recording.series import OF_THE_BACKBONE, SERIES, entity
@@ -26,10 +27,12 @@ EYE_DISTANCE = 0.55
 BACKGROUND = (72, 72, 78)
 """Of the maps: neither end of the colour maps vanishes in it."""
 
-LEGEND_COLUMNS = 7
 OVERVIEW = ("drift", "compensated_flicker", "map_vss", "map_recurrent")
 COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
 DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
+
+LEGEND_LETTERS = 90
+"""In a line of the legend."""
 
 MOST_LAID_OUT, TASK_COST, PAIR_COST = 480, 77, 60
 """Chunks of a blueprint: the most there may be, and those of a backbone on a scene and of a comparison, roughly.
@@ -65,6 +68,11 @@ def laid_out(plan: Plan) -> dict[str, list[Task]]:
     return scenes
 
 
+def legend_columns(classes: LabelSpace) -> int:
+    """How many names stand beside each other."""
+    return max(2, min(7, LEGEND_LETTERS // (max(map(len, classes.classes)) + 3)))
+
+
 def drawn(task: Task) -> str:
     """The backend whose map is drawn while it grows: the first that fuses as the recorder's tracker does."""
     alike = [name for name in task.backends if is_pointwise(name)]
@@ -92,8 +100,10 @@ def _scene(scene: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.
 
 def _overview(scene: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.Container:
     maps = rrb.Tabs(*(_maps(name, title, tasks, eye) for name, title in TITLES.items()))
-    rows = math.ceil(len(tasks[0].mapping.target) / LEGEND_COLUMNS)
-    bounds = rrb.VisualBounds2D(x_range=(-0.5, LEGEND_COLUMNS - 0.5), y_range=(-0.2, 0.5 * rows - 0.1))
+    classes = tasks[0].mapping.target
+    columns = legend_columns(classes)
+    rows = math.ceil(len(classes) / columns)
+    bounds = rrb.VisualBounds2D(x_range=(-0.5, columns - 0.5), y_range=(-0.2, 0.5 * rows - 0.1))
     legend = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
     left = rrb.Vertical(maps, legend, row_shares=[8, rows])
     top = rrb.Horizontal(left, _cameras(scene, tasks), column_shares=[5, 4])
@@ -136,7 +146,7 @@ def _camera_views(scene: str, task: Task) -> list[rrb.View]:
     color, labels = path(scene, "camera", "color"), path(scene, "camera", task.backbone, "labels")
     drift, flips = path(scene, "camera", task.backbone, "drift"), path(scene, "flips_at", task.backbone)
     origin = path(scene, "camera")
-    seen_through = {labels: rr.SegmentationImage.from_fields(opacity=0.6)}
+    seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
     return [
         rrb.Spatial2DView(
             origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.backbone}: labels"

@@ -24,10 +24,10 @@ from semstab.recording.camera import IMAGE_SIDE, Camera, drift_context, drift_le
 from semstab.recording.difference import log_difference
 from semstab.recording.entities import Clock, path
 from semstab.recording.flips import FlipLog
-from semstab.recording.layout import LEGEND_COLUMNS, blueprint, drawn, eye_on, is_pointwise, laid_out
+from semstab.recording.layout import blueprint, drawn, eye_on, is_pointwise, laid_out, legend_columns
 from semstab.recording.target import DEFAULT_URL, Target
 from semstab.recording.tracker import Tracker
-from semstab.recording.voxel_maps import MAX_VOXELS, GrowingMap
+from semstab.recording.voxel_maps import GrowingMap
 from semstab.results import GroupResult, RunResult, Unit, UnitSummary
 from semstab.run_folder import FrameRow
 from semstab.voxels import VoxelTable
@@ -250,13 +250,13 @@ class _Group:
     def _finish(self, stream: rr.RecordingStream, growing: GrowingMap, table: VoxelTable) -> str:
         """Log what is not drawn yet; where the tracker's map is not the unit's, the unit's in its place."""
         fused = self._tracker.map if self._previous is not None else None
-        if fused is not None and len(table) <= MAX_VOXELS and _same(fused.table(), table):
+        if fused is not None and growing.holds(len(table)) and _same(fused.table(), table):
             growing.finish(stream, fused)
             return ""
         return growing.replace(stream, table)
 
     def _log_pictures(self, stream: rr.RecordingStream, frame: Frame, stride: int) -> None:
-        labels = np.ascontiguousarray(frame.predicted[::stride, ::stride])
+        labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
         stream.log(f"{self._entity}/labels", rr.SegmentationImage(labels, draw_order=-10))
         step = _sampling(labels.shape)
         drift = drift_levels(*self._tracker.drift_at(frame, step * stride))
@@ -313,7 +313,8 @@ def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
 
 def _log_legend(stream: rr.RecordingStream, entity: str, space: LabelSpace) -> None:
     """Dots in the classes' colours, and their names in white: a label has its point's colour, which may be dark."""
-    at = np.array([(k % LEGEND_COLUMNS, 0.5 * (k // LEGEND_COLUMNS)) for k in range(len(space))])
+    columns = legend_columns(space)
+    at = np.array([(k % columns, 0.5 * (k // columns)) for k in range(len(space))])
     stream.log(entity, rr.Points2D(at - (0, 0.06), colors=space.colors, radii=rr.Radius.ui_points(8.0)), static=True)
     names = rr.Points2D(at, colors=(255, 255, 255), labels=space.classes, radii=0.0, show_labels=True)
     stream.log(f"{entity}/names", names, static=True)

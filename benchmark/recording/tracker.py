@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ class Tracker:
     """Follows a map voxel by voxel: the run's own, where backend `numba` is in it, else one of its own."""
 
     def __init__(self, voxel_size: float, num_classes: int) -> None:
-        self._settings = {"voxel_size": voxel_size, "num_classes": num_classes}
+        self._new_map = functools.partial(NumbaHash, voxel_size, num_classes)
         self._map: NumbaHash | None = None
         self._drift = np.zeros(0, dtype=np.float32)  # of the frame that saw the voxel last
         self._total = np.zeros(0, dtype=np.float32)
@@ -25,7 +26,7 @@ class Tracker:
     def map(self) -> NumbaHash:
         """The map that is followed."""
         if self._map is None:
-            self._map = NumbaHash(**self._settings)
+            self._map = self._new_map()
         return self._map
 
     @property

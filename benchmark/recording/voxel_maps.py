@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +63,8 @@ def edges() -> npt.NDArray[np.int64]:
 def packed(colors: npt.ArrayLike) -> npt.NDArray[np.uint32]:
     """RGB (n, 3) as the viewer's 0xRRGGBBAA (n,)."""
     r, g, b = np.asarray(colors, dtype=np.uint32).T
-    return (r << 24) | (g << 16) | (b << 8) | 0xFF
+    rgba: npt.NDArray[np.uint32] = (r << 24) | (g << 16) | (b << 8) | 0xFF
+    return rgba
 
 
 def grids(
@@ -76,7 +78,9 @@ def grids(
     index = ((table.index - origin) // factor).astype(np.int32)
     size = [table.voxel_size * factor] * 3
     yield "class", rr.VoxelGridMap(index, size, colors=packed(classes.colors)[dominant(table)])
-    values = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "op": op(table)}
+    values: dict[str, npt.NDArray[Any]] = {
+        "vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "op": op(table)
+    }  # fmt: skip
     for name, measure in MEASURES.items():
         value = values[name].astype(np.float32)
         yield name, rr.VoxelGridMap(index, size, values=value, colormap=measure.colormap, value_range=measure.range)
@@ -124,8 +128,12 @@ class GrowingMap:
                 break
             self._log(stream, fused, int(c))
 
+    def holds(self, voxels: int) -> bool:
+        """Whether a map of so many voxels is drawn as it is."""
+        return voxels <= int(self._edges[-1])
+
     def finish(self, stream: rr.RecordingStream, fused: NumbaHash) -> None:
-        """Log what has changed since it was logged; the map must have MAX_VOXELS at most."""
+        """Log what has changed since it was logged."""
         for c in np.flatnonzero(self._changed):
             self._log(stream, fused, int(c))
 

@@ -197,7 +197,7 @@ class StudyConfig(Settings):
     def base(self, scene: str | None = None) -> Config:
         """The base settings as a run's, with the frames of a scene where it is named."""
         settings = {name: getattr(self, name) for name in BASE_SETTINGS}
-        settings |= {"backends": [self.backend], "check": None, "events": self.statistics}
+        settings |= {"backends": [self.backend], "check": None, "events": self.statistics, "memory_gb": self.memory_gb}
         if self.perturbation is not None:
             settings["perturbation"] = self.perturbation.model_copy(update={"seed": self.seed})
         if scene is not None:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.memory import available_bytes
 from semstab.prefetch import default_threads
-from semstab.study.jobs import Job, Outcome, failed, message, run_job
+from semstab.study.jobs import Job, Outcome, close_dataset, failed, message, run_job
 
 CONNECT_SECONDS = 10
 
@@ -48,8 +48,11 @@ class InProcess:
 
     def run(self, jobs: Sequence[Job]) -> Generator[Finished, None, None]:
         """In order."""
-        for job in jobs:
-            yield job, run_job(job)
+        try:
+            for job in jobs:
+                yield job, run_job(job)
+        finally:
+            close_dataset()
 
 
 class LocalProcesses:

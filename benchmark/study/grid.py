@@ -12,7 +12,7 @@ from typing import Any
 
 from semstab.backends import create
 from semstab.config import BackendConfig, Config, FrameSelection, Perturbation, merge
-from semstab.datasets import Scene, Tracked, open_dataset
+from semstab.datasets import Regional, Scene, Tracked, open_dataset
 from semstab.errors import ConfigError
 from semstab.plan import Task, frame_indices, selected, tasks_of
 from semstab.results import Unit
@@ -164,10 +164,14 @@ def _base_cells(config: StudyConfig, scenes: Mapping[str, Scene]) -> Iterator[Ce
 
 def _region_cells(config: StudyConfig, scenes: Mapping[str, Scene]) -> Iterator[RegionCell]:
     for name, scene in scenes.items():
-        for backbone in selected(config.region_maps, scene.backbones, (), "backbone", name):
+        regions = scene.regions if isinstance(scene, Regional) else ()
+        for backbone in selected(config.region_maps, scene.backbones, regions, "region map", name):
             settings = config.base(name).model_copy(update={"backbones": [backbone]})
-            content = {"regions": [name, backbone], "frames": frame_indices(scene, settings)}
-            yield RegionCell(settings, scene, backbone, _hash(settings, content))
+            unit, frames = [name, backbone], frame_indices(scene, settings)
+            fused_only = {"voxel_size", "strata"}
+            yield RegionCell(
+                settings, scene, backbone, _hash(settings, {"regions": unit, "frames": frames}, fused_only)
+            )
 
 
 def _varied_cells(config: StudyConfig, base: Sequence[Cell], scenes: Mapping[str, Scene]) -> Iterator[Cell]:
@@ -202,7 +206,8 @@ def _change(sweep: str, value: float, seed: int) -> Change:
 
 
 def _changed(settings: Mapping[str, Any], base: Config) -> Config:
-    return Config.build(merge(base.model_dump(mode="json"), settings), "study")
+    changed = Config.build(merge(base.model_dump(mode="json"), settings), "study")
+    return changed.model_copy(update={"memory_gb": base.memory_gb})  # of no number, so it is not dumped
 
 
 def _fused_by(backend: BackendConfig, base: Config) -> Config:
@@ -240,8 +245,8 @@ def identity(config: Config, task: Task) -> str:
     return _hash(config, content)
 
 
-def _hash(config: Config, content: Mapping[str, Any]) -> str:
-    settings = config.model_dump(mode="json", exclude=set(NOT_IN_KEYS))
+def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:
+    settings = config.model_dump(mode="json", exclude={*NOT_IN_KEYS, *without})
     text = json.dumps([FORMAT, settings, content], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 

@@ -101,6 +101,11 @@ def shared_marker(folder: Path, start: str) -> Path:
     return folder / f".shared-{start}"
 
 
+def close_dataset() -> None:
+    """Let go of the dataset that a job opened in this process."""
+    _dataset.cache_clear()
+
+
 @functools.lru_cache(maxsize=1)
 def _dataset(_start: str, name: str, options: str) -> Dataset:
     """The dataset, opened once for a start of a study: its scenes share what they read or render."""

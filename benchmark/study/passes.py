@@ -21,7 +21,7 @@ from semstab.datasets.disk import file_digest
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path
 from semstab.frames import Frame
-from semstab.memory import available_bytes
+from semstab.memory import available_bytes, require_memory
 from semstab.pipeline import Stopwatch, flicker_between, new_map, require_voxels, unit_summary
 from semstab.plan import Task, prepare, tasks_of
 from semstab.prefetch import Fetched, prefetch
@@ -164,7 +164,9 @@ class Pass:
             frame = now.frame
             for one in stream.maps:
                 with self._failing([one.request]):
-                    _warm_up(one, frame)
+                    if not one.rows:
+                        require_memory(one.task, one.request.config, frame)
+                        _warm_up(one, frame)
                     report = one.backend.integrate(frame)
                     row = FrameRow(
                         report, frame.timestamp, now.flicker, fetched.seconds, fetched.waited, now.seconds,
@@ -235,7 +237,7 @@ def _streams(maps: Iterable[_Map]) -> list[_Stream]:
     groups: dict[Any, list[_Map]] = {}
     for one in maps:
         config = one.request.config
-        same = (config.taxonomy, config.perturbation, config.pixel_stride, tuple(one.task.indices))
+        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, tuple(one.task.indices))
         groups.setdefault(same, []).append(one)
     return [_Stream(group) for group in groups.values()]
 
@@ -299,7 +301,7 @@ def _up(scene: Scene, table: VoxelTable, poses: Sequence[Any]) -> list[float] | 
     """The scene's up axis, said or estimated; None where neither works."""
     try:
         up = estimate_up(table, poses) if scene.up is None else scene.up
-    except (DataError, ImportError):
+    except (DataError, ImportError, OSError):
         return None
     return [float(value) for value in up]
 

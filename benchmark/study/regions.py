@@ -13,6 +13,7 @@ import numpy as np
 
 from semstab.datasets import Scene
 from semstab.errors import DataError
+from semstab.exclusion import leave_out
 from semstab.frames import Frame
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.perturbation import perturb
@@ -41,6 +42,7 @@ def _frames(job: Job, scene: Scene, request: Request) -> Iterator[Frame]:
         frame = scene.frame(index, job.backbone, color=False)
         if frame.labels is None:
             raise DataError(f"{frame.where('scores')}: regions are label maps of ids, not scores")
+        frame = leave_out(frame, masks=config.exclude.masks)
         if config.perturbation is not None:
             frame = perturb(frame, config.perturbation, job.scene)
         return frame.every(config.pixel_stride)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -104,21 +104,21 @@ def _compute(
     for observer in observers:
         observer.study_started(len(units), found.kept)
     missing = [cell for identity, cell in units.items() if identity not in contents]
-    for outcome in _outcomes(config, folder, executor, missing):
-        cell = units[outcome.identity]
-        if outcome.content is not None:
-            folder.save(outcome)
-            contents[outcome.identity] = outcome.content
-        else:
-            found.errors[outcome.identity] = outcome.error or ""
-        for observer in observers:
-            observer.unit_finished(cell, outcome.error)
+    with contextlib.closing(_outcomes(config, folder, executor, missing)) as outcomes:
+        for outcome in outcomes:
+            if outcome.content is not None:
+                folder.save(outcome)
+                contents[outcome.identity] = outcome.content
+            else:
+                found.errors[outcome.identity] = outcome.error or ""
+            for observer in observers:
+                observer.unit_finished(units[outcome.identity], outcome.error)
     return found
 
 
 def _outcomes(
     config: StudyConfig, folder: StudyFolder, executor: Executor, missing: Sequence[Cell | RegionCell]
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     """What becomes of each unit, as it finishes."""
     with folder.started() as start:
         jobs = split(_jobs(config, folder.path, start, missing), executor.width)
