@@ -133,6 +133,20 @@ def test_suggestions_follow_from_the_data():
     assert "share" in slow.suggestion.frame_stride_reason
 
 
+def test_voxels_too_small_to_count_are_left_out(folder):
+    (checked,) = check(configured(folder, voxel_size=1e-9))
+    assert (checked.verdict.state, checked.persistence) == ("sound", ())
+    result = bench("check", "--data", folder, "--voxel-size", 1e-9)
+    assert "observation persistence" not in result.stdout
+
+
+def test_without_depth_nothing_is_said_about_motion(tmp_path):
+    folder = write(tmp_path / "room", Room(walk(3), told_depth=lambda z: z * np.nan))
+    (checked,) = check(configured(folder))
+    assert (checked.motion, checked.noise, checked.suggestion) == (None, None, None)
+    assert "nan" not in bench("check", "--data", folder).stdout
+
+
 def test_frames_are_those_that_are_selected(folder):
     (checked,) = check(configured(folder, frames={"start": 2, "stride": 3}))
     assert (checked.frames, checked.selected, checked.fused_frames) == (12, 4, 4)

@@ -159,7 +159,7 @@ def test_ground_truth_may_be_sparse(tmp_path):
     found = opened(SCANNET, tmp_path, label_camera="depth")
     assert (found.backbones, found.ground_truth, len(found)) == (("net",), True, COUNT)
     assert found.frame(0, "gt").labels.shape == (H, W)
-    fails(DataError, r"3 missing: .*label-filt/1\.png.*choose frames that have ground truth", found.frame, 1, "gt")
+    fails(DataError, r"3 missing: .*label-filt/1\.png.*choose frames that have them, or add them", found.frame, 1, "gt")
 
 
 # --- formats

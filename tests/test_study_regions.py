@@ -86,5 +86,5 @@ def test_one_frame_has_no_flicker(root, tmp_path) -> None:
 
 
 def test_a_source_that_is_not_there_is_refused(root, tmp_path) -> None:
-    with pytest.raises(ConfigError, match="wall: no backbone 'region'; did you mean 'regions'"):
+    with pytest.raises(ConfigError, match="wall: no region map 'region'; did you mean 'regions'"):
         run_study(configure(root, frames={}, region_maps=["region"], sweeps={}, backends=[]), tmp_path / "out")

@@ -34,8 +34,10 @@ def _heading(checked: SceneCheck) -> str:
     depth, (width, height) = checked.depth, checked.size
     text = (
         f"[bold]{escape(checked.scene)}[/]: {checked.selected} of {checked.frames} frames of {width}x{height};"
-        f" depth in {depth.valid:.0%} of the pixels, {depth.p5:.3g} to {depth.p95:.3g} m (5% to 95%)"
+        f" depth in {depth.valid:.0%} of the pixels"
     )
+    if depth.valid:
+        text += f", {depth.p5:.3g} to {depth.p95:.3g} m (5% to 95%)"
     if checked.motion is None:
         return text
     (least, most), (from_, to) = checked.motion.shift, checked.motion.turn

@@ -46,8 +46,8 @@ class Tally:
 
     def add(self, frame: Frame) -> None:
         """Count a frame's labels, or the classes of its largest scores."""
-        ids, counts = np.unique(frame.predicted, return_counts=True)
-        found = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+        counts = np.bincount(frame.predicted.ravel())
+        found = {int(i): int(counts[i]) for i in np.flatnonzero(counts)}
         self._ignored += found.pop(frame.ignore_id, 0)
         self._ids.update(found)
         if frame.scores is not None:

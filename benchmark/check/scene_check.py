@@ -238,7 +238,8 @@ class Look:
         for position, fetched in zip(positions, prefetch(attempt, [indices[p] for p in positions]), strict=True):
             if (frame := fetched.item) is not None:
                 self._first = self._first or frame
-                self.tally.add(frame)
+                if self._labelled:
+                    self.tally.add(frame)
                 self.views[position] = View.of(frame, self._points, labelled=self._labelled)
 
     def reading(self, options: Mapping[str, Any]) -> Reading:
@@ -273,23 +274,33 @@ def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Conf
     noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
     views = [look.views[position] for position in look.fused]
     stride = fused_stride(checked.size, config.pixel_stride)
-    sizes = [config.voxel_size * factor for factor in VOXEL_FACTORS]
+    fused = [_persistence(views, coverage, config.voxel_size * factor, stride) for factor in VOXEL_FACTORS]
     return dataclasses.replace(
         checked,
         overlaps=tuple(overlaps),
         noise=noise,
         fused_frames=len(views),
         fused_stride=stride,
-        persistence=tuple(persistence(views, coverage, size, stride) for size in sizes),
+        persistence=tuple(row for row in fused if row is not None),
         suggestion=None if noise is None else suggest(coverage, overlaps, config.frames.stride),
     )
 
 
+def _persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, stride: int) -> Persistence | None:
+    """The distribution of OP; None where points lie so far out that voxels of that size cannot be counted."""
+    try:
+        return persistence(views, coverage, voxel_size, stride)
+    except DataError:
+        return None
+
+
 def _motion(sample: Sample) -> Motion | None:
-    """How far the camera moves and turns from one compared frame to another."""
+    """How far the camera moves and turns from one compared frame to another; None where no depth compares with it."""
     if not sample.pairs:
         return None
     shifts, turns = shifts_and_turns(sample)
+    if np.isnan(shifts).any():
+        return None
     return Motion((float(shifts.min()), float(shifts.max())), (float(turns.min()), float(turns.max())))
 
 
