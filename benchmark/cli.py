@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +11,7 @@ from typer.core import TyperGroup
 
 from semstab import __version__
 from semstab.errors import ConfigError, DataError, SemstabError
+from semstab.process import settle
 
 if TYPE_CHECKING:
     from semstab.config import Config
@@ -109,6 +109,10 @@ def run(
         bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
     ] = False,
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
+    statistics: Annotated[
+        bool | None,
+        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; runs/TIME by default.")] = None,
     rerun: Annotated[
         str | None,
@@ -134,6 +138,7 @@ def run(
             "pixel_stride": pixel_stride,
             "check": check,
             "events": events,
+            "statistics": statistics,
             "check_geometry": False if trust_geometry else None,
         },
         settings or [],
@@ -553,6 +558,5 @@ def _say(text: str) -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    # Threads that spin while they wait for the next frame take the time of those that decode it.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    settle()
     app()

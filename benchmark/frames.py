@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, flat
 
 RIGID_TOLERANCE = 1e-3
 
@@ -107,10 +107,13 @@ class Frame:
     @cached_property
     def valid(self) -> npt.NDArray[np.bool_]:
         """(H, W): depth is valid, and the label is not ignored or the scores are finite and sum to more than 0."""
-        usable = self.labels != self.ignore_id if self.labels is not None else _usable_scores(self.scores)
-        valid: npt.NDArray[np.bool_] = self.depth > 0
-        valid &= self.depth < np.inf
-        valid &= usable
+        if self.labels is not None:
+            from semstab.pixel_kernel import mark_valid
+
+            valid = np.empty(self.shape, dtype=np.bool_)
+            mark_valid(flat(self.depth), flat(self.labels), self.ignore_id, valid.reshape(-1))
+        else:
+            valid = (self.depth > 0) & (self.depth < np.inf) & _usable_scores(self.scores)
         valid.setflags(write=False)
         return valid
 

@@ -157,6 +157,8 @@ class LabelMapping:
 
         Raises DataError with `where` (the file) for an id that the source space does not have.
         """
+        if self._keeps(labels):
+            return labels
         table = self._table(labels.dtype.itemsize)
         unknown = (table == UNKNOWN) & _present(labels)
         if unknown.any():
@@ -168,6 +170,14 @@ class LabelMapping:
                 f" ids {min(self.source.ids)} to {max(self.source.ids)})"
             )
         return _look_up(table.astype(np.uint8 if len(self.target) <= IGNORE_8BIT else np.uint16), labels)
+
+    def _keeps(self, labels: npt.NDArray[Any]) -> bool:
+        """Whether the map stays as it is: 8-bit ids that are the rows already, and none but those and the ignore id."""
+        from semstab.pixel_kernel import has_other
+
+        K = len(self.target)
+        same = self.source.ids == self.rows == tuple(range(K)) and labels.dtype == np.uint8 and K < IGNORE_8BIT
+        return same and not has_other(flat(labels), K, IGNORE_8BIT)
 
     def scores(self, scores: npt.NDArray[np.floating[Any]], where: str) -> npt.NDArray[np.floating[Any]]:
         """Map soft scores (H, W, K of the source): classes that fall together are summed, ignored ones dropped.
@@ -203,6 +213,13 @@ def shipped_taxonomies() -> tuple[str, ...]:
     """Names of the taxonomies that ship with semstab."""
     folder = importlib.resources.files("semstab.configs") / "taxonomies"
     return tuple(sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml")))
+
+
+def flat(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The image's values (n,), contiguous and read-only, so that numba compiles one version for all images."""
+    values = np.ascontiguousarray(image).reshape(-1)
+    values.flags.writeable = False
+    return values
 
 
 def _present(labels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

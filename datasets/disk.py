@@ -11,7 +11,8 @@ from pathlib import Path
 from semstab.errors import DataError
 
 AGAIN = "copy or export it again"
-DIGEST_SIZE = 16
+DIGEST = "sha256"
+"""Processors have instructions for it: there it takes half of blake2b's time."""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -29,14 +30,14 @@ def read_bytes(path: Path) -> bytes:
 
 def digest(data: bytes) -> bytes:
     """A hash of a file's content."""
-    return hashlib.blake2b(data, digest_size=DIGEST_SIZE).digest()
+    return hashlib.new(DIGEST, data).digest()
 
 
 def file_digest(path: Path) -> bytes:
     """The same of a file that was not read. Raises DataError where it cannot be."""
     try:
         with path.open("rb") as file:
-            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=DIGEST_SIZE)).digest()
+            return hashlib.file_digest(file, DIGEST).digest()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 

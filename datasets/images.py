@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.arrays import decode_array
-from semstab.datasets.codecs import decode_exr, decode_jpeg, decode_tiff, parse_png
+from semstab.datasets.codecs import Png, decode_exr, decode_jpeg, decode_tiff, parse_png
 from semstab.datasets.disk import read_bytes
 from semstab.errors import ConfigError, DataError
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
@@ -39,8 +39,8 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     data = read(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        depth, scale = _decode_depth_png(path, data), scale or MILLIMETRES
-    elif suffix in (".tiff", ".tif"):
+        return _depth_png(path, data).metres(scale or MILLIMETRES)
+    if suffix in (".tiff", ".tif"):
         depth = decode_tiff(path, data)
     elif suffix == ".exr":
         depth = decode_exr(path, data)
@@ -112,14 +112,14 @@ def read_color(path: Path) -> npt.NDArray[np.uint8]:
     return parse_png(path, data).rgb() if path.suffix.lower() == ".png" else decode_jpeg(path, data)
 
 
-def _decode_depth_png(path: Path, data: bytes) -> npt.NDArray[Any]:
+def _depth_png(path: Path, data: bytes) -> Png:
     png = parse_png(path, data)
     if png.kind != "grey" or png.bits != 16:
         raise DataError(
             f"{path}: expected 16-bit grey, found {png.bits}-bit {png.kind} (a picture of the depth?);"
             " export the depth values"
         )
-    return png.samples()
+    return png
 
 
 # --- labels ---------------------------------------------------------------------------------------------------------

@@ -25,19 +25,33 @@ def decode(width: int, height: int, bits: int, parts: Iterable[memoryview]) -> n
 
     `parts` are the bodies of its IDAT chunks. None where they do not decode to just that.
     """
-    stream = b"".join(parts)
     B = bits // 8
-    size = height * (1 + width * B)
+    if (raw := _inflated(height * (1 + width * B), parts)) is None:
+        return None
+    out = np.empty((height, width, B), dtype=np.uint8)
+    if not _unfilter(raw, out):
+        return None
+    return out.view("<u2" if B == 2 else np.uint8)[..., 0]
+
+
+def decode_metres(width: int, height: int, scale: float, parts: Iterable[memoryview]) -> npt.NDArray[np.float32] | None:
+    """Samples (height, width) of such an image of 16 bits, divided by `scale`: one pass less than in two steps."""
+    if (raw := _inflated(height * (1 + width * 2), parts)) is None:
+        return None
+    out = np.empty((height, width), dtype=np.float32)
+    return out if _unfilter_metres(raw, np.float32(scale), out) else None
+
+
+def _inflated(size: int, parts: Iterable[memoryview]) -> npt.NDArray[np.uint8] | None:
+    """The `size` bytes of filtered rows; None where it is another number, or damaged."""
+    stream = b"".join(parts)
     if size > LARGEST_RATIO * len(stream):
         return None
     try:
         raw = np.frombuffer(deflate.zlib_decompress(stream, size), dtype=np.uint8)
     except deflate.DeflateError:
         return None
-    out = np.empty((height, width, B), dtype=np.uint8)
-    if raw.size != size or not _unfilter(raw, out):
-        return None
-    return out.view("<u2" if B == 2 else np.uint8)[..., 0]
+    return raw if raw.size == size else None
 
 
 @nb.njit(cache=True, nogil=True)
@@ -46,14 +60,34 @@ def _unfilter(raw: Any, out: Any) -> bool:
     H, W, B = out.shape
     above = np.zeros((W, B), dtype=np.uint8)
     for y in range(H):
-        start = y * (1 + W * B)
-        kind = raw[start]
-        if kind > 4:
+        if not _unfilter_samples(raw[y * (1 + W * B) : (y + 1) * (1 + W * B)], above, out[y]):
             return False
-        row = raw[start + 1 : start + 1 + W * B]
-        for k in range(B):
-            _unfilter_row(kind, row[k::B], above[:, B - 1 - k], out[y, :, B - 1 - k])
         above = out[y]
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def _unfilter_metres(raw: Any, scale: Any, out: Any) -> bool:
+    """Undo the filters of each row of 16-bit samples, and divide by the scale into out (H, W)."""
+    H, W = out.shape
+    rows = np.zeros((2, W, 2), dtype=np.uint8)
+    for y in range(H):
+        row = rows[y % 2]
+        if not _unfilter_samples(raw[y * (1 + W * 2) : (y + 1) * (1 + W * 2)], rows[1 - y % 2], row):
+            return False
+        for x in range(W):
+            out[y, x] = np.float32(np.uint16(row[x, 0]) | (np.uint16(row[x, 1]) << np.uint16(8))) / scale
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def _unfilter_samples(raw: Any, above: Any, out: Any) -> bool:
+    """Undo the filter of a row, whose kind is its first byte, into out (W, B); False for a kind that is none."""
+    B = out.shape[1]
+    if raw[0] > 4:
+        return False
+    for k in range(B):
+        _unfilter_row(raw[0], raw[1 + k :: B], above[:, B - 1 - k], out[:, B - 1 - k])
     return True
 
 

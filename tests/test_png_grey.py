@@ -74,3 +74,21 @@ def test_interlaced_and_narrow_images_are_left_to_the_other_decoder() -> None:
     interlaced = narrow[:8] + header + png_chunk(b"IDAT", zlib.compress(b"\0\7")) + png_chunk(b"IEND", b"")
     assert decoded(interlaced)[0] is None
     assert parse_png("a.png", interlaced).samples().tolist() == [[7]]
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.floats(1e-3, 1e6), st.data())
+def test_metres_are_the_samples_divided_by_the_scale(width, height, scale, data) -> None:
+    kinds = data.draw(st.lists(st.integers(0, 4), min_size=height, max_size=height))
+    rows = [data.draw(st.binary(min_size=2 * width, max_size=2 * width)) for _ in kinds]
+    filtered = b"".join(bytes([kind]) + content for kind, content in zip(kinds, rows, strict=True))
+    png = parse_png("a.png", raw_png(width, height, 16, 0, zlib.compress(filtered)))
+    metres = png_grey.decode_metres(width, height, scale, png._data())
+    expected = np.divide(png.samples(), scale, dtype=np.float32, casting="same_kind")
+    np.testing.assert_array_equal(metres, expected)
+    np.testing.assert_array_equal(png.metres(scale), expected)
+    assert metres.dtype == np.float32
+
+
+def test_metres_of_a_damaged_stream_are_left_to_the_other_decoder() -> None:
+    assert png_grey.decode_metres(4, 6, 1000.0, [memoryview(zlib.compress(bytes(6 * 9))[:-1])]) is None
+    assert png_grey.decode_metres(4, 1, 1000.0, [memoryview(zlib.compress(b"\x05" + bytes(8)))]) is None

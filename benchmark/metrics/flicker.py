@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 from semstab.errors import DataError
 from semstab.frames import Frame
+from semstab.labels import flat
+from semstab.pixel_kernel import count_changed
 from semstab.warp import DEPTH_TOLERANCE, correspond
 
 
@@ -24,8 +26,9 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
         raise DataError(
             f"{current.where('depth')}: frames {previous.index} and {current.index} differ in size ({sizes})"
         )
-    both = previous.valid & current.valid
-    return _share(both & (previous.predicted != current.predicted), both, whole=100.0)
+    images = (previous.valid, previous.predicted, current.valid, current.predicted)
+    both, changed = count_changed(*(flat(image) for image in images))
+    return 100.0 * changed / both if both else math.nan
 
 
 @dataclass(frozen=True)

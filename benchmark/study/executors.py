@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.memory import available_bytes
 from semstab.prefetch import default_threads
+from semstab.process import settle
 from semstab.study.jobs import Job, Outcome, close_dataset, failed, message, run_job
 
 CONNECT_SECONDS = 10
@@ -122,7 +123,7 @@ def _check_start(pool: cf.ProcessPoolExecutor) -> None:
 def _start_worker(listening: Connection, threads: int) -> None:
     """Set a worker process up: with its share of the cores, and so that it ends with its parent."""
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))  # read when Open3D is loaded
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    settle()
     import numba
 
     numba.set_num_threads(min(threads, numba.get_num_threads()))

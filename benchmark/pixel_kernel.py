@@ -1,0 +1,38 @@
+"""Compiled loops over the pixels of labelled frames: one pass each where numpy takes five."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(cache=True, nogil=True)
+def mark_valid(depth: Any, labels: Any, ignore: int, out: Any) -> None:
+    """Mark the pixels with a valid depth and a label; all arrays are (n,)."""
+    ignored = labels.dtype.type(ignore)
+    for i in range(out.size):
+        out[i] = (depth[i] > np.float32(0)) & (depth[i] < np.float32(math.inf)) & (labels[i] != ignored)
+
+
+@nb.njit(cache=True, nogil=True)
+def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
+    """The number of pixels that are valid in both frames, and of those among them whose labels differ."""
+    both = changed = 0
+    for i in range(valid.size):
+        common = valid[i] & other_valid[i]
+        both += common
+        changed += common & (labels[i] != other_labels[i])
+    return both, changed
+
+
+@nb.njit(cache=True, nogil=True)
+def has_other(labels: Any, count: int, ignore: int) -> bool:
+    """Whether a map of ids (n,) holds one that is neither below `count` nor the ignore id."""
+    first, ignored = labels.dtype.type(count), labels.dtype.type(ignore)
+    other = False
+    for i in range(labels.size):
+        other |= (labels[i] >= first) & (labels[i] != ignored)
+    return other

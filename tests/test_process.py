@@ -1,0 +1,48 @@
+"""A prepared process keeps the memory of one image for the next, and its threads do not spin."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+FAULTS = """
+import resource
+import numpy as np
+from semstab.process import settle
+{call}
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def image():
+    np.empty(40_000_000, dtype=np.uint8)[::4096] = 1
+image()
+before = faults()
+for _ in range(5):
+    image()
+print(faults() - before)
+"""
+
+
+def faults(call: str) -> int:
+    script = FAULTS.format(call=call)
+    return int(subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout)
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "confstr") or "glibc" not in (os.confstr("CS_GNU_LIBC_VERSION") or ""), reason="glibc"
+)
+def test_memory_of_an_image_is_used_again() -> None:
+    assert faults("settle()") < 10
+    assert faults("") > 50
+
+
+def test_a_choice_of_the_user_is_kept() -> None:
+    script = "import os; from semstab.process import settle; settle(); print(os.environ['OMP_WAIT_POLICY'])"
+    for chosen, expected in ({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"):
+        environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | chosen
+        result = subprocess.run(
+            [sys.executable, "-c", script], check=True, capture_output=True, text=True, env=environment
+        )
+        assert result.stdout.strip() == expected
