@@ -298,11 +298,11 @@ class Judgement:
 
     def _refuted(self, best: Fit) -> Verdict:
         mine, lines = self.configured, self.reading.lines(best.convention)
-        error = f"{mine.error:.1%} error" if mine.has_evidence else f"{mine.share:.1%} of the points seen again"
-        text = (
-            f"depth reprojects with {error} as configured, with {best.error:.2%} error under {', '.join(lines)}"
-            f" ({self.reading.advice(best.convention)})"
-        )
+        if mine.has_evidence:
+            found = f"depth reprojects with {mine.error:.1%} error as configured, with"
+        else:
+            found = f"as configured {mine.share:.1%} of the points are seen again; depth reprojects with"
+        text = f"{found} {best.error:.2%} error under {', '.join(lines)} ({self.reading.advice(best.convention)})"
         if rivals := [self._name(fit) for fit in self._refuting[1:]][:MOST_RIVALS]:
             text += f"; these frames cannot tell it from {' or '.join(rivals)}"
         return self._as("unsound", text, lines, best)

@@ -68,13 +68,14 @@ def measure(frames: list[semstab.Frame], K: int, rounds: int) -> dict[str, dict[
         "numpy": lambda: backend("numpy"),
     }
     first, later = defaultdict(list), defaultdict(list)
-    for turn in range(rounds + 1):  # the first one compiles and warms up
+    for make in makers.values():  # compiles what is compiled on first use
+        flight.milliseconds(make(), frames[0])
+    for _ in range(rounds):
         for name, make in makers.items():
             integrate = make()
             times = [flight.milliseconds(integrate, frame) for frame in (*frames, *frames)]
-            if turn:
-                first[name].append(times[0])
-                later[name].extend(times[1:])
+            first[name].append(times[0])
+            later[name].extend(times[1:])
     return {name: {"first_ms": median(first[name]), "later_ms": median(later[name])} for name in makers}
 
 

@@ -1,0 +1,60 @@
+"""The quick way to a pixel's voxel equals the protocol's expression, at voxel faces and far from the origin as well."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from semstab.backends import kernels
+from semstab.labels import IGNORE_8BIT
+
+W = 300
+coordinate = st.one_of(
+    st.floats(-1e6, 1e6), st.integers(-40, 40).map(lambda n: n * 0.2), st.sampled_from([0.0, 5.6e6, -3.2e6])
+)
+
+
+@settings(deadline=None, max_examples=300)
+@given(
+    st.lists(coordinate, min_size=3, max_size=3),
+    st.sampled_from([0.05, 0.2, 0.25, 1.0]),
+    st.booleans(),
+    st.floats(0.1, 2e5),
+    st.integers(0, 2**31),
+)
+def test_keys_equal_the_protocols_expression(t, size, aligned, far, seed) -> None:
+    """Aligned cameras look along an axis from a voxel's corner: many of their points lie on a face."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, 3] = t
+    if not aligned:
+        T[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
+    depth = rng.uniform(0, far, W) if not aligned else rng.integers(0, 40, W) * size
+    depth = np.where(rng.random(W) < 0.1, rng.choice([0.0, -1.0, np.nan, np.inf], W), depth).astype(np.float32)
+    labels = rng.choice([0, 1, IGNORE_8BIT], W).astype(np.uint8)
+    ray_x, ray_y = (np.arange(W) - 150) / 300, 0.25
+    origin = np.floor(T[:3, 3] / size)
+    exact, quick = np.empty(W, dtype=np.int64), np.empty(W, dtype=np.int64)
+    terms = kernels.frame_terms(ray_x, T, size)
+    lost = kernels._row_keys(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, exact)
+    assert kernels.keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, *terms, quick) == lost
+    np.testing.assert_array_equal(quick, exact)
+
+
+def test_most_pixels_take_the_quick_way() -> None:
+    """Else it would only cost: of a tilted view hardly a block is in doubt."""
+    rng = np.random.default_rng(1)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=3).as_matrix(), [3.1, -7.7, 5.6e6]
+    ray_x = (np.arange(kernels.BLOCK) - 128.3) / 300
+    rays, margin = kernels.frame_terms(ray_x, T, 0.2)
+    offset = T[:3, 3] / 0.2 - np.floor(T[:3, 3] / 0.2) + kernels.HALF
+    start = T[:3, 2] / 0.2
+    out, labels = np.empty(kernels.BLOCK, dtype=np.int64), np.zeros(kernels.BLOCK, dtype=np.uint8)
+    doubts = 0
+    for _ in range(200):
+        depth = rng.uniform(1, 50, kernels.BLOCK).astype(np.float32)
+        doubts += bool(kernels._keys_fused(depth, labels, IGNORE_8BIT, *rays, *start, *offset, margin, out))
+    assert doubts <= 2
