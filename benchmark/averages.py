@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from semstab.metrics import macro_mean, pool
 from semstab.results import Means
+from semstab.statistics import number_at
 from semstab.study.results import Record, StudyResult, Variation
 
 ENOUGH = 1000
@@ -25,6 +26,11 @@ class Pooled:
     recurrent  those with OP >= 3
     strata     by OP, as the units have them
     classes    by dominant class, in order of appearance
+
+    Of the voxels with OP >= 2, macro means over the units, NaN where none has statistics:
+    psa        pairwise semantic agreement
+    alpha      Krippendorff's alpha
+    drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
     """
 
     voxels: int
@@ -35,6 +41,15 @@ class Pooled:
     strata: tuple[Means, ...]
     classes: tuple[Means, ...]
     fuse_ms_per_frame: float
+    psa: float = math.nan
+    alpha: float = math.nan
+    drift: float = math.nan
+    drift_null: float = math.nan
+
+    @property
+    def excess_drift(self) -> float:
+        """SBD less that of the same observations in random order, bits."""
+        return self.drift - self.drift_null
 
     @property
     def mean_op(self) -> float:
@@ -68,7 +83,16 @@ def pooled(records: Sequence[Record]) -> Pooled:
         strata=strata,
         classes=tuple(pool(rows, voxels) for rows in of_class),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
+        psa=_macro(records, "agreement", "psa", "value"),
+        alpha=_macro(records, "agreement", "alpha", "value"),
+        drift=_macro(records, "drift", "sbd", "value"),
+        drift_null=_macro(records, "drift", "null", "value"),
     )
+
+
+def _macro(records: Sequence[Record], *path: str) -> float:
+    """The macro mean of a number of the units' statistics; NaN where none has it."""
+    return macro_mean([number_at(record.statistics, *path) for record in records])
 
 
 @dataclass(frozen=True)
@@ -101,6 +125,11 @@ class Level:
     def mean(self, measure: Callable[[Pooled], float]) -> float:
         """The measure's mean over the repeats."""
         return self.spread(measure).mean
+
+    @property
+    def judged(self) -> bool:
+        """Whether it has statistics that are defined."""
+        return not math.isnan(self.mean(lambda pooled: pooled.psa))
 
 
 @dataclass(frozen=True)

@@ -167,6 +167,11 @@ class Config(Settings):
         True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
     )
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
+    statistics: bool = Field(
+        False,
+        description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
+        " other; keeps every observation, fuses the ground truth too",
+    )
 
     @field_validator("backends", mode="before")
     @classmethod

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +15,12 @@ from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.plan import Task, read
 
+if TYPE_CHECKING:
+    from semstab.backends.aggregator import Aggregator
+
 GB = 1e9
+DOUBT = 10
+"""A sequence whose frames might see that many times the voxels of the first, all new, is not looked at closer."""
 PROBES = 3
 """Places of a sequence at which two consecutive frames are compared."""
 
@@ -31,13 +37,14 @@ class Expected:
 def require_memory(task: Task, config: Config, first: Frame) -> None:
     """Refuse a task whose maps would not fit: in `memory_gb` where it is set, else in what is free.
 
-    `first` is the task's first frame. Further frames are read only where one voxel a pixel would be too much.
+    `first` is the task's first frame. Further frames are read only where `DOUBT` times its voxels in each frame would
+    be too much: for a short sequence they would cost more than they tell.
     Raises ConfigError that says how much is missing, and which settings change it.
     """
     free = available_bytes() if config.memory_gb is None else int(config.memory_gb * GB)
     frames = len(task.indices)
-    most = _expected(task, frames * first.depth.size, frames * first.depth.size)
-    if most.bytes <= free:
+    voxels = DOUBT * frames * len(_pixels(task, config).observe(first.every(2)).key)
+    if _expected(task, config, voxels, voxels).bytes <= free:
         return
     expected = estimate(task, config)
     if expected.bytes <= free:
@@ -51,9 +58,7 @@ def estimate(task: Task, config: Config) -> Expected:
     The first frame's voxels, and as many new ones with each further frame as the second frame of a pair has on
     average: too many where the camera comes back to a place.
     """
-    from semstab.backends.aggregator import Aggregator
-
-    pixels = Aggregator(config.voxel_size, len(task.mapping.target))
+    pixels = _pixels(task, config)
     seen, new = [], []
     for pair in _pairs(task.indices):
         keys = [pixels.observe(read(task, index, config.pixel_stride)).key.copy() for index in pair]
@@ -61,13 +66,20 @@ def estimate(task: Task, config: Config) -> Expected:
         new += [int(np.isin(keys[1], keys[0], invert=True).sum())] if len(keys) > 1 else []
     frames = len(task.indices)
     voxels = np.mean(seen) + (frames - 1) * (np.mean(new) if new else 0)
-    return _expected(task, int(voxels), int(frames * np.mean(seen)))
+    return _expected(task, config, int(voxels), int(frames * np.mean(seen)))
+
+
+def _pixels(task: Task, config: Config) -> Aggregator:
+    from semstab.backends.aggregator import Aggregator
+
+    return Aggregator(config.voxel_size, len(task.mapping.target))
 
 
 def _too_large(task: Task, config: Config, expected: Expected, free: int) -> str:
     room = f"{free / GB:.2g} GB " + ("are free" if config.memory_gb is None else "is memory_gb")
     keep_all = [name for name in task.backends if _keeps_observations(name)]
     without = f", no backend that keeps every observation ({', '.join(keep_all)})" if keep_all else ""
+    without += ", no statistics" if config.statistics else ""
     return (
         f"{task.scene.name}, {task.backbone}: about {expected.voxels / 1e6:.2g} million voxels of"
         f" {config.voxel_size:g} m would take {expected.bytes / GB:.2g} GB, and {room}; use larger voxels (voxel_size),"
@@ -93,10 +105,18 @@ def _pairs(indices: Sequence[int]) -> list[Sequence[int]]:
     return [indices[start : start + 2] for start in starts]
 
 
-def _expected(task: Task, voxels: int, observations: int) -> Expected:
+def _expected(task: Task, config: Config, voxels: int, observations: int) -> Expected:
     K = len(task.mapping.target)
     maps = sum(expected_bytes(name, voxels, observations, K) for name in task.backends)
-    return Expected(voxels, observations, maps + len(task.backends) * result_bytes(voxels, K))
+    logs = log_bytes(observations, K) if config.statistics or config.events else 0
+    truth = expected_bytes(task.backends[0], voxels, observations, K) if config.statistics else 0
+    tables = (len(task.backends) + config.statistics) * result_bytes(voxels, K)
+    return Expected(voxels, observations, maps + logs + truth + tables)
+
+
+def log_bytes(observations: int, num_classes: int) -> int:
+    """A log of observations: kept frame by frame, sorted by voxel, and put into other orders and rules."""
+    return observations * (32 * num_classes + 100)
 
 
 def result_bytes(voxels: int, num_classes: int) -> int:

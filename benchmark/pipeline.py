@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from semstab.backends import FusionBackend, create, takes_option
 from semstab.check import Verdict, require_sound
 from semstab.config import BackendConfig, Config
 from semstab.errors import DataError
+from semstab.evaluation import Evaluation, logged_by
 from semstab.frames import Frame
 from semstab.manifest import manifest
 from semstab.memory import require_memory
@@ -29,6 +31,7 @@ from semstab.plan import Plan, Task, make_plan, read, resolve
 from semstab.prefetch import Fetched, prefetch
 from semstab.results import STAGES, GroupResult, RunResult, Unit, UnitSummary
 from semstab.run_folder import FrameRow, RunFolder, group_key
+from semstab.statistics import nulls
 from semstab.voxels import VoxelTable
 
 
@@ -75,15 +78,20 @@ def run(
     for observer in observers:
         observer.run_started(plan)
     groups: list[GroupResult] = []
+    comparisons: list[Mapping[str, Any]] = []
     geometry: dict[str, Verdict] = {}
+    evaluation = Evaluation(config)
     for task in plan.tasks:
-        groups.append(_run_task(task, config, folder, observers, watch, geometry))
+        groups.append(_run_task(task, config, folder, observers, watch, geometry, evaluation))
+        if task is plan.last_of(task.scene):
+            with watch("statistics"):
+                comparisons += evaluation.comparisons()
+        result = RunResult(tuple(groups), tuple(comparisons))
         if folder is not None:
-            folder.save_summary(RunResult(tuple(groups)))
+            folder.save_summary(result)
             inputs = {f"{t.scene.name}/{t.backbone}": t.digest for t in plan.tasks[: len(groups)]}
             checked = {"geometry": {scene: verdict.summary() for scene, verdict in geometry.items()}}
             folder.save_manifest(manifest(config, inputs, watch.seconds, command) | checked)
-    result = RunResult(tuple(groups))
     for observer in observers:
         observer.run_finished(result)
     return result
@@ -96,9 +104,12 @@ def _run_task(
     observers: Sequence[Observer],
     watch: Stopwatch,
     geometry: dict[str, Verdict],
+    evaluation: Evaluation,
 ) -> GroupResult:
     kept = None if folder is None else _kept(task, config, folder, watch)
-    if kept is not None:
+    if folder is not None and kept is not None:
+        if config.statistics:
+            evaluation.add(task, VoxelTable.load(folder.voxels_path(kept.runs[0].unit)))
         for observer in observers:
             observer.group_kept(task, kept)
         return kept
@@ -108,7 +119,7 @@ def _run_task(
         geometry[task.scene.name] = verdict
         for observer in observers:
             observer.geometry_checked(task, verdict)
-    result = _fuse(task, config, folder, observers, watch)
+    result = _fuse(task, config, folder, observers, watch, evaluation)
     if folder is not None:
         folder.save_group(task.scene.name, task.backbone, _key(task, config, watch), result)
     return result
@@ -126,7 +137,12 @@ def _key(task: Task, config: Config, watch: Stopwatch) -> str:
 
 
 def _fuse(
-    task: Task, config: Config, folder: RunFolder | None, observers: Sequence[Observer], watch: Stopwatch
+    task: Task,
+    config: Config,
+    folder: RunFolder | None,
+    observers: Sequence[Observer],
+    watch: Stopwatch,
+    evaluation: Evaluation,
 ) -> GroupResult:
     """One backbone on one scene through every backend: the same frames in the same order, decoded once."""
     maps = _maps(task, config)
@@ -135,7 +151,11 @@ def _fuse(
         classes = task.mapping.target.classes
         tables = {unit: dataclasses.replace(backend.table(), classes=classes) for unit, backend in maps.items()}
         require_voxels(task, config, tables)
-        summaries = {unit: unit_summary(task, config, tables[unit], unit, rows[unit]) for unit in maps}
+    with watch("statistics"):
+        analyses = evaluation.analyses(task, maps, tables)
+    with watch("measure"):
+        said = {unit: analyses[unit].summary if unit in analyses else {} for unit in maps}
+        summaries = {unit: unit_summary(task, config, tables[unit], unit, rows[unit], said[unit]) for unit in maps}
         alike = [unit for unit, backend in maps.items() if getattr(backend, "pointwise", True)]
         agreement = tuple(
             compare(tables[a], tables[b], (a, b), tolerance=config.tolerance)
@@ -146,7 +166,8 @@ def _fuse(
             if folder is not None:
                 events = backend.events() if config.events else None
                 named = None if events is None else dataclasses.replace(events, classes=classes)
-                folder.save_unit(unit, tables[unit], named, rows[unit])
+                found = analyses[unit].maps if config.statistics and unit in analyses else {}
+                folder.save_unit(unit, tables[unit], named, rows[unit], found)
     with watch("observe"):
         for unit in maps:
             for observer in observers:
@@ -209,7 +230,8 @@ def _maps(task: Task, config: Config) -> dict[Unit, FusionBackend]:
 
 def new_map(backend: BackendConfig, task: Task, config: Config) -> FusionBackend:
     """An empty map; it keeps the history where the run is to write it, or to compute statistics from it."""
-    history = {"history": True} if config.events and takes_option(backend.name, "history") else {}
+    wanted = config.events or backend.name == logged_by(config)
+    history = {"history": True} if wanted and takes_option(backend.name, "history") else {}
     options = history | backend.options
     return create(backend.name, voxel_size=config.voxel_size, num_classes=len(task.mapping.target), **options)
 
@@ -227,8 +249,15 @@ def require_voxels(task: Task, config: Config, tables: Mapping[Unit, VoxelTable]
     )
 
 
-def unit_summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows: list[FrameRow]) -> UnitSummary:
-    """What is reported of a unit, from its map and its time series."""
+def unit_summary(
+    task: Task,
+    config: Config,
+    table: VoxelTable,
+    unit: Unit,
+    rows: list[FrameRow],
+    statistics: Mapping[str, Any],
+) -> UnitSummary:
+    """What is reported of a unit, from its map, its time series and what `semstab.statistics` says of the map."""
     return UnitSummary(
         unit=unit,
         taxonomy=task.mapping.target.name,
@@ -238,6 +267,7 @@ def unit_summary(task: Task, config: Config, table: VoxelTable, unit: Unit, rows
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms=_stages_ms(rows),
         left_out=sum(row.left_out for row in rows),
+        statistics=nulls(statistics),
     )
 
 

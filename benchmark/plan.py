@@ -55,6 +55,10 @@ class Plan:
     config: Config
     tasks: tuple[Task, ...]
 
+    def last_of(self, scene: Scene) -> Task:
+        """The last task of a scene."""
+        return [task for task in self.tasks if task.scene is scene][-1]
+
 
 def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
     """The configuration of a file with overrides on top, over what ships for its dataset in configs/datasets/."""

@@ -117,7 +117,8 @@ class UnitSummary:
     """One entry of 'runs' in summary.json.
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves.
+    fusion because what they show moves; statistics is what `semstab.statistics.describe` says of the map, empty where
+    nothing was asked for.
     """
 
     unit: Unit
@@ -128,6 +129,7 @@ class UnitSummary:
     fuse_ms_per_frame: float
     stages_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
     left_out: int = 0
+    statistics: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object; `from_dict` reads it back."""
@@ -137,6 +139,7 @@ class UnitSummary:
             | rest
             | {"stages_ms": dict(self.stages_ms), "left_out": self.left_out}
             | dataclasses.asdict(self.table)
+            | {"statistics": dict(self.statistics)}
         )
 
     @classmethod
@@ -155,6 +158,7 @@ class UnitSummary:
             **{name: content[name] for name in _UNIT_FIELDS},
             stages_ms=_defined(content.get("stages_ms", {})),  # runs of earlier versions have none
             left_out=content.get("left_out", 0),
+            statistics=content.get("statistics", {}),
         )
 
 
@@ -213,9 +217,13 @@ class GroupResult:
 
 @dataclass(frozen=True)
 class RunResult:
-    """All that a run found; `to_dict` is summary.json."""
+    """All that a run found; `to_dict` is summary.json.
+
+    comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
+    """
 
     groups: tuple[GroupResult, ...]
+    comparisons: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def runs(self) -> tuple[UnitSummary, ...]:
@@ -238,6 +246,7 @@ class RunResult:
             "schema": SCHEMA,
             "runs": [run.to_dict() for run in self.runs],
             "agreement": [row.to_dict() for row in self.agreement],
+            "comparisons": [dict(row) for row in self.comparisons],
         }
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
 import yaml
 
 from semstab.config import Config, read_yaml
@@ -20,6 +21,8 @@ from semstab.files import read_json, write_json, write_text
 from semstab.metrics import dominant, entropy, sbd, vss
 from semstab.results import STAGES, FrameReport, GroupResult, RunResult, Unit, slug
 from semstab.voxels import Events, VoxelTable
+
+Maps = Mapping[str, npt.NDArray[Any]]
 
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
@@ -97,9 +100,11 @@ class RunFolder:
         """Mark the group as finished; from now on it is kept."""
         write_json(self._group_path(scene, backbone), {"key": key, **result.to_dict()})
 
-    def save_unit(self, unit: Unit, table: VoxelTable, events: Events | None, rows: list[FrameRow]) -> None:
-        """Write a unit's voxels, its time series and, where given, its log of observations."""
-        save_voxels(table, self.voxels_path(unit))
+    def save_unit(
+        self, unit: Unit, table: VoxelTable, events: Events | None, rows: list[FrameRow], maps: Maps | None = None
+    ) -> None:
+        """Write a unit's voxels, with further columns `maps`, its time series and, where given, its observations."""
+        save_voxels(table, self.voxels_path(unit), maps)
         text = io.StringIO()
         writer = csv.DictWriter(text, FRAME_COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -137,10 +142,10 @@ class RunFolder:
             raise ConfigError(f"{self.path}: holds a run with other settings ({changed}); choose another folder")
 
 
-def save_voxels(table: VoxelTable, path: Path) -> None:
-    """Write a voxel table together with its measures."""
+def save_voxels(table: VoxelTable, path: Path, maps: Maps | None = None) -> None:
+    """Write a voxel table together with its measures, and further columns (n,) by name."""
     measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
-    table.save(path, measures)
+    table.save(path, measures | dict(maps or {}))
 
 
 def group_key(config: Config, scene: str, backbone: str, digest: str) -> str:

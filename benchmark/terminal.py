@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -68,11 +68,24 @@ def print_summary(result: RunResult, console: Console) -> None:
     if len({run.unit.backend for run in result.runs}) > 1:
         console.print(_agreement_table(result.agreement))
     console.print(_stages_line(shown), soft_wrap=True)
+    for line in _verdict_lines(result):
+        console.print(line, highlight=False)
     once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
     console.print(
         f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
         "Read VSS, SBD and entropy by OP, or for OP>=3."
     )
+
+
+def _verdict_lines(result: RunResult) -> Iterator[str]:
+    """The verdict on each backbone, scene by scene, from the fullest statistics that a backend of the run has."""
+    several = len(_scenes(result.runs)) > 1
+    for group in result.groups:
+        judged = [run for run in group.runs if run.statistics]
+        if judged:
+            fullest = max(judged, key=lambda run: sum(section is not None for section in run.statistics.values()))
+            scene = f"{fullest.unit.scene}, " if several else ""
+            yield f"{scene}{fullest.statistics['verdict']['line']}\n"
 
 
 def _once(run: UnitSummary) -> int:

@@ -57,7 +57,7 @@ def test_the_limit_is_what_is_free_where_none_is_set(root, monkeypatch) -> None:
         require_memory(task, config, read(task, 0))
 
 
-def test_no_further_frame_is_read_where_one_voxel_a_pixel_would_fit(root, monkeypatch) -> None:
+def test_no_further_frame_is_read_where_there_is_ample_room(root, monkeypatch) -> None:
     task, config = planned(root)
     first = read(task, 0)
     monkeypatch.setattr(memory, "read", lambda *_: pytest.fail("a frame was read"))

@@ -294,6 +294,11 @@ def test_every_figure_is_written_as_png_and_svg(drawn):
         "sensitivity_voxel_size",
         "sensitivity_depth_noise",
         "sensitivity_frame_count",
+        "temporal_agreement",
+        "drift",
+        "sensitivity_agreement_voxel_size",
+        "sensitivity_agreement_depth_noise",
+        "sensitivity_agreement_frame_count",
     ]
     assert paths == [folder / "figures" / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
 

@@ -19,12 +19,14 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.plan import read
 from semstab.results import Unit
+from semstab.statistics import compare_backbones, nulls
 from semstab.study import load_study_result, run_study
 from semstab.study.folder import StudyFolder
 from semstab.study.grid import make_grid
 from semstab.study.jobs import Job, Request, run_job
 from semstab.study.results import BACKENDS, Variation
 from semstab.study.run import split
+from semstab.tables import tables
 
 
 @pytest.fixture
@@ -287,21 +289,54 @@ def test_frames_without_ground_truth_are_in_no_clip(root, tmp_path) -> None:
     assert a.image_space.self_vc8 >= 0
 
 
-def test_statistics_come_with_every_unit_where_they_are_wanted(root, tmp_path) -> None:
+def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(root, tmp_path) -> None:
     config = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a", "gt"])
-    run_study(config, tmp_path / "out")
+    before = run_study(config, tmp_path / "out").records
     wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a", "gt"], statistics=True)
     assert len(count(wanted, tmp_path / "out").computed) == 4
     result = run_study(wanted, tmp_path / "out")
-    run = semstab.run(make_grid(wanted.resolved()).cells[0].config, out=tmp_path / "run").runs[0]
+    settings = make_grid(wanted.resolved()).cells[0].config.model_copy(update={"events": True})
+    run = semstab.run(settings, out=tmp_path / "run").runs[0]
     events = semstab.Events.load(tmp_path / "run" / "events" / f"{run.unit.slug}.parquet")
     base, gt, *swept = result.records
     assert base.statistics["agreement"]["psa"]["value"] == pytest.approx(psa_by_definition(events))
-    assert base.statistics["drift"] is not None  # the events were kept
+    assert base.statistics["drift"]["tests"] is not None  # the events were kept
     assert base.statistics["correctness"] is not None  # against the truth, which no map of the truth itself has
     assert gt.statistics["correctness"] is None
     assert all(record.statistics["voxel_size"] == 0.5 for record in swept)
-    assert all(record.statistics == {} for record in run_study(config, tmp_path / "out").records)
+    assert before[0].statistics["agreement"] == base.statistics["agreement"]
+    assert before[0].statistics["drift"]["tests"] is before[0].statistics["correctness"] is None
+    again = run_study(config, tmp_path / "out").records
+    assert [record.statistics for record in again] == [record.statistics for record in before]
+
+
+def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_path) -> None:
+    settings = {"sweeps": {}, "backends": [], "backbones": ["a", "b", "gt"]}
+    assert run_study(configure(root, **settings), tmp_path / "plain").comparisons == ()
+    config = configure(root, **settings, statistics=True)
+    result = run_study(config, tmp_path / "out")
+    (found,) = result.comparisons
+    maps = {record.unit.backbone: record.table() for record in result.select()}
+    truth = maps.pop("gt")
+    expected = {"scene": "wall"} | nulls(compare_backbones(maps, truth=truth))
+    assert found == expected
+    assert {row["measure"] for row in found["paired"]["differences"]} >= {"psa", "alpha", "accuracy"}
+    for other in (load_study_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept
+        assert other.comparisons == result.comparisons
+        assert [r.statistics for r in other.records] == [r.statistics for r in result.records]
+
+
+def test_a_study_of_an_earlier_version_still_loads(root, tmp_path) -> None:
+    result = run_study(configure(root, sweeps={}, backends=[]), tmp_path / "out")
+    content = json.loads((tmp_path / "out" / "summary.json").read_text())
+    del content["comparisons"]
+    for run in content["runs"]:
+        run["statistics"] = {}
+    (tmp_path / "out" / "summary.json").write_text(json.dumps(content))
+    loaded = load_study_result(tmp_path / "out")
+    assert [record.statistics for record in loaded.records] == [{}] * len(result.records)
+    assert "scenes" in (names := [table.name for table in tables(loaded)])
+    assert not {"verdicts", "temporal_agreement", "drift"} & set(names)
 
 
 def psa_by_definition(events) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -80,14 +81,20 @@ def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file,
 
 def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
     arguments = (file, "--set", "backends=[numba]", "--set", "backbones=[a]", "--only", "backends")
-    out, errors = study(*arguments, cwd=tmp_path)
-    for name in ("report.html", "manifest.json", "study.yaml", "tables/scenes.csv", "figures/persistence.png"):
+    out, errors = study(*arguments, "--set", "statistics=true", cwd=tmp_path)
+    files = ("report.html", "manifest.json", "study.yaml", "tables/scenes.csv", "figures/persistence.png")
+    for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex", "figures/correctness.svg"):
         assert (tmp_path / "studies/tiny" / name).exists()
     assert max(len(line) for line in (out + errors).splitlines()) <= 80
     assert "agree" in out
     assert "seen once" in out
+    assert "a: no verdict, too few places were seen twice" in " ".join(out.split())
     assert "study folder: studies/tiny" in out
+    page = (tmp_path / "studies/tiny/report.html").read_text()
+    assert {"table-quadrants", "table-verdicts", "figure-correctness"} <= set(re.findall(r'id="([^"]+)"', page))
     runs = json.loads((tmp_path / "studies/tiny/summary.json").read_text())["runs"]
+    (base,) = (run for run in runs if run["variation"]["sweep"] == "base")
+    assert base["statistics"]["correctness"]["quadrants"]["voxels"] > 0
     assert {run["variation"]["sweep"] for run in runs} == {"base", "backends"}
 
 

@@ -22,6 +22,7 @@ from wall_study import BACKBONES, STEPS, wall_study
 
 from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.metrics import entropy, op, sbd, vss
+from semstab.statistics import Estimate
 from semstab.study.results import BACKENDS, SHARED, ImageSpace, RegionFlicker, StudyResult
 from semstab.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
 from semstab.testing import checks
@@ -60,15 +61,23 @@ def test_the_walls_tables_are_as_in_the_golden_file(walls, suffix):
 def test_a_study_of_everything_has_every_table(walls):
     assert [table.name for table in tables(walls)] == [
         "glance",
+        "verdicts",
         "flicker",
         "flicker_by_scene",
         "scenes",
         "persistence",
         "classes",
+        "temporal_agreement",
+        "class_agreement",
+        "drift",
+        "uncertainty",
         "cross_backbone",
         "sensitivity_voxel_size",
+        "sensitivity_agreement_voxel_size",
         "sensitivity_depth_noise",
+        "sensitivity_agreement_depth_noise",
         "sensitivity_frame_count",
+        "sensitivity_agreement_frame_count",
         "fusion",
         "agreement",
     ]
@@ -286,6 +295,10 @@ def test_the_agreement_says_who_agrees(walls):
         (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
         (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"),
         (Column("", ""), "road", "road"),
+        (Column("", "", 2), Estimate(0.481, 0.326, 0.61), "0.48 (0.33, 0.61)"),
+        (Column("", "", 2, signed=True), Estimate(0.02, -0.01, 0.05), "+0.02 (-0.01, +0.05)"),
+        (Column("", "", 2), Estimate(0.481, math.nan, math.nan), "0.48"),
+        (Column("", "", 2), Estimate(math.nan, math.nan, math.nan), "--"),
     ],
 )
 def test_a_cell_in_print(column, cell, text):
@@ -307,7 +320,7 @@ def test_csv_holds_the_numbers_of_the_json_rounded(walls):
         for row, full in zip(rows, exact, strict=True):
             for column in table.columns:
                 value = full[column.key]
-                value = value["mean"] if isinstance(value, dict) else value
+                value = value.get("mean", value.get("value")) if isinstance(value, dict) else value
                 if isinstance(value, str):
                     assert row[column.key] == value
                 elif math.isnan(value):
@@ -322,6 +335,14 @@ def test_csv_gives_the_spread_a_column_of_its_own(walls):
     assert undisturbed["vss_sd"] == ""
     assert float(disturbed["vss_sd"]) >= 0
     assert "voxels_sd" not in disturbed
+
+
+def test_an_interval_has_fields_of_its_own():
+    columns = (Column("x", "X", 2), Column("y", "Y", 1))
+    table = Table("t", "t", "t", columns, (Group("", ((Estimate(-0.5, -0.75, 0.25), 1.0), (0.5, 2.0))),), by="")
+    assert to_csv(table).splitlines() == ["x,x_low,x_high,y", "-0.50,-0.75,0.25,1.0", "0.50,,,2.0"]
+    assert to_json(table)["rows"][0]["x"] == {"value": -0.5, "low": -0.75, "high": 0.25}
+    assert r"$-$0.50 ($-$0.75, 0.25)" in to_latex(table)
 
 
 NASTY = r"a|b_c & 50% #1 {x} $y$ ~^ \z <b>*i* [l](u) `c` é ≥ ±"

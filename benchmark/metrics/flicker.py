@@ -11,7 +11,6 @@ import numpy.typing as npt
 from semstab.errors import DataError
 from semstab.frames import Frame
 from semstab.labels import flat
-from semstab.pixel_kernel import count_changed
 from semstab.warp import DEPTH_TOLERANCE, correspond
 
 
@@ -26,6 +25,8 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
         raise DataError(
             f"{current.where('depth')}: frames {previous.index} and {current.index} differ in size ({sizes})"
         )
+    from semstab.pixel_kernel import count_changed
+
     images = (previous.valid, previous.predicted, current.valid, current.predicted)
     both, changed = count_changed(*(flat(image) for image in images))
     return 100.0 * changed / both if both else math.nan

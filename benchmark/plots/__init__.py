@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from semstab.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
 from semstab.plots.histograms import Histogram, together
+from semstab.plots.judgement import statistics_figures
 from semstab.plots.maps import Overview, draw_overview, draw_stability
 from semstab.plots.style import Figure
 from semstab.plots.sweeps import draw_sweep
@@ -40,6 +41,7 @@ def figures(result: StudyResult, folder: str | Path) -> list[Figure]:
         *_distributions(kept),
         *_maps(result, kept),
         *_sweeps(result),
+        *statistics_figures(result, kept),
     ]
 
 

@@ -98,10 +98,10 @@ def _draw_column(rows: Panels, histogram: Histogram, shade: str) -> None:
     rows[2].vlines(x, 0.5, voxels[present], color=shade, linewidth=3)
     rows[2].axhline(ENOUGH, color=INK, linewidth=0.6, linestyle=":")
     rows[2].set(xscale="log", yscale="log", ylim=(0.5, None))
-    _mark_op(rows[2], x[-1])
+    mark_op(rows[2], x[-1])
 
 
-def _mark_op(axes: Axes, largest: float) -> None:
+def mark_op(axes: Axes, largest: float) -> None:
     """Ticks at round OP on the logarithmic axis."""
     from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 

@@ -1,4 +1,4 @@
-"""Maps from above: stability category, SBD and entropy; and the overview from image to map (paper, its two maps)."""
+"""Maps from above: stability, drift, entropy and where it comes from; and the overview from image to map."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, dominant, e
 from semstab.plots.histograms import MOST_DRIFT
 from semstab.plots.style import COLUMN, FAINT, INK, PAGE, canvas, mark_panel
 from semstab.plots.topdown import EMPTY, Float64, Int64, top_down
+from semstab.results import RECURRENT
+from semstab.statistics import decompose, psa
+from semstab.statistics.correctness import STABLE
 from semstab.voxels import VoxelTable
 
 if TYPE_CHECKING:
@@ -31,6 +34,15 @@ Colors = Sequence[tuple[int, int, int]]
 BLANK = (255, 255, 255)
 UNDEFINED = "#cccccc"
 COLORMAP = "YlOrRd"
+RIGHT_COLORS = (
+    ("OP < 3, or no truth", (204, 204, 204)),
+    ("stable, right", (86, 180, 233)),
+    ("unstable, right", (0, 114, 178)),
+    ("unstable, wrong", (240, 228, 66)),
+    ("stable, wrong", (213, 94, 0)),
+)
+"""What is known of a voxel, in Okabe and Ito's colours."""
+
 WIDE = 1.4
 """A map this many times as wide as high or more has its panels beneath each other."""
 
@@ -49,6 +61,39 @@ def draw_stability(table: VoxelTable, up: Sequence[float]) -> Figure:
         _frame(axes)
         _scale_bar(axes, rows.shape[1], cell)
     return figure
+
+
+def draw_uncertainty(table: VoxelTable, up: Sequence[float], wrong: npt.NDArray[np.integer[Any]] | None) -> Figure:
+    """Entropy within and between frames of the topmost voxels and, where truth tells, which are stable and wrong.
+
+    `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel.
+    """
+    rows, cell = top_down(table, up)
+    figure, panels = _panels(rows, 2 if wrong is None else 3)
+    parts, again = decompose(table), table.op > 1
+    most = math.log(2) / math.log(table.K)
+    for axes, values in zip(panels, (parts.within, parts.between), strict=False):
+        _draw_measure(figure, axes, rows, np.where(again, values, np.nan), most)
+    if wrong is not None:
+        panels[2].imshow(_painted(rows, wrong, [shade for _, shade in RIGHT_COLORS]), interpolation_stage="rgba")
+        entries = [(name, tuple(channel / 255 for channel in shade)) for name, shade in RIGHT_COLORS]
+        columns = len(entries) if figure.get_figwidth() > COLUMN else 2
+        figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
+    titles = ("entropy within frames", "entropy between frames", "right and wrong")
+    for axes, letter, title in zip(panels, "abc", titles, strict=False):
+        mark_panel(axes, letter, title)
+        _frame(axes)
+        _scale_bar(axes, rows.shape[1], cell)
+    return figure
+
+
+def right_or_wrong(table: VoxelTable, truth: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """What is known of each voxel (n,), a row of RIGHT_COLORS, by its true class (n,), -1 where that is not known."""
+    with np.errstate(invalid="ignore"):
+        stable = psa(table) >= STABLE - 1e-9
+    right = dominant(table) == truth
+    known = (truth >= 0) & (table.op >= RECURRENT)
+    return np.where(known, np.where(right, np.where(stable, 1, 2), np.where(stable, 4, 3)), 0)
 
 
 @dataclass(frozen=True, eq=False)

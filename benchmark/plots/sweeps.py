@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from semstab.averages import ENOUGH, Level, Pooled, Sweep
@@ -21,17 +21,15 @@ def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figu
     values = sorted({level.value for levels in backbones.values() for level in levels})
     for k, levels in enumerate(backbones.values()):
         x = [values.index(level.value) for level in levels]
-        _line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), recurrent=None)
+        draw_line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), marker="s")
         for axes, measure in ((vss, "vss"), (sbd, "sbd")):
-            _line(axes, x, levels, _of_group("every", measure), color(k), recurrent=False)
+            draw_line(axes, x, levels, _of_group("every", measure), color(k))
             enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
             at = [values.index(level.value) for level in enough]
-            _line(axes, at, enough, _of_group("recurrent", measure), color(k), recurrent=True)
+            draw_line(axes, at, enough, _of_group("recurrent", measure), color(k), open_=True)
     titles = ("recurrent share (%)", "VSS", "SBD (bits)")
     for axes, letter, title in zip((share, vss, sbd), "abc", titles, strict=True):
-        axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
-        axes.set_xlim(-0.3, len(values) - 0.7)
-        axes.set_xlabel(f"{sweep.title.split(',')[0]} ({sweep.unit})" if sweep.unit else sweep.title)
+        mark_values(axes, sweep, values)
         mark_panel(axes, letter, title)
     share.set_ylim(bottom=0)
     figure.legend(handles=_legend(list(backbones)), loc="outside lower center", ncols=len(backbones) + 2)
@@ -42,14 +40,24 @@ def _of_group(group: str, measure: str) -> Callable[[Pooled], float]:
     return lambda pooled: float(getattr(getattr(pooled, group), measure))
 
 
-def _line(
+def mark_values(axes: Axes, sweep: Sweep, values: Sequence[float]) -> None:
+    """The swept values along the x axis, at equal distances."""
+    axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
+    axes.set_xlim(-0.3, len(values) - 0.7)
+    axes.set_xlabel(f"{sweep.title.split(',')[0]} ({sweep.unit})" if sweep.unit else sweep.title)
+
+
+def draw_line(
     axes: Axes,
-    x: list[int],
-    levels: tuple[Level, ...] | list[Level],
+    x: Sequence[int],
+    levels: Sequence[Level],
     measure: Callable[[Pooled], float],
     shade: str,
-    recurrent: bool | None,
+    *,
+    marker: str = "o",
+    open_: bool = False,
 ) -> None:
+    """A measure along a sweep, with the standard deviation over repeats; `open_` dashes it and opens the markers."""
     spreads = [level.spread(measure) for level in levels]
     errors = [0.0 if math.isnan(spread.sd) else spread.sd for spread in spreads]
     axes.errorbar(
@@ -57,9 +65,9 @@ def _line(
         [spread.mean for spread in spreads],
         yerr=errors if any(errors) else None,
         color=shade,
-        linestyle="--" if recurrent else "-",
-        marker="s" if recurrent is None else "o",
-        markerfacecolor="white" if recurrent else shade,
+        linestyle="--" if open_ else "-",
+        marker=marker,
+        markerfacecolor="white" if open_ else shade,
         capsize=2,
         elinewidth=0.8,
     )

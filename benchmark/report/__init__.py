@@ -83,7 +83,7 @@ class Topic:
 
 
 TOPICS = (
-    Topic("glance", "At a glance", "", ("glance", "overview")),
+    Topic("glance", "At a glance", "", ("glance", "verdicts", "overview")),
     Topic(
         "flicker",
         "In image space",
@@ -111,23 +111,68 @@ TOPICS = (
         ("classes",),
     ),
     Topic(
+        "agreement_of_frames",
+        "Do the frames agree about a place?",
+        "These measures do not depend on how often a place was seen. Read alpha: 1 is perfect, 0 is what chance gives;"
+        " where its interval is wide, the data do not decide. Agreement is not truth.",
+        ("temporal_agreement", "class_agreement"),
+    ),
+    Topic(
+        "drift",
+        "Does the belief drift?",
+        "SBD is largest for noise seen twice and falls with every further look. Where it equals what a random order of"
+        " the same observations gives, that fall is arithmetic. A belief that moves one way over time shows in the"
+        " trend, not in SBD.",
+        ("drift",),
+    ),
+    Topic(
         "backbones",
         "Backbones in one taxonomy",
         "Compare backbones where voxels recur, and look at their recurrent shares beside.",
         ("cross_backbone",),
     ),
     Topic(
+        "comparison",
+        "Which backbone is steadier?",
+        "On the same places, and at the same number of looks. A difference counts where its interval leaves out 0; look"
+        " at what each map covers before.",
+        ("comparison",),
+    ),
+    Topic(
+        "ceiling",
+        "Geometry or model?",
+        "Labels that never err disagree as well, where pixels fall into the wrong voxel or a voxel holds two things."
+        " Only the rest can be the model's.",
+        ("ceiling",),
+    ),
+    Topic(
+        "correctness",
+        "Is what is stable also right?",
+        "Stable and wrong is the dangerous part: no second look reveals it. Do not compare accuracy between strata as"
+        " if the number of looks caused it: what is seen often is another part of the scene.",
+        ("correctness", "quadrants"),
+    ),
+    Topic(
+        "rules",
+        "Does the rule of fusion matter?",
+        "The same observations under other rules. If the order of the backbones changes, do not rest a choice on it.",
+        ("rules",),
+    ),
+    Topic(
         "maps",
         "Where it is unstable",
-        "Stable: seen three times or more, a clear answer, little drift. Low persistence says nothing either way.",
-        ("stability_map",),
+        "Stable: seen three times or more, a clear answer, little drift. Low persistence says nothing either way."
+        " Entropy within frames lies at borders and in voxels larger than things, entropy between them where frames"
+        " disagree.",
+        ("uncertainty", "stability_map"),
         one_per_backbone=True,
     ),
     Topic(
         "sensitivity",
         "What the association does to the numbers",
         "Voxel size, noise and sampling change which observations meet in a voxel, and so how many voxels could be"
-        " contradicted at all. Compare the values over all voxels with those of the recurrent ones and their share.",
+        " contradicted at all. Compare the values over all voxels with those of the recurrent ones and their share, and"
+        " with the agreement of frames, which does not depend on it.",
         ("sensitivity",),
     ),
     Topic(
@@ -157,12 +202,12 @@ def _topics(result: StudyResult, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def _unfolded(shown: Sequence[Figure], result: StudyResult) -> tuple[list[Figure], list[Figure]]:
-    """The first figure of each backbone, and the rest."""
-    first: dict[str, Figure] = {}
+    """The first figure of each kind and backbone, and the rest."""
+    first: dict[tuple[str, str], Figure] = {}
     for figure in shown:
         for backbone in result.backbones:
             if figure.name.endswith(slug("", backbone)):
-                first.setdefault(backbone, figure)
+                first.setdefault((figure.name.partition("__")[0], backbone), figure)
     return list(first.values()), [figure for figure in shown if figure not in first.values()]
 
 
@@ -207,7 +252,8 @@ def _cell(text: str) -> str:
     """A cell as typography has it: minus signs, a dash for what is undefined."""
     if text == "--":
         return "\N{EN DASH}"
-    return relations(re.sub(r"^-(?=\d)|(?<=e)-", "\N{MINUS SIGN}", text) if text[-1:].isdigit() else text)
+    number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)
+    return relations(re.sub(r"(^|(?<=\()|(?<=, )|(?<=e))-(?=\d)", "\N{MINUS SIGN}", text) if number else text)
 
 
 def _figure(figure: Figure, folder: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.averages import ENOUGH, Pooled, by_backbone, pooled
@@ -21,6 +22,7 @@ def reading(result: StudyResult, found: Sequence[Finding]) -> list[str]:
     return [
         *_once(pooled(records)),
         *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
+        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
         *_ranking(result),
         *_flicker(records),
         *_least_seen(records),
@@ -46,6 +48,17 @@ def _recurrent(backbone: str, voxels: Pooled) -> Iterator[str]:
         )
     else:
         yield f"{backbone} has {voxels.recurrent.voxels:,} voxels with three looks or more: too few to judge it by."
+
+
+def _verdict(records: Sequence[Record]) -> Iterator[str]:
+    """The verdict on a backbone; of several scenes, in how many each level was reached."""
+    judged = [record for record in records if record.statistics]
+    if len(judged) == 1:
+        yield f"{judged[0].statistics['verdict']['line']}."
+    elif judged:
+        levels = Counter(record.statistics["verdict"]["level"] for record in judged)
+        parts = (f"{level} in {n} scene{'' if n == 1 else 's'}" for level, n in levels.items())
+        yield f"Verdict on {judged[0].unit.backbone}: {', '.join(parts)}."
 
 
 def _ranking(result: StudyResult) -> Iterator[str]:

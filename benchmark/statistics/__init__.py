@@ -9,6 +9,7 @@ from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.blocks import BlockBootstrap, Blocks, Estimate, spatial_blocks
 from semstab.statistics.ceiling import Losses, ceiling, losses, rendered
 from semstab.statistics.comparison import coverage, paired, sign_flip_test, standardised
+from semstab.statistics.content import estimate_at, nulls, number_at
 from semstab.statistics.correctness import (
     Correctness,
     Quadrants,
@@ -62,6 +63,7 @@ __all__ = [
     "coverage",
     "decompose",
     "describe",
+    "estimate_at",
     "expected_sbd",
     "fleiss_kappa",
     "flips",
@@ -69,6 +71,8 @@ __all__ = [
     "join_truth",
     "krippendorff_alpha",
     "losses",
+    "nulls",
+    "number_at",
     "paired",
     "psa",
     "quadrants",

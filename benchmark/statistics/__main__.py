@@ -8,9 +8,11 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from semstab.config import read_yaml
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import SemstabError
 from semstab.files import read_json, write_json
+from semstab.metrics.summary import STRATA
 from semstab.results import Unit
 from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.description import analyse
@@ -37,6 +39,7 @@ def main() -> int:
 
 
 def _statistics(run: Path, maps: Path | None, seed: int) -> dict[str, Any]:
+    edges = read_yaml(run / "config.yaml").get("strata", STRATA)
     groups: dict[tuple[str, str], list[Unit]] = defaultdict(list)
     for row in read_json(run / "summary.json")["runs"]:
         groups[row["scene"], row["backend"]].append(Unit(row["scene"], row["backbone"], row["backend"]))
@@ -48,7 +51,9 @@ def _statistics(run: Path, maps: Path | None, seed: int) -> dict[str, Any]:
         truth = tables.get(GROUND_TRUTH)
         for unit in units:
             name, reference = unit.backbone, None if unit.backbone == GROUND_TRUTH else truth
-            found = analyse(tables[name], events.get(name), reference, limit=reference, name=name, seed=seed)
+            found = analyse(
+                tables[name], events.get(name), reference, limit=reference, name=name, seed=seed, edges=edges
+            )
             content["maps"].append({"scene": scene, "backbone": name, "backend": backend} | found.summary)
             _say(f"{scene}, {name}, {backend}", lines(found.summary))
             if maps is not None:

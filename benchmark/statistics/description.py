@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.information import normalise
-from semstab.metrics import dominant, entropy, sbd, strata, vss
+from semstab.metrics import dominant, sbd, strata, vss
 from semstab.metrics.summary import STRATA
 from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
@@ -46,7 +46,7 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
-from semstab.statistics.matching import require_same_map
+from semstab.statistics.matching import require_same_map, rows_of
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 from semstab.voxels import Events, VoxelTable
@@ -107,10 +107,10 @@ def analyse(
         require_same_map(table, events)
     again = table.op >= 2
     blocks = spatial_blocks(table.index[again], table.voxel_size)
-    means = _Means(table, again, BlockBootstrap(blocks, seed=seed))
+    means = _Means(again, BlockBootstrap(blocks, seed=seed))
     maps: Maps = {"psa": psa(table)}
     known = None if truth is None else join_truth(table, truth)
-    agreement = _agreement(table, events, means)
+    agreement = _agreement(table, events, means, maps)
     drift = _drift(table, events, means, maps, seed)
     uncertainty = _uncertainty(table, means, maps)
     right = None if known is None else _correctness(table, known, means, maps, edges, seed)
@@ -152,8 +152,7 @@ def analyse(
 class _Means:
     """Means over the voxels with OP >= 2, with their intervals from one bootstrap."""
 
-    def __init__(self, table: VoxelTable, again: npt.NDArray[np.bool_], bootstrap: BlockBootstrap) -> None:
-        self.table = table
+    def __init__(self, again: npt.NDArray[np.bool_], bootstrap: BlockBootstrap) -> None:
         self.again = again
         self.bootstrap = bootstrap
 
@@ -166,17 +165,18 @@ class _Means:
     def function(
         self, columns: Float64, statistic: Callable[[Float64], Float64], bounds: tuple[float, float]
     ) -> Estimate:
-        """Of a statistic of the sums of columns (n, C)."""
-        return self.bootstrap.estimate(columns[self.again], statistic, bounds)
+        """Of a statistic of the sums of columns (m, C) of the m voxels with OP >= 2."""
+        return self.bootstrap.estimate(columns, statistic, bounds)
 
 
-def _agreement(table: VoxelTable, events: Events | None, means: _Means) -> dict[str, Any]:
+def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> dict[str, Any]:
+    repeated = rows_of(table, means.again)
     return {
-        "psa": means.mean(psa(table)),
-        "kappa": means.function(kappa_columns(table), kappa_of, (-1.0, 1.0)),
-        "alpha": means.function(alpha_columns(table), alpha_of, (-1.0, 1.0)),
+        "psa": means.mean(maps["psa"]),
+        "kappa": means.function(kappa_columns(repeated), kappa_of, (-1.0, 1.0)),
+        "alpha": means.function(alpha_columns(repeated), alpha_of, (-1.0, 1.0)),
         "vss": means.mean(vss(table)),
-        "classes": class_agreement(table, events),
+        "classes": class_agreement(repeated) if events is None else class_agreement(table, events),
     }
 
 
@@ -219,7 +219,7 @@ def _drift(table: VoxelTable, events: Events | None, means: _Means, maps: Maps, 
 
 def _tests(table: VoxelTable, drift: VoxelDrift, scene: SceneDrift, means: _Means, maps: Maps) -> dict[str, Any]:
     one_way, by_chance, all_of_it = trend_columns(table, drift).T
-    excess = np.stack([one_way - by_chance, all_of_it], axis=1)
+    excess = np.stack([one_way - by_chance, all_of_it], axis=1)[means.again]
     return {
         "sbd_p": scene.p_value,
         "trend": scene.trend,
@@ -286,7 +286,8 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> lis
 
 
 def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> list[dict[str, Any]]:
-    columns = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table)} | {
+    within, between = maps["entropy_within"], maps["entropy_between"]
+    columns = {"vss": vss(table), "sbd": sbd(table), "entropy": within + between} | {
         name: maps[name] for name in ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_between")
     }
     rows = []

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import reduce
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +45,14 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
     keys = voxel_keys(*(table.index for table in tables))
     common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
     return [np.searchsorted(own, common).astype(np.int64) for own in keys]
+
+
+def rows_of(table: VoxelTable, where: npt.NDArray[np.bool_]) -> VoxelTable:
+    """The voxels of a table for which `where` (n,) holds."""
+    columns: dict[str, Any] = {
+        name: value[where] for name, value in vars(table).items() if isinstance(value, np.ndarray)
+    }
+    return dataclasses.replace(table, **columns)
 
 
 def require_same_grid(*tables: VoxelTable) -> None:

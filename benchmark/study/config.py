@@ -32,7 +32,7 @@ from semstab.study.results import BACKENDS, BASE, SHARED
 
 BASE_SETTINGS = (
     "dataset", "scenes", "backbones", "taxonomy", "voxel_size", "pixel_stride", "frames", "exclude", "perturbation",
-    "strata", "tolerance",
+    "strata", "tolerance", "statistics",
 )  # fmt: skip
 """What a study shares with `semstab.Config`, by the same names."""
 
@@ -150,7 +150,8 @@ class StudyConfig(Settings):
     seed: int = Field(0, ge=0, description="of the noise; the n-th repeat takes seed + n")
     statistics: bool = Field(
         False,
-        description="also what `semstab.statistics` says of each unit; keeps every observation, fuses the truth too",
+        description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
+        " other; keeps every observation, fuses the ground truth too",
     )
     threads: int | None = Field(None, ge=1, exclude=True, description="threads that decode frames ahead, in all jobs")
     memory_gb: float | None = Field(
@@ -197,7 +198,12 @@ class StudyConfig(Settings):
     def base(self, scene: str | None = None) -> Config:
         """The base settings as a run's, with the frames of a scene where it is named."""
         settings = {name: getattr(self, name) for name in BASE_SETTINGS}
-        settings |= {"backends": [self.backend], "check": None, "events": self.statistics, "memory_gb": self.memory_gb}
+        settings |= {
+            "backends": [self.backend],
+            "check": None,
+            "statistics": self.statistics,
+            "memory_gb": self.memory_gb,
+        }
         if self.perturbation is not None:
             settings["perturbation"] = self.perturbation.model_copy(update={"seed": self.seed})
         if scene is not None:

@@ -69,7 +69,6 @@ class StudyFolder:
                 variation=cell.variation,
                 summary=UnitSummary.from_dict(content["summary"]),
                 image_space=read_image_space(content["image_space"]) if cell.image_space else ImageSpace(),
-                statistics=content["statistics"] if cell.statistics else {},
                 voxels=self._voxels(cell.unit) if cell.voxels else None,
             )
         except (KeyError, TypeError, ValueError) as error:

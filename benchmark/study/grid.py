@@ -60,18 +60,13 @@ class Cell:
         return self.task.units[0]
 
     @property
-    def statistics(self) -> bool:
-        """Whether the statistics of its map are wanted."""
-        return self.request().statistics
-
-    @property
     def digest(self) -> str:
         """A hash of its input."""
         return self.task.digest
 
     def parts(self) -> list[str]:
         """What its unit's file must have."""
-        wanted = {"summary": True, "image_space": self.image_space, "statistics": self.statistics}
+        wanted = {"summary": True, "image_space": self.image_space}
         return [name for name, is_wanted in wanted.items() if is_wanted]
 
     def request(self) -> Request:
@@ -168,7 +163,7 @@ def _region_cells(config: StudyConfig, scenes: Mapping[str, Scene]) -> Iterator[
         for backbone in selected(config.region_maps, scene.backbones, regions, "region map", name):
             settings = config.base(name).model_copy(update={"backbones": [backbone]})
             unit, frames = [name, backbone], frame_indices(scene, settings)
-            fused_only = {"voxel_size", "strata"}
+            fused_only = {"voxel_size", "strata", "statistics"}
             yield RegionCell(
                 settings, scene, backbone, _hash(settings, {"regions": unit, "frames": frames}, fused_only)
             )
@@ -211,7 +206,9 @@ def _changed(settings: Mapping[str, Any], base: Config) -> Config:
 
 
 def _fused_by(backend: BackendConfig, base: Config) -> Config:
-    return base.model_copy(update={"backends": [BackendConfig(name=backend.name, options=backend.options)]})
+    """By another backend, whose map is compared with the base one: that one's statistics are enough."""
+    named = BackendConfig(name=backend.name, options=backend.options)
+    return base.model_copy(update={"backends": [named], "statistics": False})
 
 
 def _evenly_sampled(count: int, base: Config) -> Config:

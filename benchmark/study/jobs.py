@@ -27,11 +27,6 @@ class Request:
     voxels: bool = False
     regions: bool = False
 
-    @property
-    def statistics(self) -> bool:
-        """Whether statistics are wanted: they are why a unit keeps its events."""
-        return self.config.events and not self.regions
-
 
 @dataclass(frozen=True)
 class Job:

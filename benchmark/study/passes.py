@@ -18,7 +18,8 @@ from semstab.backends import FusionBackend
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.disk import file_digest
-from semstab.errors import ConfigError, DataError
+from semstab.errors import DataError
+from semstab.evaluation import analyse_map, truth_task
 from semstab.files import atomic_path
 from semstab.frames import Frame
 from semstab.memory import available_bytes, require_memory
@@ -27,7 +28,6 @@ from semstab.plan import Task, prepare, tasks_of
 from semstab.prefetch import Fetched, prefetch
 from semstab.results import slug
 from semstab.run_folder import FrameRow, save_voxels
-from semstab.statistics import describe
 from semstab.study.image_space import ImageSpaceMeter
 from semstab.study.jobs import Job, Outcome, Request, failed, message, shared_marker
 from semstab.study.results import OVERVIEW, VOXELS
@@ -84,7 +84,7 @@ class _Stream:
         self.previous: Frame | None = None
         self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
-        self.truth_task = _truth_task(self.task) if takes_truth else None
+        self.truth_task = truth_task(self.task) if takes_truth else None
         self.poses: list[Any] = []
         self.shown = self.task.indices[len(self.task.indices) // 2] if self.image_space is not None else None
         self.overview: dict[str, Any] = {}
@@ -143,7 +143,7 @@ class Pass:
         """An empty map for a unit; none where it fails."""
         with self._failing([request]):
             (task,) = tasks_of(self._scene, request.config)
-            truth = _truth_map(request.config, task) if request.statistics else None
+            truth = _truth_map(request.config, task) if request.config.statistics else None
             return [_Map(request, task, _new_map(request.config, task), truth)]
         return []
 
@@ -182,22 +182,20 @@ class Pass:
         """Measure a finished map."""
         with self._failing([one.request]):
             task, config, unit = one.task, one.request.config, one.task.units[0]
-            table = dataclasses.replace(one.backend.table(), classes=task.mapping.target.classes)
+            table = _table(one.backend, task)
             require_voxels(task, config, {unit: table})
-            summary = unit_summary(task, config, table, unit, one.rows)
+            truth = None if one.truth is None else _table(one.truth, task)
+            found = analyse_map(task, config, table, one.backend.events() if config.statistics else None, truth)
+            summary = unit_summary(task, config, table, unit, one.rows, found.summary)
             content: dict[str, Any] = {"input": task.digest, "summary": summary.to_dict()}
             files: dict[str, Callable[[Path], None]] = {}
             if one.request.image_space and stream.image_space is not None:
                 content["image_space"] = dataclasses.asdict(stream.image_space.result(summary.flicker_percent))
                 content["up"] = _up(self._scene, table, stream.poses)
                 files[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
-            if one.request.statistics:
-                truth = None if one.truth is None else one.truth.table()
-                content["statistics"] = describe(
-                    table, one.backend.events(), truth, limit=truth, name=unit.backbone, edges=config.strata
-                )
             if one.request.voxels:
-                files[f"{VOXELS}/{unit.slug}.parquet"] = partial(save_voxels, table)
+                maps = found.maps if config.statistics else {}
+                files[f"{VOXELS}/{unit.slug}.parquet"] = partial(save_voxels, table, maps=maps)
             content["files"], returned = self._written(files)
             self._outcomes.append(Outcome(one.request.identity, content, files=returned))
 
@@ -261,18 +259,11 @@ def _warm_up(one: _Map, frame: Frame) -> None:
 
 def _truth_map(config: Config, task: Task) -> FusionBackend | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
-    return _new_map(config.model_copy(update={"events": False}), task) if _truth_task(task) else None
+    return _new_map(config.model_copy(update={"statistics": False}), task) if truth_task(task) else None
 
 
-def _truth_task(task: Task) -> Task | None:
-    """The ground truth in the unit's label space; None where there is none, or where it does not map to that."""
-    if not task.scene.ground_truth or task.backbone == GROUND_TRUTH:
-        return None
-    try:
-        mapping = task.scene.label_space(GROUND_TRUTH).mapping_to(task.mapping.target)
-    except ConfigError:
-        return None
-    return dataclasses.replace(task, backbone=GROUND_TRUTH, mapping=mapping)
+def _table(backend: FusionBackend, task: Task) -> VoxelTable:
+    return dataclasses.replace(backend.table(), classes=task.mapping.target.classes)
 
 
 def _ground_truth(scene: Scene, index: int) -> Frame | None:

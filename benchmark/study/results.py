@@ -77,9 +77,9 @@ class Record:
     """One finished unit of a study.
 
     key         hash of its inputs and settings, under which it is kept
-    summary     what `semstab.run` reports of it: unit (scene, backbone, backend), means, strata, classes, times
+    summary     what `semstab.run` reports of it: unit (scene, backbone, backend), means, strata, classes, times, and
+                what `semstab.statistics` says of the map
     image_space of the 'base' units; all NaN elsewhere
-    statistics  what `semstab.statistics` says of it, as JSON content; empty where it was not asked for
     voxels      file of its voxel table, for the 'base' and 'backends' units; None elsewhere
     """
 
@@ -87,8 +87,12 @@ class Record:
     variation: Variation
     summary: UnitSummary
     image_space: ImageSpace = ImageSpace()
-    statistics: Mapping[str, Any] = field(default_factory=dict)
     voxels: Path | None = None
+
+    @property
+    def statistics(self) -> Mapping[str, Any]:
+        """What `semstab.statistics` says of the map, as JSON content; empty in studies of earlier versions."""
+        return self.summary.statistics
 
     @property
     def unit(self) -> Unit:
@@ -140,6 +144,7 @@ class StudyResult:
     agreement  of each checked backend with the base one, on each scene and backbone
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
     regions    flicker of the label sources that are regions without classes
+    comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
 
     name: str
@@ -150,6 +155,7 @@ class StudyResult:
     up: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
+    comparisons: tuple[Mapping[str, Any], ...] = ()
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None
@@ -209,6 +215,7 @@ class StudyResult:
             ],
             "agreement": [row.to_dict() for row in self.agreement],
             "regions": [dataclasses.asdict(row) for row in self.regions],
+            "comparisons": [dict(row) for row in self.comparisons],
         }
 
     @classmethod
@@ -223,6 +230,7 @@ class StudyResult:
             up={scene: (axis[0], axis[1], axis[2]) for scene, axis in content["up"].items()},
             manifest=manifest,
             regions=tuple(RegionFlicker.from_dict(row) for row in content["regions"]),
+            comparisons=tuple(content.get("comparisons", ())),  # studies of earlier versions have none
         )
 
 
@@ -231,7 +239,6 @@ def _record_content(record: Record) -> dict[str, Any]:
         "key": record.key,
         "variation": dataclasses.asdict(record.variation),
         "image_space": dataclasses.asdict(record.image_space),
-        "statistics": dict(record.statistics),
         "voxels_file": None if record.voxels is None else f"{VOXELS}/{record.voxels.name}",
     }
 
@@ -242,7 +249,6 @@ def _record(row: Mapping[str, Any], folder: Path) -> Record:
         variation=Variation(**row["variation"]),
         summary=UnitSummary.from_dict(row),
         image_space=read_image_space(row["image_space"]),
-        statistics=row["statistics"],
         voxels=None if row["voxels_file"] is None else folder / row["voxels_file"],
     )
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from semstab.datasets import GROUND_TRUTH
+from semstab.evaluation import comparable, comparison
 from semstab.manifest import manifest
 from semstab.metrics import compare
 from semstab.results import Agreement
@@ -140,6 +142,7 @@ def _result(config: StudyConfig, folder: StudyFolder, grid: Grid, found: _Found)
             if cell.identity in errors
         ),
         agreement=tuple(_agreement(config, records)),
+        comparisons=tuple(_comparisons(records)) if config.statistics else (),
         up=_up_axes(grid.cells, contents),
         regions=tuple(
             RegionFlicker.from_dict(contents[cell.identity]["regions"])
@@ -184,6 +187,17 @@ def _agreement(config: StudyConfig, records: Sequence[Record]) -> Iterator[Agree
             if (other.unit.scene, other.unit.backbone) == (base.unit.scene, base.unit.backbone):
                 table = base.table() if table is None else table
                 yield compare(table, other.table(), (base.unit, other.unit), tolerance=config.tolerance)
+
+
+def _comparisons(records: Sequence[Record]) -> Iterator[Mapping[str, Any]]:
+    """The base units of each scene beside each other; accuracy where the ground truth is one of them."""
+    base = [record for record in records if record.variation.sweep == BASE]
+    for scene in dict.fromkeys(record.unit.scene for record in base):
+        maps = {record.unit.backbone: record.table() for record in base if record.unit.scene == scene}
+        truth = maps.pop(GROUND_TRUTH, None)
+        if comparable(maps):
+            known = truth is not None and comparable(maps | {GROUND_TRUTH: truth})
+            yield comparison(scene, maps, truth if known else None)
 
 
 def _up_axes(cells: Sequence[Cell], contents: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[float, float, float]]:

@@ -6,11 +6,14 @@ from pathlib import Path
 
 from semstab.files import write_json, write_text
 from semstab.study.results import StudyResult
+from semstab.tables.comparison import comparison
+from semstab.tables.correctness import ceiling, correctness, rules
 from semstab.tables.fusion import agreement, fusion
 from semstab.tables.glance import glance
 from semstab.tables.image_space import flicker
 from semstab.tables.sensitivity import sensitivity
 from semstab.tables.stability import classes, cross_backbone, persistence, scenes
+from semstab.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
 from semstab.tables.table import Cell, Column, Group, Table
 from semstab.tables.writers import TEXT_WRITERS, to_csv, to_json, to_latex, to_markdown
 
@@ -27,8 +30,11 @@ __all__ = [
     "write_tables",
 ]
 
-BUILDERS = (glance, flicker, scenes, persistence, classes, cross_backbone, sensitivity, fusion, agreement)
-"""In the paper's order; each makes no table where the study has nothing for it."""
+BUILDERS = (
+    glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, class_agreement, drift, uncertainty,
+    ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, agreement,
+)  # fmt: skip
+"""In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
 
 
 def tables(result: StudyResult) -> list[Table]:

@@ -9,8 +9,9 @@ from semstab.tables.table import Column, Group, Row, Table
 
 
 def sensitivity(result: StudyResult) -> list[Table]:
-    """One table a sweep (paper, Sensitivity to World-Space Association)."""
-    return [_table(result, sweep) for sweep in swept(result)]
+    """One table a sweep (paper, Sensitivity to World-Space Association), and one with what does not depend on OP."""
+    found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
+    return [table for pair in found for table in pair if table is not None]
 
 
 def _table(result: StudyResult, sweep: Sweep) -> Table:
@@ -39,6 +40,46 @@ def _table(result: StudyResult, sweep: Sweep) -> Table:
         " voxels."
     )
     return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
+
+
+def _agreement_table(result: StudyResult, sweep: Sweep) -> Table | None:
+    """None where the units have no statistics, as in studies of earlier versions."""
+    columns = (
+        Column("value", sweep.header),
+        Column("mean_op", "Mean OP", 2),
+        Column("vss", "VSS, all voxels", 4, "higher"),
+        Column("sbd", "SBD", 4, "lower"),
+        Column("psa", "PSA", 4, "higher"),
+        Column("alpha", "Alpha", 4, "higher"),
+        Column("sbd_excess", "SBD excess", 4, signed=True),
+    )
+    by_backbone = {name: levels(result, sweep.name, name) for name in result.backbones}
+    found = {name: rows for name, rows in by_backbone.items() if any(level.judged for level in rows)}
+    if not found:
+        return None
+    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in found.items())
+    caption = (
+        "VSS is pooled over the voxels of all scenes; the rest is of those seen twice or more, macro means of the"
+        " scenes. PSA: share of pairs of frames that agree about a voxel; alpha: Krippendorff's, the same beyond"
+        " chance; SBD excess: SBD less what the same observations give in random order (bits). These three do not"
+        " depend on how often a voxel was seen; which voxels were seen twice still changes along the sweep. ± is the"
+        " standard deviation over the repeats."
+    )
+    title = f"Agreement against {sweep.title}"
+    return Table(f"sensitivity_agreement_{sweep.name}", title, caption, columns, groups)
+
+
+def _agreement_row(sweep: Sweep, level: Level) -> Row:
+    spread = level.spread if len(level.repeats) > 1 else level.mean
+    return (
+        sweep.text(level.value),
+        level.mean(lambda p: p.mean_op),
+        spread(lambda p: p.every.vss),
+        spread(lambda p: p.drift),
+        spread(lambda p: p.psa),
+        spread(lambda p: p.alpha),
+        spread(lambda p: p.excess_drift),
+    )
 
 
 def _row(sweep: Sweep, level: Level) -> Row:

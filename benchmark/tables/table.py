@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semstab.averages import Spread
+from semstab.statistics import Estimate
 
 UNDEFINED = "--"
 """What stands in print where a number is undefined; in JSON it is null, in CSV an empty field."""
 
-Cell = str | int | float | Spread
+Cell = str | int | float | Spread | Estimate
 Row = tuple[Cell, ...]
 
 
@@ -44,9 +45,12 @@ class Column:
         return f"{rounded:{'+' if self.signed and rounded else ''},.{self.digits}f}"
 
     def text(self, cell: Cell) -> str:
-        """The cell in print: 'road', '286,565', '0.957', '0.957 ± 0.002' over repeats."""
+        """The cell in print: 'road', '286,565', '0.957', '0.957 ± 0.002' over repeats, '0.957 (0.951, 0.962)'."""
         if isinstance(cell, str):
             return cell
+        if isinstance(cell, Estimate):
+            ends = "" if math.isnan(cell.low) else f" ({self.number(cell.low)}, {self.number(cell.high)})"
+            return self.number(cell.value) + ends
         if not isinstance(cell, Spread):
             return self.number(cell)
         spread = "" if math.isnan(cell.sd) else f" ± {cell.sd:,.{self.digits}f}"

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from semstab.averages import Spread
+from semstab.statistics import Estimate
 from semstab.tables.table import Cell, Column, Table
 
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
@@ -27,11 +29,11 @@ def to_csv(table: Table) -> str:
     """Comma-separated, rounded, without thousands separators; an undefined number is an empty field."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    varies = [any(isinstance(row[k], Spread) for _, row in table.rows()) for k in range(len(table.columns))]
-    keys = [[column.key, f"{column.key}_sd"][: 1 + sd] for column, sd in zip(table.columns, varies, strict=True)]
+    parts = [_csv_parts([row[k] for _, row in table.rows()]) for k in range(len(table.columns))]
+    keys = [[f"{column.key}{part}" for part in own] for column, own in zip(table.columns, parts, strict=True)]
     writer.writerow([*_leading(table, table.by), *itertools.chain(*keys)])
     for group, row in table.rows():
-        cells = (_csv_cells(column, cell, sd) for column, cell, sd in zip(table.columns, row, varies, strict=True))
+        cells = (_csv_cells(column, cell, own) for column, cell, own in zip(table.columns, row, parts, strict=True))
         writer.writerow([*_leading(table, group), *itertools.chain(*cells)])
     return text.getvalue()
 
@@ -81,7 +83,7 @@ def to_latex(table: Table) -> str:
 
 
 def to_json(table: Table) -> dict[str, Any]:
-    """The JSON object, in full precision; what varies over repeats is {mean, sd, repeats}."""
+    """The JSON object, in full precision: {mean, sd, repeats} over repeats, {value, low, high} with an interval."""
     return {
         "name": table.name,
         "title": table.title,
@@ -107,7 +109,7 @@ def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
 
 
 def _json_cell(cell: Cell) -> Any:
-    return {"mean": cell.mean, "sd": cell.sd, "repeats": cell.repeats} if isinstance(cell, Spread) else cell
+    return dataclasses.asdict(cell) if isinstance(cell, Spread | Estimate) else cell
 
 
 def _leading(table: Table, cell: str) -> list[str]:
@@ -115,12 +117,21 @@ def _leading(table: Table, cell: str) -> list[str]:
     return [cell] if table.by else []
 
 
-def _csv_cells(column: Column, cell: Cell, sd: bool) -> list[str]:
-    """The field; with sd also that of the standard deviation over repeats."""
+def _csv_parts(cells: Sequence[Cell]) -> list[str]:
+    """The fields of a column: beside its own that of the standard deviation over repeats, or those of the interval."""
+    if any(isinstance(cell, Spread) for cell in cells):
+        return ["", "_sd"]
+    return ["", "_low", "_high"] if any(isinstance(cell, Estimate) for cell in cells) else [""]
+
+
+def _csv_cells(column: Column, cell: Cell, parts: Sequence[str]) -> list[str]:
     if isinstance(cell, str):
-        return [cell]
-    values = (cell.mean, cell.sd) if isinstance(cell, Spread) else (cell, math.nan)
-    return ["" if math.isnan(value) else column.number(value).replace(",", "") for value in values[: 1 + sd]]
+        return [cell, *[""] * (len(parts) - 1)]
+    if isinstance(cell, Estimate):
+        values = [cell.value, cell.low, cell.high]
+    else:
+        values = [cell.mean, cell.sd] if isinstance(cell, Spread) else [cell, math.nan, math.nan]
+    return ["" if math.isnan(value) else column.number(value).replace(",", "") for value in values[: len(parts)]]
 
 
 def _sentence(text: str) -> str:
@@ -165,7 +176,7 @@ def _latex_headers(table: Table) -> list[str]:
 
 
 _LATEX = {
-    "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+    "\N{MINUS SIGN}": "$-$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_",
     "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": "$<$", ">": "$>$", "≤": r"$\leq$", "≥": r"$\geq$",
     "±": r"$\pm$", "√": r"$\surd$", "°": r"$^\circ$", "Δ": r"$\Delta$", "·": r"$\cdot$", '"': "''", "|": r"$|$",
@@ -175,8 +186,8 @@ _LATEX = {
 def _latex(text: str) -> str:
     """Text that LaTeX shows as it is; the hyphen that leads a number is a minus sign, and ± stands close."""
     text = re.sub(r"(?<=\d) ± (?=\d)", "±", relations(" ".join(text.split())))
-    minus, text = ("$-$", text[1:]) if re.match(r"-\d", text) else ("", text)
-    return minus + "".join(_LATEX.get(character, character) for character in text)
+    text = re.sub(r"(^|(?<=\d )\(|, )-(?=\d)", "\\1\N{MINUS SIGN}", text)
+    return "".join(_LATEX.get(character, character) for character in text)
 
 
 TEXT_WRITERS: dict[str, Callable[[Table], str]] = {"csv": to_csv, "md": to_markdown, "tex": to_latex}

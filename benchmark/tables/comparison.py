@@ -1,0 +1,120 @@
+"""The backbones beside each other, on the same places and at the same number of observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from semstab.statistics import estimate_at, number_at
+from semstab.study.results import StudyResult
+from semstab.tables.table import Column, Group, Row, Table
+
+MEASURES = {
+    "psa": "PSA",
+    "alpha": "alpha",
+    "vss": "VSS",
+    "sbd": "SBD",
+    "entropy": "entropy",
+    "accuracy": "accuracy",
+}
+_COMMON = "On the voxels that every backbone saw twice or more."
+_INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
+
+
+def comparison(result: StudyResult) -> list[Table]:
+    """Paired differences, ranking, and what each map covers; one group a scene."""
+    return [_differences(result), _ranking(result), _coverage(result)] if result.comparisons else []
+
+
+def _differences(result: StudyResult) -> Table:
+    columns = (
+        Column("a", "Backbone"),
+        Column("b", "less backbone"),
+        Column("measure", "Measure"),
+        Column("difference", "Difference", 4, signed=True),
+        Column("p_holm", "p (Holm)", 4),
+    )
+    caption = (
+        f"{_COMMON} p: of a paired test that flips the sign of a block's difference, corrected for the number of pairs."
+        f" {_INTERVALS}"
+    )
+    groups = tuple(Group(found["scene"], _difference_rows(found)) for found in result.comparisons)
+    return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
+
+
+def _difference_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
+    rows = sorted(found["paired"]["differences"], key=lambda row: list(MEASURES).index(row["measure"]))
+    return tuple(
+        (row["a"], row["b"], MEASURES[row["measure"]], estimate_at(row, "difference"), number_at(row, "p_holm"))
+        for row in rows
+    )
+
+
+def _ranking(result: StudyResult) -> Table:
+    columns = (
+        Column("measure", "Measure"),
+        Column("rank", "Rank", 0),
+        Column("backbone", "Backbone"),
+        Column("range", "95% of resamples"),
+        Column("best_percent", "first in (%)", 0),
+        Column("value", "Same places", 4),
+        Column("standardised", "Same OP", 4),
+    )
+    caption = (
+        f"Same places: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
+        f" strata of OP weighted by those of all maps together. {_INTERVALS}"
+    )
+    groups = tuple(Group(found["scene"], _ranking_rows(found)) for found in result.comparisons)
+    return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
+
+
+def _ranking_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
+    rankings = {ranking["measure"]: ranking["ranks"] for ranking in found["paired"]["rankings"]}
+    rows: list[Row] = []
+    for measure, name in MEASURES.items():
+        for rank in rankings.get(measure, ()):
+            backbone = rank["backbone"]
+            rows.append(
+                (
+                    name,
+                    rank["rank"],
+                    backbone,
+                    f"{rank['low']} to {rank['high']}",
+                    100 * number_at(rank, "best"),
+                    estimate_at(found, "paired", "values", measure, backbone),
+                    estimate_at(found, "standardised", "values", measure, backbone),
+                )
+            )
+    return tuple(rows)
+
+
+def _coverage(result: StudyResult) -> Table:
+    columns = (
+        Column("backbone", "Backbone"),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("repeated", "OP>=2", 0),
+        Column("recurrent", "OP>=3", 0),
+        Column("common_percent", "in all maps (%)", 1),
+        Column("alone", "in no other", 0),
+    )
+    caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
+    groups = tuple(
+        Group(
+            found["scene"],
+            tuple(
+                (
+                    row["backbone"],
+                    row["voxels"],
+                    number_at(row, "mean_op"),
+                    row["repeated"],
+                    row["recurrent"],
+                    100 * number_at(row, "common_share"),
+                    row["alone"],
+                )
+                for row in found["coverage"]
+            ),
+        )
+        for found in result.comparisons
+    )
+    return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")

@@ -1,0 +1,361 @@
+"""Statistics in runs and studies: from the command line to summary.json, tables, figures and the report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import tiny_scene
+import tiny_study
+from records import record, study, voxels
+
+import semstab
+from semstab.config import Config
+from semstab.errors import ConfigError
+from semstab.memory import estimate
+from semstab.metrics import sbd
+from semstab.pipeline import Observer
+from semstab.plan import load_config, make_plan
+from semstab.plots import figures
+from semstab.plots.maps import right_or_wrong
+from semstab.plots.statistics import DriftByOP, draw_intervals, draw_reliability
+from semstab.report import TOPICS, write_report
+from semstab.statistics import Estimate, analyse, describe, nulls
+from semstab.statistics.__main__ import main
+from semstab.study import load_study_result, run_study
+from semstab.tables import tables, to_json
+from semstab.terminal import print_summary
+from semstab.voxels import Events, VoxelTable
+
+COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+BACKBONES = ("a", "b", "gt")
+
+
+def command(*arguments: str | Path, cwd: Path) -> str:
+    """What it prints."""
+    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
+    done = subprocess.run(
+        [COMMAND, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def configure(root: Path, **settings) -> Config:
+    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
+    return load_config(
+        overrides={"dataset": dataset, "backends": ["numpy"], "check": None, "voxel_size": 0.25, **settings}
+    )
+
+
+# --- A run ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    """A run from the command line with all statistics: its folder, what it printed, its summary."""
+    base = tmp_path_factory.mktemp("ran")
+    tiny_scene.write(base / "wall", frames=6)
+    chosen = [word for name in BACKBONES for word in ("-m", name)]
+    printed = command(
+        "--data", "wall", "-b", "numpy", *chosen, "--voxel-size", "0.25", "--check", "none", "--rerun", "off",
+        "--statistics", "--events", "--set", "strata=[1, 3]", "--out", "run", cwd=base,
+    )  # fmt: skip
+    return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
+
+
+def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events]:
+    name = f"wall__{backbone}__numpy.parquet"
+    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name)
+
+
+def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
+    run, _, summary = ran
+    truth = saved(run, "gt")[0]
+    for entry in summary["runs"]:
+        name = entry["backbone"]
+        table, events = saved(run, name)
+        true = None if name == "gt" else truth
+        expected = analyse(table, events, true, limit=true, name=name, edges=(1, 3))
+        assert entry["statistics"] == json.loads(json.dumps(nulls(expected.summary)))
+        columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
+        for column, values in expected.maps.items():
+            np.testing.assert_array_equal(columns.column(column).to_numpy(), values)
+    by_name = {entry["backbone"]: entry["statistics"] for entry in summary["runs"]}
+    assert by_name["gt"]["agreement"]["psa"]["value"] == 1.0
+    assert by_name["a"]["agreement"]["psa"]["value"] < 0.9
+    assert by_name["a"]["correctness"]["accuracy"]["value"] > 0.6
+    assert by_name["gt"]["correctness"] is None
+    assert by_name["a"]["geometry"]["geometry"]["value"] == 0.0
+
+
+def test_the_module_says_of_the_folder_what_the_run_said(ran, tmp_path, monkeypatch, capsys) -> None:
+    run, _, summary = ran
+    monkeypatch.setattr("sys.argv", ["", str(run), "--json", str(tmp_path / "found.json")])
+    assert main() == 0
+    assert "Krippendorff's alpha" in capsys.readouterr().out
+    found = json.loads((tmp_path / "found.json").read_text())
+    for entry, row in zip(summary["runs"], found["maps"], strict=True):
+        assert {key: row[key] for key in entry["statistics"]} == entry["statistics"]
+    (here,), (there,) = summary["comparisons"], found["comparisons"]
+    assert {key for key in here if here[key] != there[key]} == {"fusion_rules"}  # a run does not keep all logs
+    assert here["paired"]["values"]["accuracy"].keys() == {"a", "b"}
+
+
+def test_the_verdict_on_each_backbone_is_printed(ran) -> None:
+    _, printed, summary = ran
+    said = " ".join(printed.split())
+    for entry in summary["runs"]:
+        assert entry["statistics"]["verdict"]["line"] in said
+    assert max(len(line) for line in printed.splitlines()) <= 80
+
+
+def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a",))
+    result = semstab.run(configure(root, events=True), out=tmp_path / "run")
+    (entry,) = result.runs
+    table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
+    assert entry.statistics == nulls(describe(table, name="a"))
+    assert entry.statistics["drift"]["tests"] is None
+    assert result.comparisons == ()
+    again = semstab.run(configure(root, events=True), out=tmp_path / "run")  # kept
+    assert again.runs[0].statistics == entry.statistics
+
+
+class Interrupting(Observer):
+    """Ctrl-C when the second backbone is to be fused."""
+
+    def frame_fused(self, unit, frame, row) -> None:
+        if unit.backbone == "b":
+            raise KeyboardInterrupt
+
+
+def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall")
+    config = configure(root, statistics=True)
+    whole = semstab.run(config)
+    with pytest.raises(KeyboardInterrupt):
+        semstab.run(config, out=tmp_path / "run", observers=[Interrupting()])
+    resumed = semstab.run(config, out=tmp_path / "run")
+    assert [entry.statistics for entry in resumed.runs] == [entry.statistics for entry in whole.runs]
+    assert resumed.comparisons == whole.comparisons
+    assert whole.comparisons[0]["paired"]["values"]["accuracy"]["a"]["value"] > 0.5  # the truth was fused again
+
+
+def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a",))
+    result = semstab.run(configure(root, backends=["open3d"], check="numpy", statistics=True))
+    open3d, numpy = result.runs
+    assert open3d.statistics["drift"]["tests"] is None
+    assert open3d.statistics["correctness"] is not None
+    assert numpy.statistics["drift"]["tests"] is not None
+    assert numpy.statistics["agreement"]["alpha"] == pytest.approx(open3d.statistics["agreement"]["alpha"])
+    plain = semstab.run(configure(root, backends=["open3d"], check="numpy"))
+    assert [bool(entry.statistics) for entry in plain.runs] == [True, False]
+
+
+def test_frames_without_ground_truth_are_left_out_of_the_truth(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a",), frames=4)
+    (root / "labels/gt/0002.png").unlink()
+    (entry,) = semstab.run(configure(root, statistics=True)).runs
+    assert entry.statistics["correctness"]["accuracy"]["value"] > 0.5
+
+
+def test_no_ground_truth_no_judgement(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a",))
+    for path in (root / "labels/gt").iterdir():
+        path.unlink()
+    (root / "labels/gt").rmdir()
+    (entry,) = semstab.run(configure(root, statistics=True)).runs
+    assert entry.statistics["correctness"] is entry.statistics["geometry"] is None
+    assert entry.statistics["drift"]["tests"] is not None
+
+
+def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall")
+    (root / "labels/b/label_space.yaml").write_text("name: other\nclasses: [wall, door, window, sky]\n")
+    assert semstab.run(configure(root, statistics=True)).comparisons == ()
+
+
+def test_the_log_counts_as_memory(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a",), frames=30)
+    plain, full = (configure(root, backends=["numba"], statistics=wanted) for wanted in (False, True))
+    (task,) = make_plan(plain).tasks
+    without, expected = estimate(task, plain), estimate(task, full)
+    held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
+    assert expected.observations == without.observations == 30 * 48
+    assert expected.bytes - without.bytes > held
+    with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):
+        semstab.run(configure(root, backends=["numba"], statistics=True, memory_gb=1e-6))
+
+
+def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, capsys) -> None:
+    from rich.console import Console
+
+    for scene in ("x", "y"):
+        tiny_scene.write(tmp_path / "walls" / scene, ("a",))
+    print_summary(semstab.run(configure(tmp_path / "walls")), Console(width=80))
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "x, a: no verdict" in printed
+    assert "y, a: no verdict" in printed
+
+
+# --- A study ----------------------------------------------------------------------------------------------------------
+
+
+def rows_of(found, name):
+    (table,) = (table for table in tables(found) if table.name == name)
+    return to_json(table)["rows"]
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """A study with all statistics, and its folder."""
+    base = tmp_path_factory.mktemp("studied")
+    root = tiny_study.write(base / "wall", frames=8)
+    noise = {"depth_noise": {"values": [0, 0.05], "repeats": 2}}
+    settings = {"backbones": list(BACKBONES), "backends": [], "statistics": True, "frames": {}, "sweeps": noise}
+    run_study(tiny_study.configure(root, **settings), base / "out")
+    return load_study_result(base / "out"), base / "out"
+
+
+def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
+    found, _ = studied
+    base = {record.unit.backbone: record.statistics for record in found.select()}
+    for row in rows_of(found, "temporal_agreement"):
+        own = base[row["backbone"]]
+        assert row["psa"] == pytest.approx(own["agreement"]["psa"], nan_ok=True)
+        assert row["flip_rate"] == own["drift"]["flips"]["rate"]["value"]
+    for row in rows_of(found, "drift"):
+        assert row["sbd_p"] == base[row["backbone"]]["drift"]["tests"]["sbd_p"] or row["backbone"] == "gt"
+        assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
+    for row in rows_of(found, "ceiling"):
+        assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])
+    quadrants = rows_of(found, "quadrants")
+    assert [row["backbone"] for row in quadrants] == ["a", "b"]
+    for row in quadrants:
+        parts = [row[f"{name}_percent"]["value"] for name in
+                 ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")]  # fmt: skip
+        assert sum(parts) == pytest.approx(100)
+    strata = [row for row in rows_of(found, "correctness") if row["backbone"] == "a"]
+    assert strata[0]["voxels"] == sum(row["voxels"] for row in strata[1:])
+    (difference,) = (row for row in rows_of(found, "comparison") if row["measure"] == "accuracy")
+    values = {row["backbone"]: row["value"]["value"] for row in rows_of(found, "comparison_ranking")
+              if row["measure"] == "accuracy"}  # fmt: skip
+    assert difference["difference"]["value"] == pytest.approx(values["a"] - values["b"])
+    assert {row["verdict"] for row in rows_of(found, "verdicts")} == {"no verdict"}
+    rules = [row for row in rows_of(found, "rules") if row["backbone"] == "a"]
+    assert rules[0]["relabelled_percent"] == 0
+
+
+def test_agreement_stands_beside_the_sweep(studied) -> None:
+    found, _ = studied
+    rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["backbone"] == "a"]
+    (still,), noisy = (found.select("depth_noise", backbone="a", value=value) for value in (0, 0.05))
+    assert rows[0]["psa"] == still.statistics["agreement"]["psa"]["value"]
+    alphas = [record.statistics["agreement"]["alpha"]["value"] for record in noisy]
+    assert rows[1]["alpha"]["mean"] == pytest.approx(np.mean(alphas))
+    assert rows[1]["alpha"]["sd"] == pytest.approx(np.std(alphas, ddof=1))
+
+
+DRAWN = ("temporal_agreement", "drift", "correctness", "comparison", "sensitivity_agreement_depth_noise",
+         "uncertainty_map__wall__a")  # fmt: skip
+
+
+def test_every_figure_of_the_statistics_can_be_drawn(studied, tmp_path) -> None:
+    found, folder = studied
+    drawn = {figure.name: figure for figure in figures(found, folder)}
+    for name in DRAWN:
+        png, svg = drawn[name].save(tmp_path)
+        assert cv2.imread(str(png)).std() > 1
+        assert svg.stat().st_size > 1000
+
+
+def test_every_table_and_figure_has_one_place_in_the_report(studied) -> None:
+    found, folder = studied
+    for item in (*tables(found), *figures(found, folder)):
+        assert [topic.id for topic in TOPICS if item.name.startswith(topic.prefixes)], item.name
+        assert len([topic.id for topic in TOPICS if item.name.startswith(topic.prefixes)]) == 1, item.name
+
+
+def test_columns_without_a_number_are_left_out() -> None:
+    table = voxels((5, 1, [1, 0, 0]), (5, 2, [1, 1, 0]))
+    plain = record(table)
+    judged = dataclasses.replace(plain, summary=dataclasses.replace(plain.summary, statistics=nulls(describe(table))))
+    (row,) = rows_of(study(judged), "temporal_agreement")
+    assert "flip_rate" not in row
+    assert row["repeated_voxels"] == 5
+    assert not {"ceiling", "correctness", "quadrants", "rules"} & {found.name for found in tables(study(judged))}
+
+
+def test_the_mean_of_several_scenes_counts_each_once() -> None:
+    maps = {"x": voxels((5, 2, [2, 0, 0]), (5, 2, [1, 1, 0])), "y": voxels((90, 2, [2, 0, 0]))}
+    records = [record(table, scene=scene) for scene, table in maps.items()]
+    judged = [
+        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=nulls(describe(maps[r.unit.scene]))))
+        for r in records
+    ]
+    *_, total = rows_of(study(*judged), "uncertainty")
+    entropies = [record.statistics["uncertainty"]["entropy"]["value"] for record in judged]
+    assert total["scene"] == "Mean"
+    assert total["entropy"] == pytest.approx(np.mean(entropies))
+
+
+def test_the_reading_says_the_verdicts(tmp_path) -> None:
+    table = voxels((5, 2, [1, 1, 0]))
+    records = [record(table, scene=scene) for scene in "xy"]
+    judged = [
+        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=nulls(describe(table, name="m"))))
+        for r in records
+    ]
+    (path,) = write_report(study(*judged), tmp_path)
+    assert "Verdict on m: no verdict in 2 scenes." in path.read_text()
+
+
+# --- What figures are drawn from --------------------------------------------------------------------------------------
+
+
+def test_drift_by_op_is_the_mean_of_the_voxels_whose_null_is_known() -> None:
+    table = voxels((3, 2, [1, 1, 0], 0.3), (2, 2, [2, 0, 0]), (4, 5, [3, 2, 0], 0.1))
+    null = np.array([0.25, np.nan, 0.35, 0.0, 0.0, 0.2, 0.2, 0.2, np.nan])
+    one = DriftByOP.of(table, null)
+    found = one + one
+    assert found.voxels[[1, 4]].tolist() == [8, 6]
+    assert found.sbd[1] / found.voxels[1] == pytest.approx(np.mean(sbd(table)[[0, 2, 3, 4]]))
+    assert found.null[4] / found.voxels[4] == pytest.approx(0.2)
+
+
+def test_what_is_right_and_stable_by_voxel() -> None:
+    """Five observations of two classes: 5 to 0 is stable, 3 to 2 is not; OP = 2 does not count."""
+    table = voxels((1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 2, [2, 0, 0]))
+    one_hot = dataclasses.replace(table, self_sum=table.op.astype(float))
+    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1])).tolist() == [1, 2, 4, 3, 0]
+    assert right_or_wrong(one_hot, np.full(5, -1)).tolist() == [0] * 5
+
+
+def test_reliability_pools_the_bins_of_several_scenes() -> None:
+    bins = [
+        {"low": 0.8, "high": 0.9, "voxels": 10, "confidence": 0.85, "accuracy": 0.5},
+        {"low": 0.8, "high": 0.9, "voxels": 30, "confidence": 0.81, "accuracy": 0.7},
+        {"low": 0.9, "high": 1.0, "voxels": 0, "confidence": None, "accuracy": None},
+    ]
+    upper = draw_reliability({"net": bins}).axes[0]
+    points = [line.get_xydata().tolist() for line in upper.lines if len(line.get_xydata()) == 1]
+    assert [pytest.approx([0.82, 0.65])] in points
+
+
+def test_intervals_stand_where_their_estimates_say() -> None:
+    rows = {"x": {"net": Estimate(0.5, 0.4, 0.7), "other": Estimate(0.6, np.nan, np.nan)}}
+    (axes,) = draw_intervals({"PSA": rows}, {"PSA": (0.0,)}).axes
+    segments = [[x for x, _ in bar.get_segments()[0]] for bar in axes.collections]
+    assert segments[0] == pytest.approx([0.4, 0.7])
+    assert segments[1] == pytest.approx([0.6, 0.6])
+    assert axes.lines[0].get_xdata()[0] == 0.0
