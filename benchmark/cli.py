@@ -172,12 +172,15 @@ def study(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
     ] = None,
+    trust_geometry: Annotated[
+        bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
     from semstab.study import load_study
 
-    config = load_study(file, _overrides({}, settings or []))
+    config = load_study(file, _overrides({"check_geometry": False if trust_geometry else None}, settings or []))
     if only is not None:
         config = config.only(only)
     executor = _executor(jobs, scheduler)

@@ -103,7 +103,7 @@ def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
         title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True
     )
     for name in names:
-        table.add_column(name, vertical="bottom", no_wrap=True)
+        table.add_column(name, vertical="bottom", overflow="fold")  # names give way, numbers do not
     for name in numbers:
         table.add_column(name, justify="right", vertical="bottom", no_wrap=True)
     return table

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_scene
+import yaml
 from PIL import Image
 from room_scene import AXES, CAMERA, CLASSES, RAY_LENGTH, Room, opened, rigid, walk, write
 from typer.testing import CliRunner
@@ -371,6 +372,20 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     assert refused.exit_code == 2
     assert len(refused.stderr.strip().splitlines()) == 1
     assert bench("run", *arguments, tmp_path / "other", "--trust-geometry").exit_code == 0
+
+
+def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
+    folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
+    content = {"dataset": {"name": "posed_folder", "options": {"root": str(folder)}}, "backend": "numpy"}
+    file = tmp_path / "room.yaml"
+    file.write_text(yaml.safe_dump(content | {"backbones": ["net"]}))
+    refused = bench("study", file, "--out", tmp_path / "study", "-q")
+    assert refused.exit_code == 2
+    assert "pose_convention: world_to_camera" in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1
+    assert not list((tmp_path / "study/units").glob("*.json"))
+    assert bench("study", file, "--out", tmp_path / "study", "-q", "--trust-geometry").exit_code == 0
+    assert json.loads((tmp_path / "study/manifest.json").read_text())["geometry"] == {}
 
 
 def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):

@@ -1,6 +1,14 @@
 """Does a dataset make sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
 from semstab.check.geometry import Verdict
-from semstab.check.scene_check import SCHEMA, SceneCheck, check, check_scene, quick_check, require_sound
+from semstab.check.scene_check import (
+    SCHEMA,
+    SceneCheck,
+    check,
+    check_scene,
+    quick_check,
+    refuse_unsound,
+    require_sound,
+)
 
-__all__ = ["SCHEMA", "SceneCheck", "Verdict", "check", "check_scene", "quick_check", "require_sound"]
+__all__ = ["SCHEMA", "SceneCheck", "Verdict", "check", "check_scene", "quick_check", "refuse_unsound", "require_sound"]

@@ -175,11 +175,16 @@ def require_sound(
 ) -> Verdict:
     """The verdict of `quick_check`. Raises DataError where depth and poses contradict each other."""
     verdict = quick_check(scene, indices, backbone, options)
+    refuse_unsound(scene.name, verdict)
+    return verdict
+
+
+def refuse_unsound(scene: str, verdict: Verdict) -> None:
+    """Raise DataError where the verdict on that scene is that depth and poses contradict each other."""
     if verdict.state == "unsound":
         raise DataError(
-            f"{scene.name}: {verdict.text}; `semstab-bench check` tells more, --trust-geometry fuses it as it is"
+            f"{scene}: {verdict.text}; `semstab-bench check` tells more, --trust-geometry fuses it as it is"
         )
-    return verdict
 
 
 def _cheap_sources(scene: Scene, backbone: str) -> tuple[str | None, ...]:

@@ -157,6 +157,9 @@ class StudyConfig(Settings):
     memory_gb: float | None = Field(
         None, gt=0, exclude=True, description="for maps at a time; half of what is free where not given"
     )
+    check_geometry: bool = Field(
+        True, exclude=True, description="refuse scenes whose depth and poses contradict each other; not kept"
+    )
 
     @field_validator("backend", mode="before")
     @classmethod

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.datasets import GROUND_TRUTH
+from semstab.errors import DataError
 from semstab.evaluation import comparable, comparison
 from semstab.manifest import manifest
 from semstab.metrics import compare
@@ -51,8 +53,8 @@ def run_study(
     Each unit is kept when it is finished, under a key of its settings and its input: a killed study goes on where it
     was, a changed setting computes again only what it touches. `command` goes into the manifest.
 
-    Raises ConfigError or DataError where the study does not fit together, before anything is computed. A unit that
-    fails later is among the result's failures, and the others finish.
+    Raises ConfigError or DataError where the study does not fit together, or a scene's depth and poses contradict each
+    other, before anything is computed. A unit that fails later is among the result's failures, and the others finish.
     """
     started = time.perf_counter()
     config, executor = config.resolved(), executor or InProcess()
@@ -63,6 +65,7 @@ def run_study(
     seconds = {"study": time.perf_counter() - started}
     content = manifest(config.base(), found.inputs(grid), seconds, command)
     content |= {"study": found.counts() | {"executor": executor.name}}
+    content |= {"geometry": {scene: verdict.summary() for scene, verdict in found.geometry.items()}}
     result = dataclasses.replace(result, manifest=content)
     folder.save_result(result)
     for observer in observers:
@@ -72,10 +75,14 @@ def run_study(
 
 @dataclass
 class _Found:
-    """What is known of the units, by their identity: the content of their files, or why they failed."""
+    """What is known of the units, by their identity: the content of their files, or why they failed.
+
+    geometry  of the scenes of which something was computed
+    """
 
     contents: dict[str, Mapping[str, Any]]
     kept: int
+    geometry: dict[str, Verdict] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
 
     def inputs(self, grid: Grid) -> dict[str, str]:
@@ -106,6 +113,8 @@ def _compute(
     for observer in observers:
         observer.study_started(len(units), found.kept)
     missing = [cell for identity, cell in units.items() if identity not in contents]
+    if config.check_geometry:
+        found.geometry = _checked(config, missing)
     with contextlib.closing(_outcomes(config, folder, executor, missing)) as outcomes:
         for outcome in outcomes:
             if outcome.content is not None:
@@ -115,6 +124,20 @@ def _compute(
                 found.errors[outcome.identity] = outcome.error or ""
             for observer in observers:
                 observer.unit_finished(units[outcome.identity], outcome.error)
+    return found
+
+
+def _checked(config: StudyConfig, missing: Sequence[Cell | RegionCell]) -> dict[str, Verdict]:
+    """The geometry of each scene with units to compute; what cannot be read is left to these to report.
+
+    Raises DataError where depth and poses contradict each other.
+    """
+    found: dict[str, Verdict] = {}
+    for task in {cell.task.scene.name: cell.task for cell in missing if isinstance(cell, Cell)}.values():
+        with contextlib.suppress(DataError):
+            found[task.scene.name] = quick_check(task.scene, task.indices, task.backbone, config.dataset.options)
+    for scene, verdict in found.items():
+        refuse_unsound(scene, verdict)
     return found
 
 

@@ -69,6 +69,7 @@ def class_agreement(result: StudyResult) -> list[Table]:
 def drift(result: StudyResult) -> list[Table]:
     """SBD beside what a random order of the same observations gives, and the drift in one direction."""
     columns = (
+        Column("voxels", "Voxels", 0),
         Column("sbd", "as seen", 4, over="SBD (bits)"),
         Column("sbd_null", "random order", 4, over="SBD (bits)"),
         Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
@@ -80,6 +81,7 @@ def drift(result: StudyResult) -> list[Table]:
         Column("tested_voxels", "tested", 0, over="Voxels"),
     )
     numbers = (
+        number("drift", "voxels"),
         number("drift", "sbd", "value"),
         number("drift", "null", "value"),
         estimate("drift", "excess"),
@@ -90,11 +92,17 @@ def drift(result: StudyResult) -> list[Table]:
         number("drift", "tests", "drifting_voxels"),
         number("drift", "tests", "tested_voxels"),
     )
-    caption = (
-        f"{SEEN_TWICE} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
+    logged = any((record.statistics.get("drift") or {}).get("tests") for record in result.select())
+    one_class = f"{SEEN_TWICE[:-1]}, each frame as one class; the others need a log (statistics: true)."
+    seen = SEEN_TWICE if logged else one_class
+    tests = (
         " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
         " the frames. Drifting: voxels whose own trend is significant at a false discovery rate of 5%, of those seen"
-        f" six times or more. {INTERVALS}"
+        " six times or more."
+    )
+    caption = (
+        f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
+        f"{tests if logged else ''} {INTERVALS}"
     )
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
 
