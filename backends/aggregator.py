@@ -107,7 +107,7 @@ class Aggregator:
         labels = np.where(frame.valid, np.uint8(0), np.uint8(IGNORE_8BIT)) if soft else frame.labels
         where = self._room("where", H * W if soft else 1, np.int32)
         threads = nb.get_num_threads()
-        terms = frame_terms(ray_x, frame.T_wc, self.voxel_size)
+        rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
         row_keys = self._room("row_keys", threads * 2 * W, np.int64).reshape(threads, 2, W)
         row_changes = self._room("row_changes", threads * W, np.uint8).reshape(threads, W)
         row_runs = self._room("row_runs", threads * 4 * (W + 1), np.int32).reshape(threads, 4, W + 1)
@@ -120,7 +120,7 @@ class Aggregator:
             highest = np.full(bands, -1, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             find_entries(
-                _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin, *terms,
+                _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin, rays, margin,
                 IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes, row_runs,
                 slots, key, label, count, where, entries, lost, highest, spread,
             )  # fmt: skip

@@ -70,7 +70,8 @@ class Png:
 
     def metres(self, scale: float) -> npt.NDArray[np.float32]:
         """Samples (H, W) of a 16-bit grey image, of which `scale` make a metre."""
-        quick = png_grey.decode_metres(*self.header[:2], scale, self._data()) if self._is_common() else None
+        width, height, *_ = self.header
+        quick = png_grey.decode_metres(width, height, scale, self._data()) if self._is_common() else None
         return np.divide(self.samples(), scale, dtype=np.float32, casting="same_kind") if quick is None else quick
 
     def rgb(self) -> npt.NDArray[np.uint8]:
@@ -79,7 +80,8 @@ class Png:
 
     def _quickly(self) -> npt.NDArray[Any] | None:
         """The stored samples of a one-channel image of the common kind; None where only the other decoder knows."""
-        return png_grey.decode(*self.header[:3], self._data()) if self._is_common() else None
+        width, height, bits, *_ = self.header
+        return png_grey.decode(width, height, bits, self._data()) if self._is_common() else None
 
     def _is_common(self) -> bool:
         """Whether samples are whole bytes, deflated, filtered as usual, not interlaced."""
