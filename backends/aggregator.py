@@ -120,9 +120,9 @@ class Aggregator:
             highest = np.full(bands, -1, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             find_entries(
-                _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin, rays, margin,
-                IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes, row_runs,
-                slots, key, label, count, where, entries, lost, highest, spread,
+                _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin,
+                rays, margin, IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes,
+                row_runs, slots, key, label, count, where, entries, lost, highest, spread,
             )  # fmt: skip
             if highest.max() >= self.num_classes:
                 check_frame(frame, self.num_classes)
