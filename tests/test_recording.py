@@ -24,6 +24,7 @@ from semstab.labels import LabelSpace
 from semstab.pipeline import Observer
 from semstab.plan import Plan, Task, load_config
 from semstab.recording import MEASURES, SERIES, Recording, voxel_maps
+from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
 from semstab.recording.voxel_maps import SBD_MAX, TITLES
 from semstab.results import GroupResult, RunResult, Unit, UnitSummary
@@ -173,22 +174,42 @@ def test_the_largest_sbd_has_the_last_colour() -> None:
 
 def test_the_blueprint_shows_every_series_and_every_backbone(run) -> None:
     maps = {f"{backbone}: {title}" for backbone in "ab" for title in TITLES.values()}
-    pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", "drift that this frame caused")}
+    pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", "drift of this frame")}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
         assert names >= {*SERIES.values(), *maps, *pictures, "Classes", "Notes", "Depth", "Frames to blame"}
 
 
-def test_the_eye_looks_at_the_middle_of_the_map(run) -> None:
+def test_every_map_has_an_eye_that_looks_down_on_it(run) -> None:
     blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when there is a map to look at
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
     assert len(blueprints) == 2
     assert len(eyes) == 2 * len(TITLES)  # of two backbones, each a view for the class, the measures, the category
     table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
-    middle = (table.centers.min(axis=0) + table.centers.max(axis=0)) / 2
     for eye in eyes:
-        np.testing.assert_allclose(eye["EyeControls3D:look_target"][0], middle, atol=0.2)
-        assert eye["EyeControls3D:position"][0][1] < middle[1]  # from above: up is -y
+        assert eye["EyeControls3D:position"][0][1] < table.centers[:, 1].min()  # from above: up is -y
+
+
+@pytest.mark.parametrize("up", [None, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 2.0])])
+@pytest.mark.parametrize("aspect", [0.8, 2.0, 4.7])
+def test_a_map_and_its_cameras_fill_the_view(up, aspect) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(4000, 3)) * (20, 2, 50) + (300, -40, 7)
+    cameras = np.tile(np.eye(4), (5, 1, 1))
+    cameras[:, :3, 3] = (300, -60, 7) + rng.normal(size=(5, 3)) * 10
+    scenery = Scenery(points, cameras, up)
+    target, distance = fit(scenery, aspect)
+    toward, upright = direction(scenery)
+    right = np.cross(upright, toward)
+    right /= np.linalg.norm(right)
+    seen = np.concatenate([points, cameras[:, :3, 3]]) - (target + distance * toward)
+    depth = -seen @ toward  # by perspective projection, as the viewer does it
+    half = math.tan(math.radians(55) / 2)
+    x, y = seen @ right / (aspect * half * depth), seen @ np.cross(toward, right) / (half * depth)
+    inside = (depth > 0) & (np.abs(x) <= 1) & (np.abs(y) <= 1)
+    assert inside[len(points) :].all()
+    assert inside.mean() > 0.97
+    assert max(np.ptp(x[inside]), np.ptp(y[inside])) > 1.85  # of 2
 
 
 def test_the_world_stands_upright(run) -> None:

@@ -7,9 +7,10 @@ camera/BACKBONE/labels, .../drift       SegmentationImage: classes; drift that t
 depth, trajectory                       EncodedDepthImage, LineStrips3D
 map/BACKBONE/BACKEND/MEASURE/CHUNK      VoxelGridMap: class, vss, sbd, entropy, op, category
 series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
-flips/BACKBONE/voxel N                  StateChange: the dominant class of the voxels that drifted most
-flips_report/BACKBONE, flips_at/...     TextDocument: the frames that caused each flip; Points3D: where those voxels are
+flips/BACKBONE/voxel_N                  StateChange: the dominant class of the voxels that drifted most
+flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them; Points3D: where those voxels are
 difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
+difference_report/BACKBONE/A and B      TextDocument: how many they are
 legend, log                             Points2D: the classes and their colours; TextLog: each unit's final numbers
 """
 

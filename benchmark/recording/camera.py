@@ -25,7 +25,7 @@ from semstab.recording.voxel_maps import SBD_MAX
 IMAGE_SIDE = 640
 JPEG_QUALITY = 80
 LOOK_BEHIND = 2
-"""Colour images that may be waiting for the worker."""
+"""Frames whose images may be waiting for the worker."""
 
 NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
 LEVELS = 24
@@ -37,8 +37,8 @@ GLOW = np.array([(150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255
 
 
 def stride_of(shape: tuple[int, int]) -> int:
-    """Every how many pixels a picture of a frame of that shape (H, W) is sampled."""
-    return math.ceil(max(shape) / IMAGE_SIDE)
+    """Every how many pixels a picture of a frame of that shape (H, W) is sampled: a power of 2, as JPEG decodes to."""
+    return int(2 ** max(0, math.ceil(math.log2(max(shape) / IMAGE_SIDE))))
 
 
 def drift_levels(drift: npt.NDArray[np.float32], seen: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
@@ -84,7 +84,7 @@ class Camera:
         self._translation = translation
         self._logged: set[int] = set()
         self._depth_unit: float | None = None
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="semstab-color")
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="semstab-pictures")
         self._pending: deque[Future[None]] = deque()
 
     def log(self, stream: rr.RecordingStream, frame: Frame, clock: Clock) -> None:
@@ -96,23 +96,23 @@ class Camera:
         pose[:3, 3] -= self._translation
         self.poses.append(pose)
         stride = stride_of(frame.shape)
-        H, W = (-(-side // stride) for side in frame.shape)
         self._log_camera(stream, frame, pose, stride)
-        stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride))
         while len(self._pending) >= LOOK_BEHIND:
             self._pending.popleft().result()
-        self._pending.append(self._worker.submit(self._log_color, stream, frame, (W, H), clock))
+        self._pending.append(self._worker.submit(self._log_images, stream, frame, stride, clock))
 
     def close(self) -> None:
-        """Wait for the colour images that are still being made."""
+        """Wait for the images that are still being made."""
         self._worker.shutdown()
         for pending in self._pending:
             pending.result()
 
-    def _log_color(self, stream: rr.RecordingStream, frame: Frame, size: tuple[int, int], clock: Clock) -> None:
+    def _log_images(self, stream: rr.RecordingStream, frame: Frame, stride: int, clock: Clock) -> None:
         """In the worker: what it decodes and encodes is nothing that the next frame has to wait for."""
-        if (color := self._color(frame, size)) is not None:
-            clock.set(stream, frame.index, frame.timestamp)  # a stream has a time for each thread
+        clock.set(stream, frame.index, frame.timestamp)  # a stream has a time for each thread
+        stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride))
+        H, W = (-(-side // stride) for side in frame.shape)
+        if (color := self._color(frame, (W, H))) is not None:
             stream.log(self._path("color"), rr.EncodedImage(contents=color, media_type="image/jpeg", draw_order=-20))
 
     def _log_camera(self, stream: rr.RecordingStream, frame: Frame, pose: npt.NDArray[Any], stride: int) -> None:

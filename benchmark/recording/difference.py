@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,17 @@ VSS_RANGE = (0.0, 0.5)
 def log_difference(
     stream: rr.RecordingStream,
     entity: str,
-    first: VoxelTable,
-    second: VoxelTable,
+    tables: Mapping[str, VoxelTable],
     origin: npt.NDArray[np.int64],
     tolerance: float,
 ) -> str:
-    """Log the voxels that one map has only, and those whose VSS differs by more than the tolerance; say how many."""
+    """Log the voxels that one of two maps has only, and those whose VSS differs by more than the tolerance.
+
+    tables  the two maps by the names of their backends
+
+    Returns how many there are, in words. They are of the final maps, so they are logged for all times.
+    """
+    first, second = tables.values()
     in_first, in_second = matched(first, second)
     change = np.abs(vss(first)[in_first] - vss(second)[in_second])
     differs = change > tolerance
@@ -45,18 +51,17 @@ def log_difference(
         values: dict[str, Any] = {"values": change[differs][rows].astype(np.float32)} if part == "changed" else {}
         cells = (index[rows] // factor).astype(np.int32)
         size = [first.voxel_size * factor] * 3
-        stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **looks[part]))
+        stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **looks[part]), static=True)
+    one, other = tables
     return (
-        f"{len(parts['only_first']):,} voxels in the first only, {len(parts['only_second']):,} in the second only,"
-        f" VSS differs in {int(differs.sum()):,} of {len(in_first):,} others"
+        f"{len(parts['only_first']):,} voxels in {one} only, {len(parts['only_second']):,} in {other} only; of"
+        f" {len(in_first):,} in both VSS differs in {int(differs.sum()):,}, by {change.max(initial=0.0):.2g} at most"
     )
 
 
 def matched(first: VoxelTable, second: VoxelTable) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Rows of two tables that are the same voxel, ascending in both."""
-    a, b = (
-        np.ascontiguousarray(table.index).view([("x", "i4"), ("y", "i4"), ("z", "i4")]).ravel()
-        for table in (first, second)
-    )
+    low = np.minimum(first.index.min(axis=0), second.index.min(axis=0)).astype(np.int64)
+    a, b = (np.ascontiguousarray(table.index - low) @ (1 << 42, 1 << 21, 1) for table in (first, second))
     _, in_first, in_second = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     return in_first, in_second

@@ -1,4 +1,4 @@
-"""Flip forensics: which frames changed the dominant class of the voxels that drifted most."""
+"""Flip forensics: which frames moved the voxels that drifted most, and which of them changed the dominant class."""
 
 from __future__ import annotations
 
@@ -20,10 +20,13 @@ from semstab.recording.tracker import Tracker
 SHOWN = 10
 """Voxels that are shown of a backbone on a scene."""
 
-MAX_FLIPS = 2_000_000
-"""Flips that are kept of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
+MAX_MOVES = 2_000_000
+"""Moves that are kept of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
 
-FLIP = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
+MOVED_BITS = 0.05
+"""Drift from which on a frame is to blame, also where the dominant class stays: that of a drifting voxel."""
+
+MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
 COLORS = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
@@ -38,7 +41,7 @@ class Suspect:
     number  from 1, the one that drifted most first
     center  (3,) metres, world
     bits    its drift, summed over all frames
-    flips   records of `FLIP`, in the order of the frames
+    moves   records of `MOVE`, in the order of the frames
     """
 
     number: int
@@ -48,11 +51,11 @@ class Suspect:
     op: int
     sbd: float
     bits: float
-    flips: npt.NDArray[np.void]
+    moves: npt.NDArray[np.void]
 
 
 class FlipLog:
-    """Keeps each change of a voxel's dominant class, and from which file the frame's labels came."""
+    """Keeps what moved a voxel's belief, above all its dominant class, and from which file the frame's labels came."""
 
     def __init__(self) -> None:
         self._parts: list[npt.NDArray[np.void]] = []
@@ -60,27 +63,30 @@ class FlipLog:
         self._frames: dict[int, tuple[float | None, str]] = {}  # timestamp, label file
 
     def update(self, tracker: Tracker, frame: Frame) -> None:
-        """Keep the flips of the frame that the tracker followed last."""
+        """Keep what the frame that the tracker followed last has moved."""
         changes = tracker.map.changes
-        at = np.flatnonzero(changes.before != changes.after)
-        flips = np.zeros(len(at), dtype=FLIP)
-        flips["row"], flips["frame"], flips["bits"] = changes.row[at], frame.index, changes.drift[at]
-        flips["before"], flips["after"] = changes.before[at], changes.after[at]
-        self._parts.append(flips)
+        at = np.flatnonzero((changes.before != changes.after) | (changes.drift >= MOVED_BITS))
+        moves = np.zeros(len(at), dtype=MOVE)
+        moves["row"], moves["frame"], moves["bits"] = changes.row[at], frame.index, changes.drift[at]
+        moves["before"], moves["after"] = changes.before[at], changes.after[at]
+        self._parts.append(moves)
         self._count += len(at)
         name = frame.files.get("labels") or frame.files.get("scores") or ""
-        self._frames[frame.index] = frame.timestamp, PurePath(name).name
-        if self._count > MAX_FLIPS:
+        file = PurePath(name)
+        self._frames[frame.index] = frame.timestamp, file.name if file.suffix else ""
+        if self._count > MAX_MOVES:
             self._drop(tracker.total_drift)
 
     def suspects(self, tracker: Tracker) -> Iterator[Suspect]:
-        """The voxels that drifted most, and what flipped them."""
+        """The voxels that drifted most, and what moved them."""
         total = tracker.total_drift
-        rows = np.argsort(-total, kind="stable")[:SHOWN]
-        flips = np.concatenate([np.zeros(0, dtype=FLIP), *self._parts])
-        for number, row in enumerate(rows[total[rows] > 0], start=1):
+        most = np.partition(total, -SHOWN)[-SHOWN] if len(total) > SHOWN else 0.0
+        rows = np.flatnonzero((total >= most) & (total > 0))
+        rows = rows[np.argsort(-total[rows], kind="stable")][:SHOWN]
+        moves = np.concatenate([np.zeros(0, dtype=MOVE), *self._parts])
+        for number, row in enumerate(rows, start=1):
             table = tracker.map.table_of(np.array([row]))
-            own = flips[flips["row"] == row]
+            own = moves[moves["row"] == row]
             first = int(own["before"][0]) if len(own) else int(table.evidence[0].argmax())
             yield Suspect(
                 number, table.centers[0], int(table.first_frame[0]), first, int(table.op[0]), float(sbd(table)[0]),
@@ -99,12 +105,12 @@ class FlipLog:
     ) -> None:
         """A lane with each suspect's dominant class, a line of text for each flip, and where the suspects are."""
         for suspect in suspects:
-            lane = path(scene, "flips", backbone, f"voxel {suspect.number}")
+            lane = path(scene, "flips", backbone, f"voxel_{suspect.number}")
             names = list(classes.classes)
             colors = [(*color, 255) for color in classes.colors]
             stream.log(lane, rr.StateConfiguration(values=names, labels=names, colors=colors), static=True)
             self._log_state(stream, lane, suspect.first_frame, classes.classes[suspect.first_class], clock)
-            for flip in suspect.flips:
+            for flip in suspect.moves[suspect.moves["before"] != suspect.moves["after"]]:
                 self._log_state(stream, lane, int(flip["frame"]), classes.classes[flip["after"]], clock)
         report = rr.TextDocument(self._report(backbone, suspects, classes), media_type=rr.MediaType.MARKDOWN)
         stream.log(path(scene, "flips_report", backbone), report, static=True)
@@ -122,7 +128,7 @@ class FlipLog:
 
     def _report(self, backbone: str, suspects: list[Suspect], classes: LabelSpace) -> str:
         """Markdown: for each suspect the frames that are to blame."""
-        lines = [f"**{backbone}**: the voxels with the largest drift, and the frames that changed their dominant class"]
+        lines = [f"**{backbone}**: the voxels with the largest drift, and the frames that moved them"]
         lines += [""] if suspects else ["", "No voxel drifted."]
         for s in suspects:
             x, y, z = s.center
@@ -130,17 +136,17 @@ class FlipLog:
                 f"- **voxel {s.number}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {s.op}, drift {s.bits:.3f} bits in all,"
                 f" SBD {s.sbd:.4f} bits; {classes.classes[s.first_class]} in frame {s.first_frame}"
             )
-            for flip in s.flips:
-                file = self._frames.get(int(flip["frame"]), (None, ""))[1]
-                lines.append(
-                    f"    - frame {flip['frame']}{f' ({file})' if file else ''}: {classes.classes[flip['before']]} →"
-                    f" {classes.classes[flip['after']]}, {flip['bits']:.4f} bits"
-                )
+            for move in s.moves:
+                file = self._frames.get(int(move["frame"]), (None, ""))[1]
+                where = f"frame {move['frame']}{f' ({file})' if file else ''}"
+                before, after = (classes.classes[move[when]] for when in ("before", "after"))
+                what = f"**{before} → {after}**" if before != after else f"stays {before}"
+                lines.append(f"    - {where}: {what}, {move['bits']:.4f} bits")
         return "\n".join(lines) + "\n"
 
     def _drop(self, total_drift: npt.NDArray[np.float32]) -> None:
-        """Keep half as many: the flips of the voxels that drifted most."""
-        flips = np.concatenate(self._parts)
-        order = np.argsort(-total_drift[flips["row"]], kind="stable")[: MAX_FLIPS // 2]
-        self._parts = [flips[np.sort(order)]]
+        """Keep half as many: the moves of the voxels that drifted most."""
+        moves = np.concatenate(self._parts)
+        order = np.argsort(-total_drift[moves["row"]], kind="stable")[: MAX_MOVES // 2]
+        self._parts = [moves[np.sort(order)]]
         self._count = len(order)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,29 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
-from semstab.labels import LabelSpace
 from semstab.plan import Plan, Task
+from semstab.recording import legend
 from semstab.recording.entities import path
 from semstab.recording.series import OF_THE_BACKBONE, SERIES, entity
-from semstab.recording.voxel_maps import TITLES
+from semstab.recording.voxel_maps import TABS, TITLES
 from semstab.results import Unit
 
-EYE_DISTANCE = 0.55
-"""From the middle of a map, in units of its diagonal."""
+FIELD_OF_VIEW = math.radians(55)
+"""Of the viewer's eyes, from bottom to top."""
+
+MARGIN = 0.96
+"""Of a view's half height and half width, what is seen in it."""
+
+OUTLIERS = 0.005
+"""Share of a map's voxels that may lie beyond each edge of its view."""
+
+# In a window of 1500 x 850 points, as laptops have it; in others the proportions are alike.
+LEFT, TITLE = (808, 538), 27
+"""Width and height of what is left of the camera, and the height of a view's title or of a row of tabs."""
+DIFFERENCE_ASPECT, COMPARED_ASPECT = 2.2, 1.6
+
+MOST_BESIDE = 4
+"""Maps that are seen at once; more have a tab each."""
 
 BACKGROUND = (72, 72, 78)
 """Of the maps: neither end of the colour maps vanishes in it."""
@@ -31,46 +46,34 @@ OVERVIEW = ("drift", "compensated_flicker", "map_vss", "map_recurrent")
 COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
 DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
 
-LEGEND_LETTERS = 90
-"""In a line of the legend."""
 
-MOST_LAID_OUT, TASK_COST, PAIR_COST = 480, 77, 60
-"""Chunks of a blueprint: the most there may be, and those of a backbone on a scene and of a comparison, roughly.
+@dataclass(frozen=True, eq=False)
+class Scenery:
+    """What a scene's maps show, from which follows where they are seen from.
 
-The viewer of rerun 0.41 refuses a file with a blueprint of 900 ('finished without loading a recording'), and opens one
-with 490.
-"""
+    points   (n, 3) metres, of the voxels or a sample of them
+    cameras  (m, 4, 4) poses in the same world
+    up       (3,), where it is known
+    """
 
-Eyes = Mapping[str, rrb.EyeControls3D]
+    points: npt.NDArray[np.float64]
+    cameras: npt.NDArray[np.float64]
+    up: npt.NDArray[np.float64] | None
 
 
-def blueprint(plan: Plan, eyes: Eyes) -> rrb.Blueprint:
-    """The layout of a plan; `eyes` says, by scene, where its maps are seen from; else the viewer chooses."""
-    scenes = [_scene(scene, tasks, eyes.get(scene)) for scene, tasks in laid_out(plan).items()]
+Sceneries = Mapping[str, Scenery]
+
+
+def blueprint(plan: Plan, sceneries: Sceneries) -> rrb.Blueprint:
+    """The layout of a plan; `sceneries`, by scene, say where its maps are seen from; else the viewer chooses."""
+    by_scene = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
+    scenes = [_scene(scene, list(tasks), sceneries.get(scene)) for scene, tasks in by_scene]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="frame", play_state="following"),  # the whole map is at the end
     )
-
-
-def laid_out(plan: Plan) -> dict[str, list[Task]]:
-    """The tasks of the scenes that have a tab: the first ones, as many as the viewer opens without complaint."""
-    scenes: dict[str, list[Task]] = {}
-    cost = 0
-    for scene, group in itertools.groupby(plan.tasks, key=lambda task: task.scene.name):
-        tasks = list(group)
-        cost += sum(TASK_COST + PAIR_COST * len(compared(task)) for task in tasks)
-        if cost > MOST_LAID_OUT and scenes:
-            break
-        scenes[scene] = tasks
-    return scenes
-
-
-def legend_columns(classes: LabelSpace) -> int:
-    """How many names stand beside each other."""
-    return max(2, min(7, LEGEND_LETTERS // (max(map(len, classes.classes)) + 3)))
 
 
 def drawn(task: Task) -> str:
@@ -90,49 +93,61 @@ def compared(task: Task) -> list[tuple[str, str]]:
     return [(drawn(task), other) for other in task.backends if other != drawn(task)]
 
 
-def _scene(scene: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.Container:
-    overview = _overview(scene, tasks, eye)
-    pairs = [(task, first, second) for task in tasks for first, second in compared(task)]
-    if not pairs:
-        return overview
-    return rrb.Tabs(overview, *(_comparison(*pair, eye) for pair in pairs), name=scene)
+def distinct(task: Task) -> list[str]:
+    """The backends whose series are drawn over each other: of those that fuse alike one, as their lines coincide."""
+    return [name for name in task.backends if name == drawn(task) or not is_pointwise(name)]
 
 
-def _overview(scene: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.Container:
-    maps = rrb.Tabs(*(_maps(name, title, tasks, eye) for name, title in TITLES.items()))
+def _scene(scene: str, tasks: list[Task], scenery: Scenery | None) -> rrb.Container:
+    flips = [_flips(scene, task) for task in tasks]
+    comparisons = [_comparison(task, *pair, scenery) for task in tasks for pair in compared(task)]
+    return rrb.Tabs(_overview(scene, tasks, scenery), *flips, *comparisons, name=scene)
+
+
+def _overview(scene: str, tasks: list[Task], scenery: Scenery | None) -> rrb.Container:
     classes = tasks[0].mapping.target
-    columns = legend_columns(classes)
-    rows = math.ceil(len(classes) / columns)
-    bounds = rrb.VisualBounds2D(x_range=(-0.5, columns - 0.5), y_range=(-0.2, 0.5 * rows - 0.1))
-    legend = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
-    left = rrb.Vertical(maps, legend, row_shares=[8, rows])
+    width, height = legend.size(classes)
+    area = LEFT[0], LEFT[1] - TITLE - (height + TITLE)
+    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area) for name in TITLES))
+    bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
+    classes_view = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
+    left = rrb.Vertical(maps, classes_view, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
     top = rrb.Horizontal(left, _cameras(scene, tasks), column_shares=[5, 4])
-    return rrb.Vertical(top, _below(scene, tasks), row_shares=[5, 2], name=scene)
+    return rrb.Vertical(top, _below(scene, tasks), row_shares=[5, 2], name="Overview")
 
 
 def _below(scene: str, tasks: list[Task]) -> rrb.Container:
-    first = rrb.Horizontal(*(_plot(scene, name) for name in OVERVIEW), name="Time series")
-    more = [_plot(scene, name) for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
-    times = [_plot(scene, name) for name in SERIES if name.endswith("_ms")]
-    flips = [
-        rrb.Horizontal(
-            rrb.StateTimelineView(
-                origin=path(scene, "flips", task.backbone), name="Dominant class of the voxels that drifted most"
-            ),
-            rrb.TextDocumentView(origin=path(scene, "flips_report", task.backbone), name="Frames to blame"),
-            name=f"Flips: {task.backbone}",
-        )
-        for task in tasks
-    ]
+    first = rrb.Horizontal(*(_plot(scene, name, tasks) for name in OVERVIEW), name="Time series")
+    more = [_plot(scene, name, tasks) for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
+    times = [_plot(scene, name, tasks) for name in SERIES if name.endswith("_ms")]
     notes = rrb.TextLogView(origin=path(scene, "log"), name="Notes")
     return rrb.Tabs(
-        first, rrb.Horizontal(*more, name="More series"), rrb.Horizontal(*times, name="Milliseconds"), *flips, notes
+        first, rrb.Horizontal(*more, name="More series"), rrb.Horizontal(*times, name="Milliseconds"), notes
     )
 
 
-def _plot(scene: str, name: str) -> rrb.TimeSeriesView:
-    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=name == "map_recurrent")  # there a growing line leaves room
-    return rrb.TimeSeriesView(origin=path(scene, "series", name), name=SERIES[name], plot_legend=legend)
+def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
+    legend_at = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=name in ("map_recurrent", "fuse_ms"))
+    lines = [
+        entity(name, Unit(scene, task.backbone, backend))
+        for task in tasks
+        for backend in (task.backends if name.endswith("_ms") else distinct(task))
+    ]
+    return rrb.TimeSeriesView(
+        origin=path(scene, "series", name), contents=list(dict.fromkeys(lines)), name=SERIES[name],
+        plot_legend=legend_at,
+    )  # fmt: skip
+
+
+def _flips(scene: str, task: Task) -> rrb.Container:
+    """The voxels that drifted most and the frames to blame, beside what the camera saw."""
+    lanes = rrb.StateTimelineView(
+        origin=path(scene, "flips", task.backbone), name="Dominant class of the voxels that drifted most"
+    )
+    blamed = rrb.TextDocumentView(origin=path(scene, "flips_report", task.backbone), name="Frames to blame")
+    left = rrb.Vertical(lanes, blamed)
+    right = rrb.Vertical(*_camera_views(scene, task))
+    return rrb.Horizontal(left, right, column_shares=[5, 4], name=f"Flips: {task.backbone}")
 
 
 def _cameras(scene: str, tasks: list[Task]) -> rrb.Container:
@@ -151,17 +166,30 @@ def _camera_views(scene: str, task: Task) -> list[rrb.View]:
         rrb.Spatial2DView(
             origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.backbone}: labels"
         ),
-        rrb.Spatial2DView(
-            origin=origin, contents=[color, drift, flips], name=f"{task.backbone}: drift that this frame caused"
-        ),
+        rrb.Spatial2DView(origin=origin, contents=[color, drift, flips], name=f"{task.backbone}: drift of this frame"),
     ]
 
 
-def _maps(name: str, title: str, tasks: list[Task], eye: rrb.EyeControls3D | None) -> rrb.Container:
-    views = [_map(name, f"{task.backbone}: {title}", task, drawn(task), eye) for task in tasks]
-    if len(views) > 4:
-        return rrb.Tabs(*views, name=title)
-    return rrb.Grid(*views, grid_columns=1 if len(views) <= 2 else 2, name=title)
+def _maps(name: str, tasks: list[Task], scenery: Scenery | None, area: tuple[float, float]) -> rrb.Container:
+    columns, aspect = _arrangement(len(tasks), scenery, area)
+    views = [_map(name, f"{task.backbone}: {TITLES[name]}", task, drawn(task), _eye(scenery, aspect)) for task in tasks]
+    if len(views) > MOST_BESIDE:
+        return rrb.Tabs(*views, name=TABS[name])
+    return rrb.Grid(*views, grid_columns=columns, name=TABS[name])
+
+
+def _arrangement(views: int, scenery: Scenery | None, area: tuple[float, float]) -> tuple[int, float]:
+    """In how many columns so many views of a scenery show it largest, and how much wider than high each one is."""
+    if views > MOST_BESIDE:
+        return 1, area[0] / (area[1] - 2 * TITLE)
+    cells = {}
+    for columns in range(1, views + 1):
+        height = area[1] / math.ceil(views / columns) - TITLE
+        aspect = area[0] / columns / height
+        scale = height if scenery is None else height / fit(scenery, aspect)[1]
+        cells[columns] = scale, aspect
+    best = max(cells, key=lambda columns: cells[columns][0])
+    return best, cells[best][1]
 
 
 def _map(name: str, title: str, task: Task, backend: str, eye: rrb.EyeControls3D | None) -> rrb.Spatial3DView:
@@ -178,25 +206,28 @@ def _map(name: str, title: str, task: Task, backend: str, eye: rrb.EyeControls3D
     )
 
 
-def _comparison(task: Task, first: str, second: str, eye: rrb.EyeControls3D | None) -> rrb.Container:
+def _comparison(task: Task, first: str, second: str, scenery: Scenery | None) -> rrb.Container:
     """Two backends: their maps and where these differ, and the same series side by side."""
     scene, backbone = task.scene.name, task.backbone
-    parts = [path(scene, "difference", backbone, f"{first} and {second}", part) for part in DIFFERENCE]
+    pair = f"{first} and {second}"
     difference = rrb.Spatial3DView(
         origin=path(scene),
-        contents=parts,
-        name=f"Difference: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
+        contents=[path(scene, "difference", backbone, pair, part) for part in DIFFERENCE],
+        name=f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
         background=BACKGROUND,
         line_grid=False,
-        eye_controls=eye,
+        eye_controls=_eye(scenery, DIFFERENCE_ASPECT),
     )
+    found = rrb.TextDocumentView(origin=path(scene, "difference_report", backbone, pair), name="What differs")
+    eye = _eye(scenery, COMPARED_ASPECT)
     maps = rrb.Horizontal(
-        *(_map("class", f"{backend}: dominant class", task, backend, eye) for backend in (first, second))
+        _map("class", f"{first}: dominant class", task, first, eye),
+        _map("class", f"{second}: dominant class, at the end", task, second, eye),
     )
     plots = [
         rrb.TimeSeriesView(
             origin=entity(name, Unit(scene, backbone, backend)),
-            name=f"{backend}: {SERIES[name]}",
+            name=f"{SERIES[name]}: {backend}",
             plot_legend=rrb.PlotLegend(visible=False),
         )
         for name in COMPARED
@@ -204,30 +235,60 @@ def _comparison(task: Task, first: str, second: str, eye: rrb.EyeControls3D | No
         for backend in (first, second)
     ]
     return rrb.Horizontal(
-        rrb.Vertical(difference, maps, row_shares=[3, 2]),
+        rrb.Vertical(found, difference, maps, row_shares=[1, 5, 4]),
         rrb.Grid(*plots, grid_columns=2),
         column_shares=[5, 4],
-        name=f"{backbone}: {first} and {second}",
+        name=f"{backbone}: {pair}",
     )
 
 
-def eye_on(
-    points: npt.NDArray[Any], cameras: Sequence[npt.NDArray[np.float64]], up: npt.NDArray[Any] | None
-) -> rrb.EyeControls3D:
-    """An eye on the points (n, 3), so near that they fill the view; cameras are poses (4, 4), where they are known.
+def _eye(scenery: Scenery | None, aspect: float) -> rrb.EyeControls3D | None:
+    if scenery is None:
+        return None
+    target, distance = fit(scenery, aspect)
+    toward, up = direction(scenery)
+    return rrb.EyeControls3D(position=target + distance * toward, look_target=target, eye_up=up)
 
-    Where the world's up is known it looks down on them, across their longest extent; else from the cameras' side.
+
+def direction(scenery: Scenery) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Unit vectors from a scenery to the eye, and up.
+
+    Where the world's up is known it looks down on the points, across their longest extent; else from the cameras' side.
     """
-    low, high = np.quantile(points, [0.02, 0.98], axis=0)
-    middle = (low + high) / 2
-    poses = np.array(cameras) if len(cameras) else np.eye(4)[None]
-    side = poses[:, :3, 3].mean(axis=0) - middle
+    points, cameras, up = scenery.points, scenery.cameras, scenery.up
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    side = (cameras[:, :3, 3] - middle).mean(axis=0) if len(cameras) else np.zeros(3)
     if up is None:
-        up = -poses[:, :3, 1].mean(axis=0)  # the images' top
-        side = side / max(float(np.linalg.norm(side)), 1e-9) + 0.3 * up
+        up = -cameras[:, :3, 1].mean(axis=0) if len(cameras) else np.array([0.0, -1.0, 0.0])  # the images' top
+        toward = side / max(float(np.linalg.norm(side)), 1e-9) + 0.3 * up
     else:
         flat = (points - middle) - np.outer((points - middle) @ up, up)
         across = np.cross(np.linalg.eigh(flat.T @ flat)[1][:, 2], up)
-        side = across * (1 if across @ side > 0 else -1) + up
-    side *= EYE_DISTANCE * np.linalg.norm(high - low) / np.linalg.norm(side)
-    return rrb.EyeControls3D(position=middle + side, look_target=middle, eye_up=up)
+        toward = across * (1 if across @ side > 0 else -1) + up
+    return toward / np.linalg.norm(toward), up / np.linalg.norm(up)
+
+
+def fit(scenery: Scenery, aspect: float) -> tuple[npt.NDArray[np.float64], float]:
+    """Where an eye looks, and from how far, for a view of that width by height to be full of points and cameras.
+
+    With the depth z of a point towards the eye, and its place (x, y) across, the view holds it where
+    |x - x0| <= aspect * h * (d - z) and |y - y0| <= h * (d - z), h the tangent of half the field of view: so the edges
+    of x - aspect * h * z and x + aspect * h * z say what d has to be, and likewise those of y.
+    """
+    toward, up = direction(scenery)
+    right = np.cross(up, toward)
+    right /= np.linalg.norm(right)
+    across = np.stack([right, np.cross(toward, right)])
+    half = MARGIN * math.tan(FIELD_OF_VIEW / 2) * np.array([aspect, 1.0])
+
+    def edges(places: npt.NDArray[np.float64], trimmed: float) -> tuple[Any, Any]:
+        at, near = places @ across.T, np.outer(places @ toward, half)
+        return np.quantile(at - near, trimmed, axis=0), np.quantile(at + near, 1 - trimmed, axis=0)
+
+    low, high = edges(scenery.points, OUTLIERS)
+    if len(scenery.cameras):
+        first, last = edges(scenery.cameras[:, :3, 3], 0.0)
+        low, high = np.minimum(low, first), np.maximum(high, last)
+    distance = float(((high - low) / (2 * half)).max())
+    middle = float(np.median(scenery.points @ toward))
+    return (low + high) / 2 @ across + middle * toward, distance - middle

@@ -12,19 +12,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
-import rerun.blueprint as rrb
 
 from semstab.frames import Frame
-from semstab.labels import LabelSpace
-from semstab.metrics import compensated_flicker, vss
+from semstab.metrics import compensated_flicker
 from semstab.pipeline import Observer
 from semstab.plan import Plan, Task
-from semstab.recording import series
+from semstab.recording import legend, series
 from semstab.recording.camera import IMAGE_SIDE, Camera, drift_context, drift_levels, label_context, stride_of
 from semstab.recording.difference import log_difference
 from semstab.recording.entities import Clock, path
 from semstab.recording.flips import FlipLog
-from semstab.recording.layout import blueprint, drawn, eye_on, is_pointwise, laid_out, legend_columns
+from semstab.recording.layout import Scenery, blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target
 from semstab.recording.tracker import Tracker
 from semstab.recording.voxel_maps import GrowingMap
@@ -34,6 +32,9 @@ from semstab.voxels import VoxelTable
 
 SAMPLING = 2
 """In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
+
+SAMPLE = 20_000
+"""Voxels of a scene from which it follows where its maps are seen from."""
 
 ORIGIN_STEP = 1000.0
 """Metres; map origins are multiples of it: a scene near its world's origin keeps its coordinates."""
@@ -59,7 +60,7 @@ class Recording(Observer):
         self._kept: list[tuple[Task, GroupResult]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
         self._cameras: dict[str, Camera] = {}
-        self._eyes: dict[str, rrb.EyeControls3D] = {}
+        self._sceneries: dict[str, Scenery] = {}
         self._group: _Group | None = None  # the backbone on a scene that is being fused
 
     def run_started(self, plan: Plan) -> None:
@@ -129,7 +130,7 @@ class Recording(Observer):
         if self._stream is None:
             self._stream = stream = self.target.open()
             _log_static(stream, self._plan)
-            stream.send_blueprint(blueprint(self._plan, self._eyes))
+            stream.send_blueprint(blueprint(self._plan, self._sceneries))
             self._log_kept(stream)
         return self._stream
 
@@ -138,12 +139,13 @@ class Recording(Observer):
     ) -> None:
         remark = group.log_map(stream, unit, table, self._plan.config.tolerance)
         stream.log(path(unit.scene, "log"), rr.TextLog(_final(summary) + remark))
-        if unit.scene not in self._eyes and len(table):
-            points = (table.index - group.origin + 0.5) * table.voxel_size
-            poses = self._cameras[unit.scene].poses
-            self._eyes[unit.scene] = eye_on(points, poses, group.task.scene.up)
+        if unit.scene not in self._sceneries and len(table):
+            some = table.index[:: math.ceil(len(table) / SAMPLE)]
+            poses = np.reshape(self._cameras[unit.scene].poses, (-1, 4, 4))
+            points = ((some - group.origin + 0.5) * table.voxel_size).astype(np.float64)
+            self._sceneries[unit.scene] = Scenery(points, poses, group.task.scene.up)
             stream.send_blueprint(
-                blueprint(self._plan, self._eyes), make_default=True, make_active=not self.target.live
+                blueprint(self._plan, self._sceneries), make_default=True, make_active=not self.target.live
             )
 
     def _log_kept(self, stream: rr.RecordingStream) -> None:
@@ -187,7 +189,7 @@ class _Group:
     def __init__(self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64]) -> None:
         self.task = task
         self.origin = origin
-        self._classes: LabelSpace = task.mapping.target
+        self._classes = task.mapping.target
         self._translation = origin * voxel_size
         self._tracker = Tracker(voxel_size, len(self._classes))
         self._followed = False  # the frame went into a map of the run that the tracker follows
@@ -224,9 +226,7 @@ class _Group:
         if first in self._tables:
             for backend in self._tables if unit.backend == first else [unit.backend]:
                 self._compare(stream, first, backend, tolerance)
-        if unit.backend == first:
-            return self._finish(stream, self._map(first), table)
-        return self._map(unit.backend).replace(stream, table)
+        return self._map(unit.backend).finish(stream, table)
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
         """Log which frames changed the voxels that drifted most."""
@@ -244,16 +244,11 @@ class _Group:
             return
         scene, backbone = self.task.scene.name, self.task.backbone
         entity = path(scene, "difference", backbone, f"{first} and {second}")
-        found = log_difference(stream, entity, self._tables[first], self._tables[second], self.origin, tolerance)
-        stream.log(path(scene, "log"), rr.TextLog(f"{backbone}, {first} and {second}: {found}"))
-
-    def _finish(self, stream: rr.RecordingStream, growing: GrowingMap, table: VoxelTable) -> str:
-        """Log what is not drawn yet; where the tracker's map is not the unit's, the unit's in its place."""
-        fused = self._tracker.map if self._previous is not None else None
-        if fused is not None and growing.holds(len(table)) and _same(fused.table(), table):
-            growing.finish(stream, fused)
-            return ""
-        return growing.replace(stream, table)
+        tables = {name: self._tables[name] for name in (first, second)}
+        found = log_difference(stream, entity, tables, self.origin, tolerance)
+        stream.log(path(scene, "log"), rr.TextLog(f"{backbone}: {found}"))
+        report = rr.TextDocument(f"{found}.", media_type=rr.MediaType.MARKDOWN)
+        stream.log(path(scene, "difference_report", backbone, f"{first} and {second}"), report, static=True)
 
     def _log_pictures(self, stream: rr.RecordingStream, frame: Frame, stride: int) -> None:
         labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
@@ -285,39 +280,18 @@ def _sampling(shape: tuple[int, ...]) -> int:
     return SAMPLING if max(shape) > IMAGE_SIDE // SAMPLING else 1
 
 
-def _same(a: VoxelTable, b: VoxelTable) -> bool:
-    """Whether two maps look the same: the same voxels with the same numbers, but for what nobody sees."""
-    if len(a) != len(b):
-        return False
-    alike = (a.index == b.index).all() and (a.op == b.op).all()
-    return bool(alike and np.allclose(vss(a), vss(b), atol=1e-6) and np.allclose(a.drift_sum, b.drift_sum, atol=1e-6))
-
-
 def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
-    shown = laid_out(plan)
-    for scene in dict.fromkeys(task.scene.name for task in plan.tasks if task.scene.name not in shown):
-        text = rr.TextLog(f"{scene}: recorded, without a tab: the viewer opens no larger layout; add views as you like")
-        stream.log(path(next(iter(shown)), "log"), text, static=True)
     for scene, task in {task.scene.name: task for task in plan.tasks}.items():
         if (up := task.scene.up) is not None:  # the axis of the world that is nearest to it
             axis = int(np.abs(up).argmax())
             name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
             stream.log(path(scene), getattr(rr.ViewCoordinates, name), static=True)
-        _log_legend(stream, path(scene, "legend"), task.mapping.target)
+        legend.log_legend(stream, path(scene, "legend"), task.mapping.target)
     for task in plan.tasks:
         entity = path(task.scene.name, "camera", task.backbone)
         stream.log(f"{entity}/labels", label_context(task.mapping.target), static=True)
         stream.log(f"{entity}/drift", drift_context(), static=True)
     series.log_styles(stream, plan)
-
-
-def _log_legend(stream: rr.RecordingStream, entity: str, space: LabelSpace) -> None:
-    """Dots in the classes' colours, and their names in white: a label has its point's colour, which may be dark."""
-    columns = legend_columns(space)
-    at = np.array([(k % columns, 0.5 * (k // columns)) for k in range(len(space))])
-    stream.log(entity, rr.Points2D(at - (0, 0.06), colors=space.colors, radii=rr.Radius.ui_points(8.0)), static=True)
-    names = rr.Points2D(at, colors=(255, 255, 255), labels=space.classes, radii=0.0, show_labels=True)
-    stream.log(f"{entity}/names", names, static=True)
 
 
 def _final(summary: UnitSummary) -> str:

@@ -90,7 +90,7 @@ def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
         for unit in task.units:
             color = LINE_COLORS[units.index((unit.backbone, unit.backend)) % len(LINE_COLORS)]
             # Where backends agree their lines coincide; the viewer draws them by name, so each one is thinner.
-            width = 1.5 + 2.5 * sum(backend > unit.backend for backend in task.backends)
+            width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
             for name in columns(unit, task):
                 label = unit.backbone if name in OF_THE_BACKBONE else f"{unit.backbone}, {unit.backend}"
                 line = rr.SeriesLines(colors=color, names=label, widths=width)

@@ -58,18 +58,19 @@ class Target:
                 stream.save(self.file)
             else:
                 self.file.touch()
-                stream.set_sinks(self._viewer(), rr.FileSink(self.file))
+                stream.set_sinks(self._viewer(stream), rr.FileSink(self.file))
         except (OSError, RuntimeError) as error:
             raise ConfigError(f"{self.file}: the recording cannot be written ({error})") from error
         stream.set_log_tick_enabled(False)
         stream.set_log_time_enabled(False)
         return stream
 
-    def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
+    def _viewer(self, stream: rr.RecordingStream) -> rr.GrpcSink | rr.GrpcServerSink:
         if self.viewer == "serve":
             return rr.GrpcServerSink("127.0.0.1")
         if self.viewer == "spawn":
-            rr.spawn(connect=False, executable_path=viewer_program())
+            # Without a stream it would look for a global one, find none, and start nothing.
+            rr.spawn(connect=False, executable_path=viewer_program(), recording=stream)
             return rr.GrpcSink(DEFAULT_URL)
         assert self.viewer is not None
         _require_listener(self.viewer)

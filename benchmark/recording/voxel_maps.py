@@ -17,7 +17,9 @@ import rerun as rr
 
 from semstab.backends.numba_hash import NumbaHash
 from semstab.labels import LabelSpace
-from semstab.metrics import CATEGORY_COLORS, categories, dominant, entropy, op, sbd, vss
+from semstab.metrics import CATEGORY_COLORS, categories, op, sbd
+from semstab.recording.belief_kernel import read_off
+from semstab.results import RECURRENT
 from semstab.voxels import VoxelTable
 
 # The largest SBD there is, 0.311 bits: a voxel's second frame sees a class that its first one did not see at all.
@@ -34,15 +36,19 @@ class Measure:
 
 
 MEASURES = {
-    "vss": Measure("VSS (0 to 1)", rr.components.Colormap.Viridis, (0.0, 1.0)),
+    "vss": Measure("VSS (0.5 and less to 1)", rr.components.Colormap.Viridis, (0.5, 1.0)),
     "sbd": Measure(f"SBD (0 to {SBD_MAX:.2f} bits; black: seen once)", rr.components.Colormap.Plasma, (0.0, SBD_MAX)),
-    "entropy": Measure("Entropy (0 to 1)", rr.components.Colormap.Plasma, (0.0, 1.0)),
+    "entropy": Measure("Entropy (0 to 0.5 and more)", rr.components.Colormap.Plasma, (0.0, 0.5)),
     "op": Measure("OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
 }
 TITLES = {
-    "class": "Dominant class", **{name: measure.title for name, measure in MEASURES.items()}, "category": "Category"
-}  # fmt: skip
+    "class": "dominant class",
+    **{name: measure.title for name, measure in MEASURES.items()},
+    "category": f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})",
+}
 """What the maps are coloured by, and what their views are called."""
+
+TABS = {"class": "Class", "vss": "VSS", "sbd": "SBD", "entropy": "Entropy", "op": "OP", "category": "Category"}
 
 MAX_VOXELS = 2_000_000
 """Drawn of one map; at its end a larger one is thinned."""
@@ -51,7 +57,7 @@ CHUNKS = 64
 BUDGET = 2_000_000
 """Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
 
-MOST_A_FRAME = 20_000
+MOST_A_FRAME = 5_000
 """Voxels, of the budget, for which a frame pays: short runs need not log everything anew with each frame."""
 
 
@@ -77,10 +83,10 @@ def grids(
     """
     index = ((table.index - origin) // factor).astype(np.int32)
     size = [table.voxel_size * factor] * 3
-    yield "class", rr.VoxelGridMap(index, size, colors=packed(classes.colors)[dominant(table)])
-    values: dict[str, npt.NDArray[Any]] = {
-        "vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "op": op(table)
-    }  # fmt: skip
+    label, vss, entropy = (np.empty(len(table), dtype) for dtype in (np.uint16, np.float32, np.float32))
+    read_off(table.evidence, label, vss, entropy)
+    yield "class", rr.VoxelGridMap(index, size, colors=packed(classes.colors)[label])
+    values: dict[str, npt.NDArray[Any]] = {"vss": vss, "sbd": sbd(table), "entropy": entropy, "op": op(table)}
     for name, measure in MEASURES.items():
         value = values[name].astype(np.float32)
         yield name, rr.VoxelGridMap(index, size, values=value, colormap=measure.colormap, value_range=measure.range)
@@ -95,7 +101,7 @@ def thinned(index: npt.NDArray[np.int64]) -> tuple[int, npt.NDArray[np.int64]]:
         x, y, z = (blocks - blocks.min(axis=0)).T
         _, first = np.unique((x << 42) ^ (y << 21) ^ z, return_index=True)
         blocks, rows = blocks[first], rows[first]
-    return factor, np.sort(rows)
+    return factor, np.sort(rows) if factor > 1 else rows
 
 
 class GrowingMap:
@@ -128,17 +134,8 @@ class GrowingMap:
                 break
             self._log(stream, fused, int(c))
 
-    def holds(self, voxels: int) -> bool:
-        """Whether a map of so many voxels is drawn as it is."""
-        return voxels <= int(self._edges[-1])
-
-    def finish(self, stream: rr.RecordingStream, fused: NumbaHash) -> None:
-        """Log what has changed since it was logged."""
-        for c in np.flatnonzero(self._changed):
-            self._log(stream, fused, int(c))
-
-    def replace(self, stream: rr.RecordingStream, table: VoxelTable) -> str:
-        """Log another table in place of what is there; says how it was thinned, where it is too large."""
+    def finish(self, stream: rr.RecordingStream, table: VoxelTable) -> str:
+        """Log the final map in place of what is there; says how it was thinned, where it is too large."""
         factor, rows = thinned(table.index - self._origin)
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
@@ -147,7 +144,6 @@ class GrowingMap:
                 for name in TITLES:
                     stream.log(self._path(name, c), rr.Clear(recursive=False))
             self._size[c] = len(part)
-        self._changed[:] = 0
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         return thin if factor > 1 else ""
 
@@ -169,5 +165,7 @@ def select(table: VoxelTable, rows: npt.NDArray[np.int64]) -> VoxelTable:
     """Those rows of a table, ascending."""
     columns = ("ix", "iy", "iz", "op", "evidence", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum",
                "frame_entropy_sum")  # fmt: skip
-    picked = {name: getattr(table, name)[rows] for name in columns}
+    whole = len(rows) > 0 and rows[-1] - rows[0] == len(rows) - 1
+    pick = slice(rows[0], rows[-1] + 1) if whole else rows  # a stretch is not copied
+    picked = {name: getattr(table, name)[pick] for name in columns}
     return VoxelTable(**picked, voxel_size=table.voxel_size, classes=table.classes)
