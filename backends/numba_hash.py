@@ -126,7 +126,7 @@ class NumbaHash:
             raise ConfigError(
                 f"threads = {threads}: use 1 to {nb.config.NUMBA_NUM_THREADS}, the threads that numba has"
             )
-        if not _is_compiled():
+        if not (NumbaHash._loaded or _is_compiled()):
             logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); the result is cached")
         self.voxel_size = voxel_size
         self.num_classes = num_classes
