@@ -6,7 +6,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,14 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: Any) -> None:
     """Write `value` atomically as JSON; undefined numbers (NaN, infinity) become null."""
     write_text(path, json.dumps(_defined(value), indent=2, allow_nan=False) + "\n")
+
+
+def keep_only(written: Collection[Path], folder: Path) -> None:
+    """Remove other files of the same kinds from a folder of results: an earlier start left them, they hold no longer."""
+    kinds = {path.suffix for path in written}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.suffix in kinds and path not in written:
+            path.unlink()
 
 
 def read_json(path: str | Path) -> Any:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from semstab.errors import DataError
-from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.files import atomic_path, keep_only, read_json, write_json, write_text
 
 
 def test_a_file_is_written_whole(tmp_path):
@@ -72,3 +72,13 @@ def test_json_that_cannot_be_read_is_one_line_with_the_path(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(DataError, match=r"^.*summary\.json: [^\n]*$"):
         read_json(path)
+
+
+def test_results_of_an_earlier_start_are_removed_and_nothing_else(tmp_path) -> None:
+    for name in ("now.csv", "before.csv", "mine.txt", "sub/before.csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    keep_only([tmp_path / "now.csv"], tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "now.csv", "sub"]
+    assert (tmp_path / "sub/before.csv").exists()
+    keep_only([], tmp_path / "nowhere")

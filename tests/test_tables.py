@@ -21,6 +21,7 @@ from records import record, study, voxels
 from wall_study import BACKBONES, STEPS, wall_study
 
 from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.files import write_text
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.statistics import Estimate
 from semstab.study.results import BACKENDS, SHARED, ImageSpace, RegionFlicker, StudyResult
@@ -389,6 +390,7 @@ def test_latex_compiles_without_overfull_lines(walls, tmp_path):
 
 
 def test_tables_are_written_in_four_formats(walls, tmp_path):
+    write_text(tmp_path / "tables/of_a_dropped_sweep.csv", "")
     paths = write_tables(walls, tmp_path)
     assert sorted(paths) == sorted((tmp_path / "tables").iterdir())
     assert {path.suffix for path in paths} == {".csv", ".md", ".tex", ".json"}

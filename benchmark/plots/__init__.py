@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semstab.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
+from semstab.files import keep_only
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
 from semstab.plots.histograms import Histogram, together
 from semstab.plots.judgement import statistics_figures
@@ -28,9 +29,14 @@ Histograms = Mapping[str, Mapping[str, Histogram]]
 
 
 def write_figures(result: StudyResult, folder: str | Path) -> list[Path]:
-    """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths."""
+    """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
+
+    Other figures there are removed.
+    """
     target = Path(folder) / "figures"
-    return [path for figure in figures(result, folder) for path in figure.save(target)]
+    written = [path for figure in figures(result, folder) for path in figure.save(target)]
+    keep_only(written, target)
+    return written
 
 
 def figures(result: StudyResult, folder: str | Path) -> list[Figure]:

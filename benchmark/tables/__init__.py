@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from semstab.files import write_json, write_text
+from semstab.files import keep_only, write_json, write_text
 from semstab.study.results import StudyResult
 from semstab.tables.comparison import comparison
 from semstab.tables.correctness import ceiling, correctness, rules
@@ -43,7 +43,7 @@ def tables(result: StudyResult) -> list[Table]:
 
 
 def write_tables(result: StudyResult, folder: str | Path) -> list[Path]:
-    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table; return the paths."""
+    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, in place of all others there; return the paths."""
     written = []
     for table in tables(result):
         stem = Path(folder) / "tables" / table.name
@@ -52,4 +52,5 @@ def write_tables(result: StudyResult, folder: str | Path) -> list[Path]:
             write_text(written[-1], write(table))
         written.append(stem.with_suffix(".json"))
         write_json(written[-1], to_json(table))
+    keep_only(written, Path(folder) / "tables")
     return written
