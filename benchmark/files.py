@@ -50,7 +50,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def keep_only(written: Collection[Path], folder: Path) -> None:
-    """Remove other files of the same kinds from a folder of results: an earlier start left them, they hold no longer."""
+    """Remove other files of the same kinds from a folder of results: an earlier start's, which hold no longer."""
     kinds = {path.suffix for path in written}
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.suffix in kinds and path not in written:
