@@ -1,6 +1,11 @@
+import os
+from pathlib import Path
+
 import pytest
 
 from semstab.process import settle
 
 pytest.register_assert_rewrite("semstab.testing")
 settle()  # threads that spin would take the time of the other workers' tests
+if not Path("/dev/nvidiactl").exists():
+    os.environ["TRITON_INTERPRET"] = "1"  # before any test imports Triton: its kernels then run without a GPU
