@@ -57,7 +57,7 @@ CHUNKS = 64
 BUDGET = 2_000_000
 """Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
 
-MOST_A_FRAME = 5_000
+MOST_A_FRAME = 10_000
 """Voxels, of the budget, for which a frame pays: short runs need not log everything anew with each frame."""
 
 
