@@ -23,6 +23,24 @@ if TYPE_CHECKING:
 
 DISAGREE, INTERRUPTED = 3, 130
 
+# --- Options that commands share --------------------------------------------------------------------------------------
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")]
+DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
+DatasetName = Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")]
+Scenes = Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")]
+Backbones = Annotated[
+    list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
+]
+VoxelSize = Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")]
+Frames = Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")]
+TrustGeometry = Annotated[
+    bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+
+# --- Commands ---------------------------------------------------------------------------------------------------------
+
 
 class Group(TyperGroup):
     """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
@@ -87,17 +105,15 @@ def root(
 @app.command("run")
 def run(
     backend: Annotated[list[str] | None, typer.Option("--backend", "-b", help="Fusion backend; repeatable.")] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
-    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
-    backbone: Annotated[
-        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
-    ] = None,
+    config: ConfigFile = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
     taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse in: a name or a YAML file.")] = None,
-    voxel_size: Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")] = None,
+    voxel_size: VoxelSize = None,
     pixel_stride: Annotated[int | None, typer.Option(help="Use every n-th pixel of each axis.")] = None,
-    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    frames: Frames = None,
     device: Annotated[str | None, typer.Option(help="CPU:0, or CUDA:0 for backends that take a device.")] = None,
     check: Annotated[str | None, typer.Option(help="Backend to check against, or 'none'.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.")] = None,
@@ -105,9 +121,7 @@ def run(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640."),
     ] = None,
-    trust_geometry: Annotated[
-        bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
-    ] = False,
+    trust_geometry: TrustGeometry = False,
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
     statistics: Annotated[
         bool | None,
@@ -125,7 +139,7 @@ def run(
         list[str] | None,
         typer.Option(metavar="NAME[,KEY=VALUE...]", help="Model that makes the labels, nothing on disk; repeatable."),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
     overrides = _overrides(
@@ -172,10 +186,8 @@ def study(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
     ] = None,
-    trust_geometry: Annotated[
-        bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    trust_geometry: TrustGeometry = False,
+    quiet: Quiet = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
     from semstab.study import load_study
@@ -197,10 +209,10 @@ def study(
 def predict(
     backbone: Annotated[str, typer.Option("--backbone", "-m", help="Model, as named by `semstab-bench list`.")],
     images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
-    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
-    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    frames: Frames = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder above labels/ and scores/; the scene's own by default.")
     ] = None,
@@ -222,7 +234,7 @@ def predict(
         typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.KEY=VALUE."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
     from semstab.predict import command
@@ -249,21 +261,19 @@ def predict(
 
 @app.command("check")
 def check_(
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
-    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
-    backbone: Annotated[
-        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
-    ] = None,
-    voxel_size: Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")] = None,
-    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    config: ConfigFile = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
+    voxel_size: VoxelSize = None,
+    frames: Frames = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000."),
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
     named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
@@ -276,14 +286,12 @@ def check_(
 @app.command()
 def convert(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder in which each scene becomes a folder.")],
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")] = None,
-    dataset: Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")] = None,
-    backbone: Annotated[
-        list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
-    ] = None,
-    frames: Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")] = None,
+    config: ConfigFile = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
+    frames: Frames = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.root=FOLDER."),
@@ -291,7 +299,7 @@ def convert(
     depth_error: Annotated[
         float, typer.Option(min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")
     ] = 0.0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write any dataset as posed folders. Goes on where it was."""
     _convert(

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch", reason="pip install 'semstab[torch]'")
 
 HAS_CUDA = torch.cuda.is_available()
-HAS_TRITON = importlib.util.find_spec("triton") is not None
-if HAS_TRITON and not HAS_CUDA:
-    os.environ["TRITON_INTERPRET"] = "1"  # before the kernels are imported: they run in Triton's interpreter then
+RUNS_TRITON = importlib.util.find_spec("triton") is not None and (
+    HAS_CUDA or os.environ.get("TRITON_INTERPRET") == "1"  # set in conftest.py, where there is no device
+)
 
 from semstab import backends  # noqa: E402
 from semstab.backends import torch_devices, torch_eager, torch_map, torch_storage, torch_views  # noqa: E402
@@ -510,7 +510,7 @@ def test_the_default_device_is_the_accelerator_where_there_is_one():
 
 # --- The kernels ------------------------------------------------------------------------------------------------------
 
-needs_triton = pytest.mark.skipif(not HAS_TRITON, reason="pip install triton: it runs the kernels without a GPU too")
+needs_triton = pytest.mark.skipif(not RUNS_TRITON, reason="pip install triton: it runs the kernels without a GPU too")
 DEVICE = "CUDA:0" if HAS_CUDA else "CPU:0"
 
 
