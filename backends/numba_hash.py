@@ -20,11 +20,10 @@ import numpy.typing as npt
 
 from semstab.backends.aggregator import Aggregator, Observed
 from semstab.backends.association import check_frame, check_settings
-from semstab.backends.kernels import PARTITIONS, _row_keys, mix, parallel, partition_of, serial
+from semstab.backends.kernels import PARTITIONS, mix, parallel, serial
 from semstab.backends.updates import js_term, plogp
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
-from semstab.labels import IGNORE_8BIT
 from semstab.results import RECURRENT, FrameReport
 from semstab.voxels import Events, VoxelTable, index_columns
 
@@ -70,20 +69,22 @@ class Changes:
     """What one frame did to each of the n voxels that it saw.
 
     row            (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation
+    key            (n,) int64 its index, packed, relative to the map's origin; overwritten by the next frame
     drift          (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before
     before, after  (n,) uint16 its dominant class; where it was not seen before, both are the one after
     """
 
     row: Int64
+    key: Int64
     drift: npt.NDArray[np.float32]
     before: npt.NDArray[np.uint16]
     after: npt.NDArray[np.uint16]
 
     @classmethod
-    def room(cls, row: Int64) -> Changes:
-        """To be filled, for the voxels of these rows."""
+    def room(cls, row: Int64, key: Int64) -> Changes:
+        """To be filled, for the voxels of these rows and keys."""
         n = len(row)
-        return cls(row, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
+        return cls(row, key, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
 
 
 class NumbaReport(FrameReport):
@@ -144,7 +145,7 @@ class NumbaHash:
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
         self._sums = np.zeros(2)  # of VSS and of entropy in bits, over the map
         self._recurrent = 0
-        self.changes = Changes.room(np.zeros(0, dtype=np.int64))
+        self.changes = Changes.room(*np.zeros((2, 0), dtype=np.int64))
         """What the last frame did to each voxel."""
         _load_compiled()
 
@@ -198,7 +199,7 @@ class NumbaHash:
         self._make_nodes(np.diff(seen.start[seen.bounds]))
         sums = np.zeros((PARTITIONS, 3))
         recurrent = np.zeros(PARTITIONS, dtype=np.int64)
-        self.changes = changes = Changes.room(row)
+        self.changes = changes = Changes.room(row, seen.key)
         _update(
             seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, self.num_classes,
             row, slot, base, self._slots, self._records, self._nodes, self._ranges, sums, recurrent,
@@ -222,30 +223,34 @@ class NumbaHash:
         """The voxels of those numbers (n,), distinct ones, as a table; see `Changes.row`."""
         order = rows[np.argsort(self._records["key"][rows], kind="stable")]
         records = self._records[order]
-        evidence = np.zeros((len(order), self.num_classes))
-        _unchain(self._records, self._nodes, order, evidence)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
         values: dict[str, Any] = {name: records[name] for name in columns}
-        index = self.index_of(order)
-        return VoxelTable(**index_columns(index), **values, evidence=evidence, voxel_size=self.voxel_size)
+        return VoxelTable(
+            **index_columns(self.index_of(order)),
+            **values,
+            evidence=self.evidence_of(order),
+            voxel_size=self.voxel_size,
+        )
+
+    def column(self, name: str, rows: Int64 | slice = np.s_[:]) -> npt.NDArray[Any]:
+        """That column of the table (n,), such as op or drift_sum, of the voxels of those numbers in their order."""
+        values: npt.NDArray[Any] = self._records[name][: self._rows][rows].copy()  # the array may move as it grows
+        return values
+
+    def evidence_of(self, rows: Int64) -> npt.NDArray[np.float64]:
+        """Evidence (n, K) of the voxels of those numbers."""
+        evidence = np.zeros((len(rows), self.num_classes))
+        _unchain(self._records, self._nodes, rows, evidence)
+        return evidence
+
+    @property
+    def origin(self) -> Int64:
+        """(3,) voxel index that packed keys count from: that of the first camera; of an empty map 0."""
+        return np.zeros(3, dtype=np.int64) if self._pixels.origin is None else self._pixels.origin
 
     def index_of(self, rows: Int64) -> Int64:
         """Voxel indices (n, 3) of the voxels of those numbers."""
         return self._pixels.index_of(self._records["key"][rows]) if len(rows) else np.zeros((0, 3), dtype=np.int64)
-
-    def rows_at(self, frame: Frame, stride: int = 1) -> npt.NDArray[np.int32]:
-        """The number of the voxel behind every stride-th pixel of each axis, (H', W'); -1 where there is none.
-
-        There is none where a pixel does not count, or where the map has not seen the place.
-        """
-        H, W = frame.shape
-        camera, pick = frame.intrinsics, np.s_[::stride, ::stride]
-        rays = (np.arange(W)[::stride] - camera.cx) / camera.fx, (np.arange(H)[::stride] - camera.cy) / camera.fy
-        depth = np.where(frame.valid[pick], frame.depth[pick], np.float32(0))
-        rows = np.full(depth.shape, -1, dtype=np.int32)
-        if self._pixels.origin is not None:
-            _find_rows(depth, *rays, np.array(frame.T_wc), self.voxel_size, self._pixels.origin, self._slots, rows)
-        return rows
 
     def events(self) -> Events | None:
         """Every observation in order of integration within a voxel, where `history` is kept; else None."""
@@ -486,28 +491,6 @@ def _update(
             reached += 1 if op + 1 == RECURRENT else 0
         sums[p, 0], sums[p, 1], sums[p, 2] = vss, entropy, drift
         recurrent[p] = reached
-
-
-@serial
-def _find_rows(depth, ray_x, ray_y, T, size, origin, slots, rows):
-    """The row of the voxel behind each pixel; `rows` is left as it is where there is none. Depth is 0 where invalid."""
-    H, W = depth.shape
-    mask = np.uint64(slots.shape[1] - 1)
-    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
-    labels, keys = np.zeros(W, dtype=np.uint8), np.empty(W, dtype=np.int64)
-    for v in range(H):
-        _row_keys(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, IGNORE_8BIT, keys)
-        for u in range(W):
-            if keys[u] < 0:
-                continue
-            if u > 0 and keys[u] == keys[u - 1]:
-                rows[v, u] = rows[v, u - 1]
-                continue
-            p = partition_of(keys[u])
-            at = np.int64(mix(keys[u]) & mask)
-            while slots[p, at].row != -1 and slots[p, at].key != keys[u]:
-                at = (at + 1) & np.int64(mask)
-            rows[v, u] = slots[p, at].row
 
 
 @parallel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -372,6 +373,7 @@ def _run(config: Config, out: Path, rerun: str | None, quiet: bool) -> RunResult
         recording = Recording(Target.parse(rerun, out / "recording.rrd"), run=out)
         observers.append(recording)
         closing.append(recording)
+    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
     try:
         result = pipeline.run(config, out=out, observers=observers, command=sys.argv)
         if not quiet:

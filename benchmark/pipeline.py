@@ -49,8 +49,11 @@ class Observer:
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """A frame went into a unit's map; `frame` holds labels in the run's label space."""
 
+    def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
+        """All frames went into a unit's map, which is measured and written next."""
+
     def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
-        """A unit's map is complete."""
+        """A unit's map is measured and written."""
 
     def group_kept(self, task: Task, result: GroupResult) -> None:
         """A backbone on a scene was found finished in the run folder."""
@@ -151,6 +154,10 @@ def _fuse(
         classes = task.mapping.target.classes
         tables = {unit: dataclasses.replace(backend.table(), classes=classes) for unit, backend in maps.items()}
         require_voxels(task, config, tables)
+    with watch("observe"):
+        for unit in maps:
+            for observer in observers:
+                observer.unit_fused(unit, tables[unit])
     with watch("statistics"):
         analyses = evaluation.analyses(task, maps, tables)
     with watch("measure"):

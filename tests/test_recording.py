@@ -23,7 +23,7 @@ from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.pipeline import Observer
 from semstab.plan import Plan, Task, load_config
-from semstab.recording import MEASURES, SERIES, Recording, voxel_maps
+from semstab.recording import MEASURES, SERIES, Recording, observer, voxel_maps
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
 from semstab.recording.voxel_maps import SBD_MAX, TITLES
@@ -62,7 +62,10 @@ def read(path: Path) -> dict[str, list[dict[str, Any]]]:
 def read_blueprints(path: Path) -> list[list[dict[str, Any]]]:
     """The rows of each blueprint, in no particular order."""
     reader = rr.chunk.RrdReader(path)
-    return [[row for chunk in reader.stream(store=store) for row in rows_of(chunk)] for store in reader.blueprints()]
+    return [
+        [row | {"rerun.entity": chunk.entity_path} for chunk in reader.stream(store=store) for row in rows_of(chunk)]
+        for store in reader.blueprints()
+    ]
 
 
 def rows_of(chunk: Any) -> list[dict[str, Any]]:
@@ -79,21 +82,30 @@ def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]
 
 
 def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
-    """What the chunks of a map show at last, voxels sorted, by short component names."""
-    last = [
-        max(found, key=lambda row: (row["frame"], row["rerun.controls.RowId"]))
-        for at, found in rows.items()
-        if at.startswith(f"{path}/")
-    ]
-    shown_last = [row for row in last if "VoxelGridMap:voxel_indices" in row]  # others were cleared
-    chunks = [{name.removeprefix("VoxelGridMap:"): value for name, value in row.items()} for row in shown_last]
-    index = [tuple(cell) for chunk in chunks for cell in chunk["voxel_indices"]]
+    """What a map shows at last, voxels sorted: indices, and each of TITLES by the name of its view."""
+    chunks = []
+    for at in sorted(at for at in rows if at.startswith(f"{path}/")):
+        shown: dict[str, Any] = {}
+        for row in sorted(rows[at], key=lambda row: (row["frame"], row["rerun.controls.RowId"])):
+            if "Clear:is_recursive" in row:
+                shown = {}
+            shown |= {name: value for name, value in row.items() if value is not None}  # each component is the latest
+        if "VoxelGridMap:voxel_indices" in shown:
+            chunks.append(shown)
+    index = [tuple(cell) for shown in chunks for cell in shown["VoxelGridMap:voxel_indices"]]
     order = sorted(range(len(index)), key=index.__getitem__)
-    shown = {name: chunks[0][name] for name in ("voxel_size", "value_range") if name in chunks[0]}
-    for name in {"values", "colors"} & set(chunks[0]):
-        whole = [value for chunk in chunks for value in chunk[name]]
-        shown[name] = [whole[i] for i in order]
-    return shown | {"voxel_indices": [index[i] for i in order], "frame": max(chunk["frame"] for chunk in chunks)}
+    assert len(set(index)) == len(index)
+    components = {name: f"{name}:values" for name in MEASURES}
+    components |= {"class": "VoxelGridMap:colors", "category": "category:colors"}
+    found: dict[str, Any] = {"voxel_indices": [index[i] for i in order]}
+    for name, component in components.items():
+        whole = [value for shown in chunks for value in shown[component]]
+        assert len(whole) == len(index)
+        found[name] = [whole[i] for i in order]
+    return found | {
+        "voxel_size": chunks[0]["VoxelGridMap:voxel_size"],
+        "frame": max(shown["frame"] for shown in chunks),
+    }
 
 
 def notes(rows: dict[str, list[dict[str, Any]]], scene: str = "wall") -> list[str]:
@@ -145,16 +157,14 @@ def test_lines_are_named_and_have_distinct_colours(run) -> None:
 def test_the_final_voxels_are_those_of_the_run(run, backbone) -> None:
     rows = read(run / "recording.rrd")
     table = VoxelTable.load(run / "voxels" / f"wall__{backbone}__numpy.parquet")
-    values = {name: getattr(metrics, name)(table) for name in MEASURES}
-    for name, measure in MEASURES.items():
-        voxels = grid(rows, f"/wall/map/{backbone}/numpy/{name}")
-        assert voxels["frame"] == 2
-        np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
-        np.testing.assert_allclose(voxels["values"], values[name], rtol=1e-6)  # SBD of a voxel seen once is NaN
-        np.testing.assert_allclose(voxels["value_range"], [measure.range], rtol=1e-6)
-        np.testing.assert_allclose(voxels["voxel_size"], [[0.25] * 3])
+    voxels = grid(rows, f"/wall/map/{backbone}/numpy")
+    assert voxels["frame"] == 2
+    np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
+    np.testing.assert_allclose(voxels["voxel_size"], [[0.25] * 3])
+    for name in MEASURES:  # SBD of a voxel seen once is NaN
+        np.testing.assert_allclose(voxels[name], getattr(metrics, name)(table), rtol=1e-6)
     expected = voxel_maps.packed(metrics.CATEGORY_COLORS)[metrics.categories(table)]
-    np.testing.assert_array_equal(grid(rows, f"/wall/map/{backbone}/numpy/category")["colors"], expected)
+    np.testing.assert_array_equal(voxels["category"], expected)
 
 
 def test_voxels_have_the_colours_of_the_legend(run) -> None:
@@ -163,7 +173,7 @@ def test_voxels_have_the_colours_of_the_legend(run) -> None:
     assert names["Points2D:labels"] == ["wall", "door", "window"]
     table = VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
     expected = np.array(legend["Points2D:colors"])[metrics.dominant(table)]
-    np.testing.assert_array_equal(grid(rows, "/wall/map/a/numpy/class")["colors"], expected)
+    np.testing.assert_array_equal(grid(rows, "/wall/map/a/numpy")["class"], expected)
 
 
 def test_the_largest_sbd_has_the_last_colour() -> None:
@@ -188,6 +198,53 @@ def test_every_map_has_an_eye_that_looks_down_on_it(run) -> None:
     table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
     for eye in eyes:
         assert eye["EyeControls3D:position"][0][1] < table.centers[:, 1].min()  # from above: up is -y
+
+
+def test_each_view_of_a_map_shows_its_measure(run) -> None:
+    """Of every chunk that there is, and in its own colours; of itself a grid shows the dominant class."""
+    chunks = [at for at in read(run / "recording.rrd") if at.startswith("/wall/map/a/numpy/")]
+    assert chunks
+    for rows in read_blueprints(run / "recording.rrd"):
+        views = {
+            row["ViewBlueprint:display_name"][0]: row["rerun.entity"]
+            for row in rows
+            if "ViewBlueprint:display_name" in row
+        }
+        for name, title in TITLES.items():
+            for chunk in chunks:
+                at = f"{views[f'a: {title}']}/ViewContents/overrides{chunk}/visualizers/"
+                instructions = [row for row in rows if row["rerun.entity"].startswith(at)]
+                sources = {
+                    mapping["target"]: mapping["source_component"]
+                    for row in instructions
+                    for mapping in row.get("VisualizerInstruction:component_map") or []
+                }
+                if name == "class":
+                    assert not instructions
+                elif name == "category":
+                    assert sources == {"VoxelGridMap:colors": "category:colors"}
+                else:
+                    assert sources == {"VoxelGridMap:values": f"{name}:values", "VoxelGridMap:colors": None}
+                    defaults = f"{views[f'a: {title}']}/defaults"
+                    (look,) = (row for row in rows if row["rerun.entity"] == defaults)
+                    np.testing.assert_allclose(look["VoxelGridMap:value_range"], [MEASURES[name].range], rtol=1e-6)
+
+
+def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(observer, "FIRST_CHUNKS", 1)
+    monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 1000)
+    path = tmp_path / "outgrown.rrd"
+    _, table = record(path, [frame(i, i % 3, (0.25 * i + 0.01, 0.01, 2.01)) for i in range(6)])
+    used = voxel_maps.chunks_of(len(table))
+    assert used > 1
+    known = [
+        len({row["rerun.entity"].split("/visualizers")[0] for row in rows if "/overrides/" in row["rerun.entity"]
+             and "/map/" in row["rerun.entity"]})
+        for rows in read_blueprints(path)
+    ]  # fmt: skip
+    assert min(known) == len(TITLES) - 1
+    assert max(known) == (len(TITLES) - 1) * voxel_maps.CHUNKS
+    assert len(grid(read(path), r"/floor\ 1/map/net\/x/numpy")["voxel_indices"]) == len(table)
 
 
 @pytest.mark.parametrize("up", [None, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 2.0])])
@@ -235,9 +292,9 @@ def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> N
             entities = [at for at in first if at.startswith(f"/wall/series/{column}/")]
             assert entities
             assert all(series(again, at) == series(first, at) for at in entities)
-    for name in TITLES:
-        was, now = (grid(rows, f"/wall/map/a/numpy/{name}") for rows in (first, again))
-        assert [repr(was[key]) for key in was] == [repr(now[key]) for key in was]
+    was, now = (grid(rows, "/wall/map/a/numpy") for rows in (first, again))
+    assert {*TITLES} < {*was}
+    assert [repr(was[key]) for key in was] == [repr(now[key]) for key in was]
 
 
 def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
@@ -267,7 +324,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     for backbone in "ab":
         assert len(series(rows, f"/wall/series/updated_voxels/{backbone}/numpy")) == 3
         table = VoxelTable.load(path.parent / "voxels" / f"wall__{backbone}__numpy.parquet")
-        np.testing.assert_array_equal(grid(rows, f"/wall/map/{backbone}/numpy/op")["values"], table.op)
+        np.testing.assert_array_equal(grid(rows, f"/wall/map/{backbone}/numpy")["op"], table.op)
     assert "/wall/camera/b/labels" in rows
     assert not [row for row in rows["/wall/camera/a/labels"] if "SegmentationImage:buffer" in row]
 
@@ -335,6 +392,7 @@ def record(path: Path, frames: list[Frame], *, finish: bool = True) -> tuple[Rec
         watching.frame_fused(UNIT, each, FrameRow(backend.integrate(each), each.timestamp, math.nan))
     table = backend.table()
     if finish:
+        watching.unit_fused(UNIT, table)
         watching.unit_finished(UNIT, table, summary_of(table))
         watching.run_finished(RunResult((GroupResult((summary_of(table),), ()),)))
     return watching, table
@@ -367,7 +425,7 @@ def test_utm_coordinates_are_recorded_relative_to_an_origin(tmp_path) -> None:
     path = tmp_path / "utm.rrd"
     _, table = record(path, [frame(i, i, (455_123.01, 5_412_345.01, 302.01)) for i in range(2)])
     rows = read(path)
-    voxels = grid(rows, r"/floor\ 1/map/net\/x/numpy/vss")
+    voxels = grid(rows, r"/floor\ 1/map/net\/x/numpy")
     origin = np.array([455_000, 5_412_000, 0]) * 4
     np.testing.assert_array_equal(np.array(voxels["voxel_indices"]) + origin, table.index)
     (text, _) = notes(rows, r"floor\ 1")
@@ -380,12 +438,12 @@ def test_a_map_that_is_too_large_is_thinned_and_says_so(tmp_path, monkeypatch) -
     _, table = record(path, [frame(i, i % 3, (0.25 * i + 0.01, 0.01, 2.01)) for i in range(6)])
     rows = read(path)
     assert len(table) == 13 * 6
-    drawn = grid(rows, r"/floor\ 1/map/net\/x/numpy/op")
+    drawn = grid(rows, r"/floor\ 1/map/net\/x/numpy")
     np.testing.assert_allclose(drawn["voxel_size"], [[0.5] * 3])
     blocks = table.index // 2
     np.testing.assert_array_equal(drawn["voxel_indices"], np.unique(blocks, axis=0))
     of_block = {tuple(block): set(table.op[(blocks == block).all(axis=1)].tolist()) for block in blocks}
-    assert all(v in of_block[tuple(q)] for q, v in zip(drawn["voxel_indices"], drawn["values"], strict=True))
+    assert all(v in of_block[tuple(q)] for q, v in zip(drawn["voxel_indices"], drawn["op"], strict=True))
     assert "one voxel of each block of 2x2x2" in notes(rows, r"floor\ 1")[0]
 
 

@@ -61,11 +61,18 @@ def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) 
     Drifting comes first because nearly all drifting voxels are ambiguous as well, but not the other way round: with
     more observations a voxel that stays ambiguous goes from drifting to uncertain.
     """
+    return categorise(table.op, sbd(table), entropy_bits(normalise(table.evidence)), thresholds)
+
+
+def categorise(
+    op: npt.ArrayLike, sbd: npt.ArrayLike, bits: npt.ArrayLike, thresholds: CategoryThresholds | None = None
+) -> npt.NDArray[np.uint8]:
+    """Category (n,) by OP, SBD in bits and entropy in bits, (n,) each; see `categories`."""
     limits = thresholds or CategoryThresholds()
-    category = np.full(len(table), STABLE, dtype=np.uint8)
-    category[entropy_bits(normalise(table.evidence)) >= limits.uncertain_bits] = UNCERTAIN
-    category[sbd(table) >= limits.drifting_bits] = DRIFTING
-    category[table.op < limits.min_op] = LOW_PERSISTENCE
+    category = np.full(np.shape(op), STABLE, dtype=np.uint8)
+    category[np.asarray(bits) >= limits.uncertain_bits] = UNCERTAIN
+    category[np.asarray(sbd) >= limits.drifting_bits] = DRIFTING
+    category[np.asarray(op) < limits.min_op] = LOW_PERSISTENCE
     return category
 
 

@@ -21,9 +21,14 @@ def vss(table: VoxelTable) -> Float64:
 
 def sbd(table: VoxelTable) -> Float64:
     """Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1]; NaN where OP < 2."""
-    drift = np.full(len(table), np.nan)
-    again = table.op >= 2
-    drift[again] = table.drift_sum[again] / (table.op[again] - 1)
+    return mean_drift(table.drift_sum, table.op)
+
+
+def mean_drift(drift_sum: Float64, op: npt.NDArray[np.int32]) -> Float64:
+    """SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
+    drift = np.full(len(op), np.nan)
+    again = op >= 2
+    drift[again] = drift_sum[again] / (op[again] - 1)
     return drift
 
 

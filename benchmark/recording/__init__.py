@@ -2,10 +2,12 @@
 
 Entities, all below the scene's name:
 
-camera, camera/color                    Transform3D and Pinhole, EncodedImage (JPEG)
-camera/BACKBONE/labels, .../drift       SegmentationImage: classes; drift that the frame caused at each pixel's voxel
-depth, trajectory                       EncodedDepthImage, LineStrips3D
-map/BACKBONE/BACKEND/MEASURE/CHUNK      VoxelGridMap: class, vss, sbd, entropy, op, category
+camera, camera/color                    Transform3D and Pinhole; EncodedImage (JPEG)
+camera/BACKBONE/labels, .../drift       SegmentationImage: classes; drift that the frame caused at each pixel's voxel.
+                                        Smaller ones have a Transform3D, which spreads them over the camera's image
+depth, trajectory                       DepthImage; LineStrips3D
+map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; components category:colors, vss:values,
+                                        sbd:values, entropy:values and op:values, which the views map to its own
 series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
 flips/BACKBONE/voxel_N                  StateChange: the dominant class of the voxels that drifted most
 flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them; Points3D: where those voxels are

@@ -9,10 +9,10 @@ import numba as nb
 
 
 @nb.njit(cache=True, nogil=True)
-def read_off(evidence: Any, label: Any, vss: Any, entropy: Any) -> None:
-    """Dominant class, VSS and normalised entropy of evidence (n, K), as `semstab.metrics` defines them, in one pass.
+def read_off(evidence: Any, label: Any, vss: Any, bits: Any) -> None:
+    """Dominant class, VSS and entropy in bits of evidence (n, K), as `semstab.metrics` defines them, in one pass.
 
-    Fills label (n,) uint16, and vss and entropy (n,) float32.
+    Fills label (n,) uint16, and vss and bits (n,) float64.
     """
     n, K = evidence.shape
     for i in range(n):
@@ -22,11 +22,11 @@ def read_off(evidence: Any, label: Any, vss: Any, entropy: Any) -> None:
             total += evidence[i, k]
             if evidence[i, k] > evidence[i, most]:
                 most = k
-        bits = 0.0
-        for k in range(K):
-            if 0.0 < evidence[i, k] < total:
-                p = evidence[i, k] / total
-                bits -= p * math.log2(p)
         label[i] = most
         vss[i] = evidence[i, most] / total
-        entropy[i] = bits / math.log2(K)
+        bits[i] = 0.0
+        if evidence[i, most] < total:
+            for k in range(K):
+                if evidence[i, k] > 0.0:
+                    p = evidence[i, k] / total
+                    bits[i] -= p * math.log2(p)

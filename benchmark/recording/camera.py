@@ -1,14 +1,14 @@
 """What the camera sees: pose, colour, depth, labels, and the drift that the frame caused behind each pixel.
 
-All pictures of a frame have one size, at most IMAGE_SIDE pixels a side, so that they can be laid over each other.
+The camera has the frame's size. Pictures are smaller where that saves much; transforms lay them over each other.
 """
 
 from __future__ import annotations
 
+import functools
+import io
 import itertools
 import math
-from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,18 @@ import numpy.typing as npt
 import rerun as rr
 
 from semstab.datasets import Scene
-from semstab.frames import Frame
+from semstab.frames import Frame, Intrinsics
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.recording.entities import Clock, path
+from semstab.recording.background import Background
+from semstab.recording.entities import path
 from semstab.recording.voxel_maps import SBD_MAX
 
 IMAGE_SIDE = 640
+"""Pixels a side, of pictures that are made here."""
+
 JPEG_QUALITY = 80
-LOOK_BEHIND = 2
-"""Frames whose images may be waiting for the worker."""
+COLOR_BYTES = 400_000_000
+"""Of a scene's colour, where its frames' files are JPEG: those within their share go into the recording as they are."""
 
 NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
 LEVELS = 24
@@ -39,6 +42,27 @@ GLOW = np.array([(150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255
 def stride_of(shape: tuple[int, int]) -> int:
     """Every how many pixels a picture of a frame of that shape (H, W) is sampled: a power of 2, as JPEG decodes to."""
     return int(2 ** max(0, math.ceil(math.log2(max(shape) / IMAGE_SIDE))))
+
+
+class Overlay:
+    """Lays pictures of a camera over each other: says what part of the camera's image a picture covers."""
+
+    def __init__(self) -> None:
+        self._logged: dict[str, tuple[float, ...]] = {}
+
+    def log(
+        self, stream: rr.RecordingStream, entity: str, shape: tuple[int, ...], picture: tuple[int, ...], stride: int = 0
+    ) -> None:
+        """Lay the entity's picture over a camera image, both (H, W), where that differs from what was logged last.
+
+        stride  of the sampling, where the picture is every stride-th pixel: these are then in the middle of the squares
+                that they are drawn as
+        """
+        scale = (stride, stride) if stride else (shape[1] / picture[1], shape[0] / picture[0])
+        shift = (1 - stride) / 2 if stride else 0.0
+        if self._logged.get(entity, (1, 1, 0)) != (*scale, shift):
+            self._logged[entity] = (*scale, shift)
+            stream.log(entity, rr.Transform3D(translation=[shift, shift, 0], scale=[*scale, 1]))
 
 
 def drift_levels(drift: npt.NDArray[np.float32], seen: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
@@ -75,98 +99,103 @@ def label_context(classes: LabelSpace) -> rr.AnnotationContext:
 class Camera:
     """The camera of a scene: its pictures are logged once a frame, whichever backbones and backends fuse it."""
 
-    def __init__(self, scene: Scene, translation: npt.NDArray[np.floating[Any]]) -> None:
+    def __init__(self, scene: Scene, translation: npt.NDArray[np.floating[Any]], frames: int) -> None:
         self.scene = scene
         self.poses: list[npt.NDArray[np.float64]] = []
         """(4, 4) each, relative to the map's origin."""
         self.unread: str | None = None
         """Why a colour image is missing, where one is."""
         self._translation = translation
+        self._share = COLOR_BYTES // max(frames, 1)
         self._logged: set[int] = set()
+        self._overlay = Overlay()
+        self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
         self._depth_unit: float | None = None
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="semstab-pictures")
-        self._pending: deque[Future[None]] = deque()
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, clock: Clock) -> None:
-        """Log the frame's pose, camera, colour and depth at the stream's time, where that has not happened yet."""
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
+        """Log the frame's pose, camera, colour and depth, where that has not happened yet."""
         if frame.index in self._logged:
             return
         self._logged.add(frame.index)
         pose = frame.T_wc.copy()
         pose[:3, 3] -= self._translation
         self.poses.append(pose)
-        stride = stride_of(frame.shape)
-        self._log_camera(stream, frame, pose, stride)
-        while len(self._pending) >= LOOK_BEHIND:
-            self._pending.popleft().result()
-        self._pending.append(self._worker.submit(self._log_images, stream, frame, stride, clock))
+        self._log_camera(stream, frame, pose)
+        background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
 
-    def close(self) -> None:
-        """Wait for the images that are still being made."""
-        self._worker.shutdown()
-        for pending in self._pending:
-            pending.result()
+    def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
+        stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride_of(frame.shape)))
+        if (color := self._color(frame)) is not None:
+            jpeg, size = color
+            self._overlay.log(stream, self._path("color"), frame.shape, size)
+            stream.log(self._path("color"), rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=-20))
 
-    def _log_images(self, stream: rr.RecordingStream, frame: Frame, stride: int, clock: Clock) -> None:
-        """In the worker: what it decodes and encodes is nothing that the next frame has to wait for."""
-        clock.set(stream, frame.index, frame.timestamp)  # a stream has a time for each thread
-        stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride))
-        H, W = (-(-side // stride) for side in frame.shape)
-        if (color := self._color(frame, (W, H))) is not None:
-            stream.log(self._path("color"), rr.EncodedImage(contents=color, media_type="image/jpeg", draw_order=-20))
-
-    def _log_camera(self, stream: rr.RecordingStream, frame: Frame, pose: npt.NDArray[Any], stride: int) -> None:
-        K = frame.intrinsics.every(stride).matrix
-        K[:2, 2] += 0.5  # the viewer's pixel centres are at halves
-        H, W = (-(-side // stride) for side in frame.shape)
-        depth = frame.depth[::16, ::16]
-        far = np.median(depth[np.isfinite(depth) & (depth > 0)]) if (depth > 0).any() else 1.0
-        pinhole = rr.Pinhole(
-            image_from_camera=K, width=W, height=H, camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.2 * float(far),
-        )  # fmt: skip
-        stream.log(self._path(), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), pinhole)
+    def _log_camera(self, stream: rr.RecordingStream, frame: Frame, pose: npt.NDArray[Any]) -> None:
+        if self._intrinsics != (frame.intrinsics, frame.shape):
+            self._intrinsics = frame.intrinsics, frame.shape
+            K = frame.intrinsics.matrix
+            K[:2, 2] += 0.5  # the viewer's pixel centres are at halves
+            H, W = frame.shape
+            depth = frame.depth[::16, ::16]
+            far = np.median(depth[np.isfinite(depth) & (depth > 0)]) if (depth > 0).any() else 1.0
+            pinhole = rr.Pinhole(
+                image_from_camera=K, width=W, height=H, camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=0.2 * float(far),
+            )  # fmt: skip
+            stream.log(self._path(), pinhole)
+        stream.log(self._path(), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         n = len(self.poses)
         if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
             track = np.array([p[:3, 3] for p in self.poses])
             stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
 
-    def _depth(self, frame: Frame, stride: int) -> rr.EncodedDepthImage:
+    def _depth(self, frame: Frame, stride: int) -> rr.DepthImage:
         """16-bit depth in a unit that the scene's first frame decides: a decimal part of a metre."""
-        import cv2
-
         depth = np.where(np.isfinite(frame.depth[::stride, ::stride]), frame.depth[::stride, ::stride], 0)
         if self._depth_unit is None:
             self._depth_unit = 10.0 ** math.floor(math.log10(65535 / (4 * max(float(depth.max()), 1e-3))))
         units = np.clip(np.round(depth * self._depth_unit), 0, 65535).astype(np.uint16)
-        _, png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        return rr.EncodedDepthImage(png.tobytes(), media_type="image/png", meter=self._depth_unit, colormap="turbo")
+        return rr.DepthImage(units, meter=self._depth_unit, colormap="turbo")
 
-    def _color(self, frame: Frame, size: tuple[int, int]) -> bytes | None:
-        """Colour as JPEG of that size (width, height); None where the frame has none, or it cannot be read."""
+    def _color(self, frame: Frame) -> tuple[bytes, tuple[int, int]] | None:
+        """Colour as JPEG, and its size (H, W); None where the frame has none, or it cannot be read."""
         import cv2
 
-        image = self._small_color(frame, size[0])
-        if image is None:
-            return None
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if image.shape[1::-1] != size else image
-        _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        return bytes(jpeg)
-
-    def _small_color(self, frame: Frame, width: int) -> npt.NDArray[np.uint8] | None:
-        """Colour (h, w, 3), BGR, of `width` pixels or more; from a file decoded no larger than is needed."""
+        H, W = (-(-side // stride_of(frame.shape)) for side in frame.shape)
         if frame.color is not None:
-            return np.ascontiguousarray(frame.color[..., ::-1])
-        file = Path(frame.files.get("color", ""))
-        if not file.is_file():
-            return None
-        image = _decoded(file.read_bytes(), frame.shape[1] // width)
-        if image is None:
-            self.unread = self.unread or f"{file}: the image cannot be decoded"
-        return image
+            image = np.ascontiguousarray(frame.color[..., ::-1])
+        else:
+            file = Path(frame.files.get("color", ""))
+            if not file.is_file():
+                return None
+            data = file.read_bytes()
+            if len(data) <= self._share and (size := _jpeg_size(data)) is not None:
+                return data, size
+            decoded = _decoded(data, frame.shape[1] // W)
+            if decoded is None:
+                self.unread = self.unread or f"{file}: the image cannot be decoded"
+                return None
+            image = decoded
+        small = cv2.resize(image, (W, H), interpolation=cv2.INTER_AREA) if image.shape[:2] != (H, W) else image
+        _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        return bytes(jpeg), (H, W)
 
     def _path(self, *parts: str) -> str:
         return path(self.scene.name, "camera", *parts)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """(H, W) of a JPEG file that is whole, and of a kind that the viewer shows; else None."""
+    from PIL import Image, UnidentifiedImageError
+
+    if not data.rstrip(b"\0").endswith(b"\xff\xd9"):
+        return None
+    try:
+        with Image.open(io.BytesIO(data)) as image:  # reads no more than the header
+            known = image.format == "JPEG" and image.mode in ("RGB", "L")
+            return (image.height, image.width) if known else None
+    except (UnidentifiedImageError, OSError):
+        return None
 
 
 def _decoded(data: bytes, reduction: int) -> npt.NDArray[np.uint8] | None:

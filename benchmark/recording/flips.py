@@ -75,11 +75,11 @@ class FlipLog:
         file = PurePath(name)
         self._frames[frame.index] = frame.timestamp, file.name if file.suffix else ""
         if self._count > MAX_MOVES:
-            self._drop(tracker.total_drift)
+            self._drop(tracker.map.column("drift_sum"))
 
     def suspects(self, tracker: Tracker) -> Iterator[Suspect]:
         """The voxels that drifted most, and what moved them."""
-        total = tracker.total_drift
+        total = tracker.map.column("drift_sum")
         most = np.partition(total, -SHOWN)[-SHOWN] if len(total) > SHOWN else 0.0
         rows = np.flatnonzero((total >= most) & (total > 0))
         rows = rows[np.argsort(-total[rows], kind="stable")][:SHOWN]
@@ -144,7 +144,7 @@ class FlipLog:
                 lines.append(f"    - {where}: {what}, {move['bits']:.4f} bits")
         return "\n".join(lines) + "\n"
 
-    def _drop(self, total_drift: npt.NDArray[np.float32]) -> None:
+    def _drop(self, total_drift: npt.NDArray[np.float64]) -> None:
         """Keep half as many: the moves of the voxels that drifted most."""
         moves = np.concatenate(self._parts)
         order = np.argsort(-total_drift[moves["row"]], kind="stable")[: MAX_MOVES // 2]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,9 @@ from semstab.backends import REGISTRY
 from semstab.plan import Plan, Task
 from semstab.recording import legend
 from semstab.recording.entities import path
-from semstab.recording.series import OF_THE_BACKBONE, SERIES, entity
-from semstab.recording.voxel_maps import TABS, TITLES
-from semstab.results import Unit
+from semstab.recording.series import SERIES, entity
+from semstab.recording.voxel_maps import TABS, TITLES, chunk, defaults, visualizer
+from semstab.results import RECURRENT, Unit
 
 FIELD_OF_VIEW = math.radians(55)
 """Of the viewer's eyes, from bottom to top."""
@@ -43,7 +42,16 @@ BACKGROUND = (72, 72, 78)
 """Of the maps: neither end of the colour maps vanishes in it."""
 
 OVERVIEW = ("drift", "compensated_flicker", "map_vss", "map_recurrent")
-COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
+COMPARED = {
+    "drift": "Drift (bits)",
+    "map_vss": "VSS",
+    "map_entropy": "Entropy",
+    "map_recurrent": f"OP >= {RECURRENT}",
+    "new_voxels": "New voxels",
+    "fuse_ms": "Fusion (ms)",
+}
+"""Series of two backends that are seen side by side, and short titles: a backend's name may be long."""
+
 DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
 
 
@@ -61,13 +69,24 @@ class Scenery:
     up: npt.NDArray[np.float64] | None
 
 
-Sceneries = Mapping[str, Scenery]
+@dataclass
+class Known:
+    """What is known of a run so far, and the layout depends on.
+
+    sceneries  by scene, say where its maps are seen from; else the viewer chooses
+    chunks     by scene, of how many chunks of a map the views say how they are coloured
+    spans      by scene and backbone, the lowest and highest value of each of COMPARED in all backends
+    """
+
+    sceneries: dict[str, Scenery] = field(default_factory=dict)
+    chunks: dict[str, int] = field(default_factory=dict)
+    spans: dict[tuple[str, str], dict[str, tuple[float, float]]] = field(default_factory=dict)
 
 
-def blueprint(plan: Plan, sceneries: Sceneries) -> rrb.Blueprint:
-    """The layout of a plan; `sceneries`, by scene, say where its maps are seen from; else the viewer chooses."""
+def blueprint(plan: Plan, known: Known) -> rrb.Blueprint:
+    """The layout of a plan, with what is known so far."""
     by_scene = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
-    scenes = [_scene(scene, list(tasks), sceneries.get(scene)) for scene, tasks in by_scene]
+    scenes = [_scene(scene, list(tasks), known) for scene, tasks in by_scene]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
@@ -98,17 +117,18 @@ def distinct(task: Task) -> list[str]:
     return [name for name in task.backends if name == drawn(task) or not is_pointwise(name)]
 
 
-def _scene(scene: str, tasks: list[Task], scenery: Scenery | None) -> rrb.Container:
+def _scene(scene: str, tasks: list[Task], known: Known) -> rrb.Container:
     flips = [_flips(scene, task) for task in tasks]
-    comparisons = [_comparison(task, *pair, scenery) for task in tasks for pair in compared(task)]
-    return rrb.Tabs(_overview(scene, tasks, scenery), *flips, *comparisons, name=scene)
+    comparisons = [_comparison(task, *pair, known) for task in tasks for pair in compared(task)]
+    overview = _overview(scene, tasks, known.sceneries.get(scene), known.chunks[scene])
+    return rrb.Tabs(overview, *flips, *comparisons, name=scene)
 
 
-def _overview(scene: str, tasks: list[Task], scenery: Scenery | None) -> rrb.Container:
+def _overview(scene: str, tasks: list[Task], scenery: Scenery | None, chunks: int) -> rrb.Container:
     classes = tasks[0].mapping.target
     width, height = legend.size(classes)
     area = LEFT[0], LEFT[1] - TITLE - (height + TITLE)
-    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area) for name in TITLES))
+    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area, chunks) for name in TITLES))
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
     classes_view = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
     left = rrb.Vertical(maps, classes_view, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
@@ -170,9 +190,14 @@ def _camera_views(scene: str, task: Task) -> list[rrb.View]:
     ]
 
 
-def _maps(name: str, tasks: list[Task], scenery: Scenery | None, area: tuple[float, float]) -> rrb.Container:
+def _maps(
+    name: str, tasks: list[Task], scenery: Scenery | None, area: tuple[float, float], chunks: int
+) -> rrb.Container:
     columns, aspect = _arrangement(len(tasks), scenery, area)
-    views = [_map(name, f"{task.backbone}: {TITLES[name]}", task, drawn(task), _eye(scenery, aspect)) for task in tasks]
+    colored = 0 if name == "class" else chunks
+    views = [
+        _map(f"{task.backbone}: {TITLES[name]}", task, drawn(task), scenery, aspect, name, colored) for task in tasks
+    ]
     if len(views) > MOST_BESIDE:
         return rrb.Tabs(*views, name=TABS[name])
     return rrb.Grid(*views, grid_columns=columns, name=TABS[name])
@@ -192,23 +217,29 @@ def _arrangement(views: int, scenery: Scenery | None, area: tuple[float, float])
     return best, cells[best][1]
 
 
-def _map(name: str, title: str, task: Task, backend: str, eye: rrb.EyeControls3D | None) -> rrb.Spatial3DView:
+def _map(
+    title: str, task: Task, backend: str, scenery: Scenery | None, aspect: float, name: str = "class", chunks: int = 0
+) -> rrb.Spatial3DView:
+    """A backend's map; coloured other than by class, the views say so of each of its chunks."""
     scene = task.scene.name
-    chunks = path(scene, "map", task.backbone, backend, name) + "/**"
+    entity = path(scene, "map", task.backbone, backend)
     around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", task.backbone)]
     return rrb.Spatial3DView(
         origin=path(scene),
-        contents=[chunks, *around],
+        contents=[f"{entity}/**", *around],
+        defaults=defaults(name),
+        overrides=dict.fromkeys([chunk(entity, number) for number in range(chunks)], visualizer(name)),
         name=title,
         background=BACKGROUND,
         line_grid=False,
-        eye_controls=eye,
+        eye_controls=_eye(scenery, aspect),
     )
 
 
-def _comparison(task: Task, first: str, second: str, scenery: Scenery | None) -> rrb.Container:
-    """Two backends: their maps and where these differ, and the same series side by side."""
+def _comparison(task: Task, first: str, second: str, known: Known) -> rrb.Container:
+    """Two backends: their maps and where these differ, and the same series side by side, in the same range."""
     scene, backbone = task.scene.name, task.backbone
+    scenery, spans = known.sceneries.get(scene), known.spans.get((scene, backbone), {})
     pair = f"{first} and {second}"
     difference = rrb.Spatial3DView(
         origin=path(scene),
@@ -219,19 +250,18 @@ def _comparison(task: Task, first: str, second: str, scenery: Scenery | None) ->
         eye_controls=_eye(scenery, DIFFERENCE_ASPECT),
     )
     found = rrb.TextDocumentView(origin=path(scene, "difference_report", backbone, pair), name="What differs")
-    eye = _eye(scenery, COMPARED_ASPECT)
     maps = rrb.Horizontal(
-        _map("class", f"{first}: dominant class", task, first, eye),
-        _map("class", f"{second}: dominant class, at the end", task, second, eye),
+        _map(f"{first}: dominant class", task, first, scenery, COMPARED_ASPECT),
+        _map(f"{second}: dominant class, at the end", task, second, scenery, COMPARED_ASPECT),
     )
     plots = [
         rrb.TimeSeriesView(
             origin=entity(name, Unit(scene, backbone, backend)),
-            name=f"{SERIES[name]}: {backend}",
+            name=f"{title}: {backend}",
+            axis_y=_axis(spans.get(name)),
             plot_legend=rrb.PlotLegend(visible=False),
         )
-        for name in COMPARED
-        if name not in OF_THE_BACKBONE
+        for name, title in COMPARED.items()
         for backend in (first, second)
     ]
     return rrb.Horizontal(
@@ -240,6 +270,15 @@ def _comparison(task: Task, first: str, second: str, scenery: Scenery | None) ->
         column_shares=[5, 4],
         name=f"{backbone}: {pair}",
     )
+
+
+def _axis(span: tuple[float, float] | None) -> rrb.ScalarAxis | None:
+    """From the lowest to the highest value, with a margin; where they are one, the viewer chooses."""
+    if span is None or span[0] == span[1]:
+        return None
+    low, high = span
+    margin = 0.05 * (high - low)
+    return rrb.ScalarAxis(range=(low - margin, high + margin))
 
 
 def _eye(scenery: Scenery | None, aspect: float) -> rrb.EyeControls3D | None:
@@ -268,6 +307,7 @@ def direction(scenery: Scenery) -> tuple[npt.NDArray[np.float64], npt.NDArray[np
     return toward / np.linalg.norm(toward), up / np.linalg.norm(up)
 
 
+@functools.lru_cache(maxsize=256)
 def fit(scenery: Scenery, aspect: float) -> tuple[npt.NDArray[np.float64], float]:
     """Where an eye looks, and from how far, for a view of that width by height to be full of points and cameras.
 

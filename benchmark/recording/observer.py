@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import math
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +20,32 @@ from semstab.metrics import compensated_flicker
 from semstab.pipeline import Observer
 from semstab.plan import Plan, Task
 from semstab.recording import legend, series
-from semstab.recording.camera import IMAGE_SIDE, Camera, drift_context, drift_levels, label_context, stride_of
+from semstab.recording.background import Background
+from semstab.recording.camera import (
+    IMAGE_SIDE,
+    Camera,
+    Overlay,
+    drift_context,
+    drift_levels,
+    label_context,
+    stride_of,
+)
 from semstab.recording.difference import log_difference
 from semstab.recording.entities import Clock, path
 from semstab.recording.flips import FlipLog
-from semstab.recording.layout import Scenery, blueprint, drawn, is_pointwise
+from semstab.recording.layout import Known, Scenery, blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target
-from semstab.recording.tracker import Tracker
-from semstab.recording.voxel_maps import GrowingMap
+from semstab.recording.tracker import FrameDrift, Tracker
+from semstab.recording.voxel_maps import CHUNKS, GrowingMap, chunks_of
 from semstab.results import GroupResult, RunResult, Unit, UnitSummary
 from semstab.run_folder import FrameRow
 from semstab.voxels import VoxelTable
 
 SAMPLING = 2
 """In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
+
+FIRST_CHUNKS = 8
+"""Chunks of each map that the first layout knows; it is sent again where a map outgrows them."""
 
 SAMPLE = 20_000
 """Voxels of a scene from which it follows where its maps are seen from."""
@@ -60,13 +74,17 @@ class Recording(Observer):
         self._kept: list[tuple[Task, GroupResult]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
         self._cameras: dict[str, Camera] = {}
-        self._sceneries: dict[str, Scenery] = {}
+        self._known = Known()
+        self._sent = 0  # layouts
         self._group: _Group | None = None  # the backbone on a scene that is being fused
+        self._background: Background | None = None
 
     def run_started(self, plan: Plan) -> None:
         """Keep the plan: layout, names and colours follow from it."""
         self._plan = plan
         self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
+        first = CHUNKS if self.target.live else FIRST_CHUNKS  # a live viewer keeps the layout that it got first
+        self._known.chunks = {task.scene.name: first for task in plan.tasks}
 
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """Log the unit's row of the time series; with the frame's last unit, what the camera and the map show."""
@@ -76,22 +94,37 @@ class Recording(Observer):
         origin = self._origin(stream, task, frame.T_wc[:3, 3])
         if self._group is None or self._group.task is not task:
             self._group = _Group(task, self._plan.config.voxel_size, origin)
-        series.log_row(stream, unit, task, row.cells())
+        values = series.values(row.cells())
+        series.log_row(stream, unit, task, values)
+        self._group.span(values)
         self._group.follow(row)
         if unit.backend == task.backends[-1]:
-            self._cameras[unit.scene].log(stream, frame, self._clock)
-            self._group.log(stream, frame)
+            assert self._background is not None
+            self._cameras[unit.scene].log(stream, frame, self._background)
+            self._group.log(stream, frame, self._background)
+            if chunks_of(self._group.grown) > self._known.chunks[unit.scene]:
+                show = functools.partial(self._show_chunks, stream, unit.scene, self._group.grown)
+                self._background.submit(frame.index, frame.timestamp, show)
+
+    def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
+        """Log the unit's voxels and flips, while they are measured; the time is that of its last frame."""
+        stream, group, background = self._opened(), self._group, self._background
+        assert group is not None
+        assert background is not None
+        tolerance = self._plan.config.tolerance
+        background.submit(*group.last, functools.partial(group.log_map, stream, unit, table, tolerance))
+        if unit.backend == group.task.backends[-1]:
+            background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
+            background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
 
     def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
-        """Log the unit's voxels and final numbers; the time is that of its last frame."""
-        stream = self._opened()
-        group = self._group
+        """Log the unit's final numbers."""
+        stream, group = self._opened(), self._group
         assert group is not None
-        group.set_last_time(stream, self._clock)
-        self._log_map(stream, group, unit, table, summary)
-        if unit.backend == group.task.backends[-1]:
-            group.log_flips(stream, self._clock)
-            group.set_last_time(stream, self._clock)
+        assert self._background is not None
+        self._background.drain()
+        self._clock.set(stream, *group.last)
+        self._log_numbers(stream, group, summary)
 
     def group_kept(self, task: Task, result: GroupResult) -> None:
         """Log the units' series and voxels from the run folder: their pictures are not in this recording."""
@@ -119,8 +152,9 @@ class Recording(Observer):
         """Write out what is pending and close the file; a second call does nothing."""
         stream, self._stream = self._stream, None
         if stream is not None:
+            if self._background is not None:
+                self._background.close()
             for camera in self._cameras.values():
-                camera.close()
                 if camera.unread is not None:
                     stream.log(path(camera.scene.name, "log"), rr.TextLog(f"without colour: {camera.unread}"))
             stream.flush()
@@ -129,24 +163,42 @@ class Recording(Observer):
     def _opened(self) -> rr.RecordingStream:
         if self._stream is None:
             self._stream = stream = self.target.open()
+            self._background = Background(stream, self._clock)
             _log_static(stream, self._plan)
-            stream.send_blueprint(blueprint(self._plan, self._sceneries))
+            self._send_blueprint(stream)
             self._log_kept(stream)
         return self._stream
 
-    def _log_map(
-        self, stream: rr.RecordingStream, group: _Group, unit: Unit, table: VoxelTable, summary: UnitSummary
-    ) -> None:
-        remark = group.log_map(stream, unit, table, self._plan.config.tolerance)
-        stream.log(path(unit.scene, "log"), rr.TextLog(_final(summary) + remark))
-        if unit.scene not in self._sceneries and len(table):
+    def _lay_out(self, stream: rr.RecordingStream, group: _Group, table: VoxelTable) -> None:
+        """All of a group is fused: send the layout again where there is more to it now. The table is one of its own."""
+        known, scene = self._known, group.task.scene.name
+        compared = len(group.task.backends) > 1
+        if compared:
+            known.spans[scene, group.task.backbone] = group.spans
+        first = scene not in known.sceneries and len(table) > 0
+        if first:
             some = table.index[:: math.ceil(len(table) / SAMPLE)]
-            poses = np.reshape(self._cameras[unit.scene].poses, (-1, 4, 4))
+            poses = np.reshape(self._cameras[scene].poses, (-1, 4, 4))
             points = ((some - group.origin + 0.5) * table.voxel_size).astype(np.float64)
-            self._sceneries[unit.scene] = Scenery(points, poses, group.task.scene.up)
-            stream.send_blueprint(
-                blueprint(self._plan, self._sceneries), make_default=True, make_active=not self.target.live
-            )
+            known.sceneries[scene] = Scenery(points, poses, group.task.scene.up)
+        self._show_chunks(stream, scene, group.voxels, anyway=first or compared)
+
+    def _log_numbers(self, stream: rr.RecordingStream, group: _Group, summary: UnitSummary) -> None:
+        text = _final(summary) + group.remarks.get(summary.unit.backend, "")
+        stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
+
+    def _send_blueprint(self, stream: rr.RecordingStream) -> None:
+        layout = blueprint(self._plan, self._known)
+        stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
+        self._sent += 1
+
+    def _show_chunks(self, stream: rr.RecordingStream, scene: str, voxels: int, *, anyway: bool = False) -> None:
+        """Send the layout again where a scene's map of that size has more chunks than it knows, or anyway."""
+        outgrown = chunks_of(voxels) > self._known.chunks[scene]
+        if outgrown:
+            self._known.chunks[scene] = CHUNKS
+        if outgrown or anyway:
+            self._send_blueprint(stream)
 
     def _log_kept(self, stream: rr.RecordingStream) -> None:
         kept, self._kept = self._kept, []
@@ -165,9 +217,15 @@ class Recording(Observer):
                 if group is None:
                     at = table.centers.mean(axis=0)
                     group = _Group(task, table.voxel_size, self._origin(stream, task, at))
-                series.send_rows(stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock)
+                for values in series.send_rows(
+                    stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
+                ):
+                    group.span(values)
                 self._clock.set(stream, task.indices[-1])
-                self._log_map(stream, group, unit, table, summary)
+                group.log_map(stream, unit, table, self._plan.config.tolerance)
+                self._log_numbers(stream, group, summary)
+            if group is not None:
+                self._lay_out(stream, group, table)
 
     def _origin(self, stream: rr.RecordingStream, task: Task, position: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """The scene's map origin, in voxels: settled near the first position that is known, and said."""
@@ -176,7 +234,7 @@ class Recording(Observer):
             return self._origins[scene]
         steps = np.round(position / ORIGIN_STEP).astype(np.int64)
         self._origins[scene] = origin = steps * round(ORIGIN_STEP / voxel_size)
-        self._cameras[scene] = Camera(task.scene, origin * voxel_size)
+        self._cameras[scene] = Camera(task.scene, origin * voxel_size, len(task.indices))
         if steps.any():
             where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", origin * voxel_size, strict=True))
             stream.log(path(scene, "log"), rr.TextLog(f"map coordinates are relative to {where} of the scene's world"))
@@ -198,35 +256,60 @@ class _Group:
         self._tables: dict[str, VoxelTable] = {}
         self._previous: Frame | None = None
         self._entity = path(task.scene.name, "camera", task.backbone)
-        self._last: tuple[int, float | None] = (task.indices[-1], None)
+        self._overlay = Overlay()
+        self.last: tuple[int, float | None] = (task.indices[-1], None)
+        """Number and timestamp of the last frame."""
+        self.spans: dict[str, tuple[float, float]] = {}
+        """The lowest and highest value of each series in all backends."""
+        self.voxels = 0
+        """Of its largest final map."""
+        self.remarks: dict[str, str] = {}
+        """What there is to say of the final map of a backend."""
+
+    def span(self, values: Mapping[str, float]) -> None:
+        """A unit's series had these values in a frame."""
+        for name, value in values.items():
+            low, high = self.spans.get(name, (value, value))
+            self.spans[name] = min(low, value), max(high, value)
 
     def follow(self, row: FrameRow) -> None:
         """A unit of the group fused the frame."""
         self._followed = self._tracker.follow(row.report) or self._followed
 
-    def log(self, stream: rr.RecordingStream, frame: Frame) -> None:
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
         """All units of the group fused the frame: log what it shows and what it changed."""
         if not self._followed:
             self._tracker.integrate(frame)
-        self._tracker.note()
         self._followed = False
-        self._last = frame.index, frame.timestamp
-        stride = stride_of(frame.shape)
-        self._log_pictures(stream, frame, stride)
-        self._log_flicker(stream, frame, stride)
+        self.last = frame.index, frame.timestamp
         self._flips.update(self._tracker, frame)
-        if is_pointwise(drawn(self.task)):
-            self._map(drawn(self.task)).update(stream, self._tracker.map)
+        grown = self._map(drawn(self.task)).update(stream, self._tracker.map) if is_pointwise(drawn(self.task)) else []
+        drift, previous = self._tracker.drift_of(frame), self._previous
         self._previous = frame
 
-    def log_map(self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float) -> str:
-        """Log a unit's final voxels, and where they differ from those of the drawn unit; say how they were thinned."""
+        def job() -> None:
+            self._log_pictures(stream, drift)
+            if previous is not None:
+                self._log_flicker(stream, previous, frame)
+            for log_chunk in grown:
+                log_chunk()
+
+        background.submit(frame.index, frame.timestamp, job)
+
+    @property
+    def grown(self) -> int:
+        """Voxels of the map that is drawn while it grows."""
+        return len(self._tracker.map) if is_pointwise(drawn(self.task)) else 0
+
+    def log_map(self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float) -> None:
+        """Log a unit's final voxels, and where they differ from those of the drawn unit."""
         first = drawn(self.task)
         self._tables[unit.backend] = table
+        self.voxels = max(self.voxels, len(table))
         if first in self._tables:
             for backend in self._tables if unit.backend == first else [unit.backend]:
                 self._compare(stream, first, backend, tolerance)
-        return self._map(unit.backend).finish(stream, table)
+        self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
         """Log which frames changed the voxels that drifted most."""
@@ -234,10 +317,6 @@ class _Group:
         self._flips.log(
             stream, self.task.scene.name, self.task.backbone, suspects, self._classes, self._translation, clock
         )
-
-    def set_last_time(self, stream: rr.RecordingStream, clock: Clock) -> None:
-        """What is logged from now on belongs to the last frame."""
-        clock.set(stream, *self._last)
 
     def _compare(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
         if first == second:
@@ -250,23 +329,23 @@ class _Group:
         report = rr.TextDocument(f"{found}.", media_type=rr.MediaType.MARKDOWN)
         stream.log(path(scene, "difference_report", backbone, f"{first} and {second}"), report, static=True)
 
-    def _log_pictures(self, stream: rr.RecordingStream, frame: Frame, stride: int) -> None:
+    def _log_pictures(self, stream: rr.RecordingStream, caused: FrameDrift) -> None:
+        frame = caused.frame
+        stride = stride_of(frame.shape)
         labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
-        stream.log(f"{self._entity}/labels", rr.SegmentationImage(labels, draw_order=-10))
-        step = _sampling(labels.shape)
-        drift = drift_levels(*self._tracker.drift_at(frame, step * stride))
-        drift = drift.repeat(step, axis=0).repeat(step, axis=1)[: labels.shape[0], : labels.shape[1]]
-        stream.log(f"{self._entity}/drift", rr.SegmentationImage(drift, draw_order=-10))
+        coarse = stride * _sampling(labels.shape)
+        for name, picture, step in (("labels", labels, stride), ("drift", drift_levels(*caused.at(coarse)), coarse)):
+            entity = f"{self._entity}/{name}"
+            self._overlay.log(stream, entity, frame.shape, picture.shape, step)
+            stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
 
-    def _log_flicker(self, stream: rr.RecordingStream, frame: Frame, stride: int) -> None:
+    def _log_flicker(self, stream: rr.RecordingStream, previous: Frame, frame: Frame) -> None:
         """Motion-compensated flicker: of a sample of the frame's pixels, looked up in the whole frame before."""
-        if self._previous is None:
-            return
+        stride = stride_of(frame.shape)
         sample = frame.every(stride)
-        flicker = compensated_flicker(self._previous, sample.every(_sampling(sample.shape))).flicker_percent
+        flicker = compensated_flicker(previous, sample.every(_sampling(sample.shape))).flicker_percent
         if math.isfinite(flicker):
-            unit = self.task.units[0]
-            stream.log(series.entity("compensated_flicker", unit), rr.Scalars(flicker))
+            stream.log(series.entity("compensated_flicker", self.task.units[0]), rr.Scalars(flicker))
 
     def _map(self, backend: str) -> GrowingMap:
         if backend not in self._maps:

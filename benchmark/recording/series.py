@@ -58,16 +58,15 @@ def columns(unit: Unit, task: Task) -> list[str]:
     return [name for name in SERIES if name not in OF_THE_BACKBONE or unit.backend == task.backends[0]]
 
 
-def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, cells: Mapping[str, Any]) -> None:
-    """Log one frame's row at the stream's time."""
-    row = values(cells)
+def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, row: Mapping[str, float]) -> None:
+    """Log one frame's values at the stream's time."""
     for name in columns(unit, task):
         if name in row:
             stream.log(entity(name, unit), rr.Scalars(row[name]))
 
 
-def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> None:
-    """Log a whole time series from its CSV. Raises DataError where it is damaged."""
+def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> list[dict[str, float]]:
+    """Log a whole time series from its CSV, and return its values. Raises DataError where it is damaged."""
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             rows = list(csv.DictReader(lines))
@@ -81,6 +80,7 @@ def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, cl
         if at:
             times = clock.columns([numbers[i] for i in at], [stamps[i] for i in at])
             stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=[found[i][name] for i in at]))
+    return found
 
 
 def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.numba_hash import NumbaHash, NumbaReport
 from semstab.frames import Frame
+from semstab.recording.drift_kernel import find_voxels
 from semstab.results import FrameReport
 
 
@@ -19,8 +20,6 @@ class Tracker:
     def __init__(self, voxel_size: float, num_classes: int) -> None:
         self._new_map = functools.partial(NumbaHash, voxel_size, num_classes)
         self._map: NumbaHash | None = None
-        self._drift = np.zeros(0, dtype=np.float32)  # of the frame that saw the voxel last
-        self._total = np.zeros(0, dtype=np.float32)
 
     @property
     def map(self) -> NumbaHash:
@@ -28,11 +27,6 @@ class Tracker:
         if self._map is None:
             self._map = self._new_map()
         return self._map
-
-    @property
-    def total_drift(self) -> npt.NDArray[np.float32]:
-        """Sum of each voxel's drift so far, bits."""
-        return self._total[: len(self.map)]
 
     def follow(self, report: FrameReport) -> bool:
         """Follow the map that the report's frame went into, where that is possible; from the first frame or never."""
@@ -44,25 +38,40 @@ class Tracker:
         """Fuse the frame into the map of its own."""
         self.map.integrate(frame)
 
-    def note(self) -> None:
-        """Take down what the last frame did."""
+    def drift_of(self, frame: Frame) -> FrameDrift:
+        """What that frame, which went into the map last, did to the voxels that it saw."""
         changes = self.map.changes
-        self._drift, self._total = (_grown(array, len(self.map)) for array in (self._drift, self._total))
-        self._drift[changes.row] = changes.drift
-        self._total[changes.row] += np.nan_to_num(changes.drift)
-
-    def drift_at(self, frame: Frame, stride: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-        """Drift in bits (H', W') that the last frame caused behind every stride-th pixel, and where there is a voxel.
-
-        NaN where the voxel was not seen before.
-        """
-        rows = self.map.rows_at(frame, stride)
-        drift: npt.NDArray[np.float32] = self._drift[rows] if len(self._drift) else np.zeros(rows.shape, np.float32)
-        return drift, rows >= 0
+        return FrameDrift(frame, changes.key.copy(), changes.drift, self.map.voxel_size, self.map.origin)
 
 
-def _grown(array: npt.NDArray[Any], size: int) -> npt.NDArray[Any]:
-    """The array, with zeros behind it where it is too short; by quarters."""
-    if size <= len(array):
-        return array
-    return np.concatenate([array, np.zeros(max(size, len(array) * 5 // 4) - len(array), dtype=array.dtype)])
+@dataclass(frozen=True, eq=False)
+class FrameDrift:
+    """The drift that a frame caused at each voxel that it saw, whatever becomes of the map.
+
+    key    (n,) int64 packed voxel index, relative to the origin
+    drift  (n,) float32 bits, NaN where the voxel was not seen before
+    """
+
+    frame: Frame
+    key: npt.NDArray[np.int64]
+    drift: npt.NDArray[np.float32]
+    voxel_size: float
+    origin: npt.NDArray[np.int64]
+
+    def at(self, stride: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+        """Drift behind every stride-th pixel (H', W'), and where there is a voxel: where there is none, drift is 0."""
+        found = self.voxels_at(stride)
+        seen = found >= 0
+        drift = np.zeros(found.shape, dtype=np.float32)
+        drift[seen] = self.drift[found[seen]]
+        return drift, seen
+
+    def voxels_at(self, stride: int) -> npt.NDArray[np.int32]:
+        """Which of the n voxels is behind every stride-th pixel (H', W'); -1 where a pixel does not count."""
+        H, W = self.frame.shape
+        camera, pick = self.frame.intrinsics, np.s_[::stride, ::stride]
+        rays = (np.arange(W)[::stride] - camera.cx) / camera.fx, (np.arange(H)[::stride] - camera.cy) / camera.fy
+        depth = np.where(self.frame.valid[pick], self.frame.depth[pick], np.float32(0))
+        found = np.full(depth.shape, -1, dtype=np.int32)
+        find_voxels(depth, *rays, np.array(self.frame.T_wc), self.voxel_size, self.origin, self.key, found)
+        return found

@@ -1,23 +1,27 @@
-"""Fused voxels in the viewer: VoxelGridMaps, one for each chunk of the map and each measure that colours it.
+"""Fused voxels in the viewer: VoxelGridMaps with all measures on the same voxels; a view picks the one that it shows.
 
-A chunk is a stretch of voxels in the order of their first observation, so its voxels were seen together, are seen
-again together, and rest together: only chunks that changed are logged again.
+A map is logged in chunks. While it grows a chunk is a stretch of voxels in the order of their first observation, so its
+voxels were seen together, are seen again together, and rest together: only chunks that changed are logged again, and
+those that got no new voxels without their indices.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from semstab.backends.numba_hash import NumbaHash
 from semstab.labels import LabelSpace
-from semstab.metrics import CATEGORY_COLORS, categories, op, sbd
+from semstab.metrics import CATEGORY_COLORS
+from semstab.metrics.category import categorise
+from semstab.metrics.voxelwise import mean_drift
 from semstab.recording.belief_kernel import read_off
 from semstab.results import RECURRENT
 from semstab.voxels import VoxelTable
@@ -53,17 +57,30 @@ TABS = {"class": "Class", "vss": "VSS", "sbd": "SBD", "entropy": "Entropy", "op"
 MAX_VOXELS = 2_000_000
 """Drawn of one map; at its end a larger one is thinned."""
 
-CHUNKS = 64
+CHUNKS = 32
 BUDGET = 2_000_000
 """Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
 
 MOST_A_FRAME = 10_000
 """Voxels, of the budget, for which a frame pays: short runs need not log everything anew with each frame."""
 
+NEW = 10
+"""How many voxels that were seen again wait for one that is not drawn yet."""
+
 
 def edges() -> npt.NDArray[np.int64]:
     """(CHUNKS + 1,) first voxel of each chunk: small maps have several chunks, large ones not too many."""
     return np.round(MAX_VOXELS * (np.arange(CHUNKS + 1) / CHUNKS) ** 2).astype(np.int64)
+
+
+def chunks_of(voxels: int) -> int:
+    """In how many chunks a map of that size is drawn."""
+    return int(np.searchsorted(edges(), min(voxels, MAX_VOXELS)))
+
+
+def chunk(entity: str, number: int) -> str:
+    """The entity of a chunk, where `entity` is the map's."""
+    return f"{entity}/{number:02d}"
 
 
 def packed(colors: npt.ArrayLike) -> npt.NDArray[np.uint32]:
@@ -73,24 +90,82 @@ def packed(colors: npt.ArrayLike) -> npt.NDArray[np.uint32]:
     return rgba
 
 
-def grids(
-    table: VoxelTable, classes: LabelSpace, origin: npt.NDArray[np.int64], factor: int = 1
-) -> Iterator[tuple[str, rr.VoxelGridMap]]:
-    """The voxels in each of the colourings `TITLES`.
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """n voxels as they are drawn.
 
-    Indices relative to the origin are small, so the viewer's float32 keeps them exact. The voxels of a table that was
-    thinned are `factor` times as large.
+    index   (n, 3) int32 relative to the map's origin: small, so that the viewer's float32 keeps them exact
+    size    edge of a voxel, metres
+    colors  (n,) uint32 by dominant class and by category, 'class' and 'category'
+    values  (n,) float32 of each of MEASURES
     """
-    index = ((table.index - origin) // factor).astype(np.int32)
-    size = [table.voxel_size * factor] * 3
-    label, vss, entropy = (np.empty(len(table), dtype) for dtype in (np.uint16, np.float32, np.float32))
-    read_off(table.evidence, label, vss, entropy)
-    yield "class", rr.VoxelGridMap(index, size, colors=packed(classes.colors)[label])
-    values: dict[str, npt.NDArray[Any]] = {"vss": vss, "sbd": sbd(table), "entropy": entropy, "op": op(table)}
-    for name, measure in MEASURES.items():
-        value = values[name].astype(np.float32)
-        yield name, rr.VoxelGridMap(index, size, values=value, colormap=measure.colormap, value_range=measure.range)
-    yield "category", rr.VoxelGridMap(index, size, colors=packed(CATEGORY_COLORS)[categories(table)])
+
+    index: npt.NDArray[np.int32]
+    size: float
+    colors: dict[str, npt.NDArray[np.uint32]]
+    values: dict[str, npt.NDArray[np.float32]]
+
+    @classmethod
+    def of(
+        cls,
+        index: npt.NDArray[np.int32],
+        size: float,
+        classes: LabelSpace,
+        evidence: npt.NDArray[np.float64],
+        op: npt.NDArray[np.int32],
+        drift_sum: npt.NDArray[np.float64],
+    ) -> Drawn:
+        """From the voxels' columns, as `VoxelTable` has them."""
+        n, K = evidence.shape
+        label, vss, bits = np.empty(n, dtype=np.uint16), np.empty(n), np.empty(n)
+        read_off(evidence, label, vss, bits)
+        sbd = mean_drift(drift_sum, op)
+        values: dict[str, npt.NDArray[Any]] = {"vss": vss, "sbd": sbd, "entropy": bits / math.log2(K), "op": op}
+        colors = {
+            "class": packed(classes.colors)[label],
+            "category": packed(CATEGORY_COLORS)[categorise(op, sbd, bits)],
+        }
+        return cls(index, size, colors, {name: value.astype(np.float32) for name, value in values.items()})
+
+    def components(self, *, whole: bool) -> list[Any]:
+        """A grid that shows the dominant class, and beside it what else it can show; see `visualizer`.
+
+        Where not `whole`, only colours and values, as the rest was logged before.
+        """
+        places: dict[str, Any] = {"voxel_indices": self.index, "voxel_size": [self.size] * 3} if whole else {}
+        category = rr.components.ColorBatch(self.colors["category"])
+        return [
+            rr.VoxelGridMap.from_fields(**places, colors=self.colors["class"]),
+            rr.DynamicArchetype("category", components={"colors": category}),
+            *(
+                rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(values)})
+                for name, values in self.values.items()
+            ),
+        ]
+
+
+def visualizer(name: str) -> rr.blueprint.Visualizer:
+    """What makes a view show a measure, or the category, of a grid that has them all; of itself it shows the class.
+
+    The view's `defaults` say how values are coloured.
+    """
+    source = ComponentSourceKind.SourceComponent
+    if name == "category":
+        mappings = [VisualizerComponentMapping("VoxelGridMap:colors", source, source_component="category:colors")]
+    else:
+        mappings = [
+            VisualizerComponentMapping("VoxelGridMap:values", source, source_component=f"{name}:values"),
+            VisualizerComponentMapping("VoxelGridMap:colors", ComponentSourceKind.Default),
+        ]
+    return rr.VoxelGridMap.from_fields().visualizer(mappings=mappings)
+
+
+def defaults(name: str) -> list[rr.VoxelGridMap]:
+    """How a view colours the values of a measure."""
+    if name not in MEASURES:
+        return []
+    measure = MEASURES[name]
+    return [rr.VoxelGridMap.from_fields(colormap=measure.colormap, value_range=measure.range)]
 
 
 def thinned(index: npt.NDArray[np.int64]) -> tuple[int, npt.NDArray[np.int64]]:
@@ -107,7 +182,8 @@ def thinned(index: npt.NDArray[np.int64]) -> tuple[int, npt.NDArray[np.int64]]:
 class GrowingMap:
     """Logs what changes in a map, within the budget: of `frames` frames each one may log its share, and what is saved.
 
-    Where there is more to log, chunks come first in which the most voxels were observed since they were logged.
+    Where there is more to log, chunks come first in which the most voxels are new or were observed again since they
+    were logged.
     """
 
     def __init__(self, entity: str, classes: LabelSpace, origin: npt.NDArray[np.int64], frames: int) -> None:
@@ -121,51 +197,56 @@ class GrowingMap:
         self._share = min(BUDGET / frames, MOST_A_FRAME)
         self._allowed = 0.0
         self._changed = np.zeros(CHUNKS, dtype=np.int64)  # observations in each chunk since it was logged
-        self._size = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
+        self._drawn = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
 
-    def update(self, stream: rr.RecordingStream, fused: NumbaHash) -> None:
-        """A frame went into the map: log what the budget allows."""
+    def update(self, stream: rr.RecordingStream, fused: NumbaHash) -> list[Callable[[], None]]:
+        """A frame went into the map: what logs as much of it as the budget allows, whatever becomes of the map."""
         rows = fused.changes.row
         self._changed += np.bincount(self._chunk_of[rows[rows < MAX_VOXELS]], minlength=CHUNKS)
         self._allowed += self._share
         sizes = np.diff(np.minimum(self._edges, len(fused)))
-        for c in np.argsort(-self._changed / np.maximum(sizes, 1), kind="stable"):
+        urgent = (self._changed + NEW * (sizes - self._drawn)) / np.maximum(sizes, 1)
+        jobs: list[Callable[[], None]] = []
+        for c in np.argsort(-urgent, kind="stable"):
             if self._changed[c] == 0 or self.logged + sizes[c] > self._allowed:
                 break
-            self._log(stream, fused, int(c))
+            jobs.append(self._job(stream, fused, int(c), int(sizes[c])))
+        return jobs
 
     def finish(self, stream: rr.RecordingStream, table: VoxelTable) -> str:
         """Log the final map in place of what is there; says how it was thinned, where it is too large."""
-        factor, rows = thinned(table.index - self._origin)
+        index = table.index - self._origin
+        factor, rows = thinned(index)
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
-                self._log_table(stream, c, select(table, part), factor)
-            elif self._size[c]:
-                for name in TITLES:
-                    stream.log(self._path(name, c), rr.Clear(recursive=False))
-            self._size[c] = len(part)
+                at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # what is not thinned is not copied
+                drawn = Drawn.of(
+                    (index[at] // factor).astype(np.int32), table.voxel_size * factor, self._classes,
+                    table.evidence[at], table.op[at], table.drift_sum[at],
+                )  # fmt: skip
+                stream.log(chunk(self.entity, c), *drawn.components(whole=True))
+                self._note(c, len(part))
+            elif self._drawn[c]:
+                stream.log(chunk(self.entity, c), rr.Clear(recursive=False))
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         return thin if factor > 1 else ""
 
-    def _log(self, stream: rr.RecordingStream, fused: NumbaHash, c: int) -> None:
-        rows = np.arange(self._edges[c], min(self._edges[c + 1], len(fused)))
-        self._log_table(stream, c, fused.table_of(rows))
-        self._changed[c], self._size[c] = 0, len(rows)
+    def _job(self, stream: rr.RecordingStream, fused: NumbaHash, c: int, size: int) -> Callable[[], None]:
+        """What logs a chunk as it is now."""
+        stretch = np.s_[self._edges[c] : self._edges[c] + size]
+        rows = np.arange(stretch.start, stretch.stop)
+        index, evidence = fused.index_of(rows), fused.evidence_of(rows)
+        op, drift_sum = (fused.column(name, stretch) for name in ("op", "drift_sum"))
+        whole = self._drawn[c] != size
+        self._note(c, size)
 
-    def _log_table(self, stream: rr.RecordingStream, c: int, table: VoxelTable, factor: int = 1) -> None:
-        for name, grid in grids(table, self._classes, self._origin, factor):
-            stream.log(self._path(name, c), grid)
-        self.logged += len(table)
+        def job() -> None:
+            at = (index - self._origin).astype(np.int32)
+            drawn = Drawn.of(at, fused.voxel_size, self._classes, evidence, op, drift_sum)
+            stream.log(chunk(self.entity, c), *drawn.components(whole=whole))
 
-    def _path(self, name: str, chunk: int) -> str:
-        return f"{self.entity}/{name}/{chunk:02d}"
+        return job
 
-
-def select(table: VoxelTable, rows: npt.NDArray[np.int64]) -> VoxelTable:
-    """Those rows of a table, ascending."""
-    columns = ("ix", "iy", "iz", "op", "evidence", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum",
-               "frame_entropy_sum")  # fmt: skip
-    whole = len(rows) > 0 and rows[-1] - rows[0] == len(rows) - 1
-    pick = slice(rows[0], rows[-1] + 1) if whole else rows  # a stretch is not copied
-    picked = {name: getattr(table, name)[pick] for name in columns}
-    return VoxelTable(**picked, voxel_size=table.voxel_size, classes=table.classes)
+    def _note(self, c: int, size: int) -> None:
+        self.logged += size
+        self._changed[c], self._drawn[c] = 0, size
