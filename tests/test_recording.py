@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import math
 import subprocess
 import sys
@@ -23,7 +24,8 @@ from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.pipeline import Observer
 from semstab.plan import Plan, Task, load_config
-from semstab.recording import MEASURES, SERIES, Recording, observer, voxel_maps
+from semstab.recording import MEASURES, SERIES, Recording, background, observer, voxel_maps
+from semstab.recording.entities import Clock
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
 from semstab.recording.voxel_maps import SBD_MAX, TITLES
@@ -419,6 +421,45 @@ def test_frames_without_a_timestamp_have_a_number_only(tmp_path) -> None:
     record(path, [frame(0, 0, (0.01, 0.01, 2.01), 4.0), frame(1, 0, (0.01, 0.01, 2.01), None)])
     rows = read(path)[r"/floor\ 1/series/updated_voxels/net\/x/numpy"]
     assert {row["frame"]: "time" in row for row in rows if "frame" in row} == {0: True, 1: False}
+
+
+def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "broken.rrd"
+    watching, table = record(path, [frame(i, 0, (0.01, 0.01, 2.01)) for i in range(2)], finish=False)
+
+    def fail(*_: object) -> str:
+        raise RuntimeError("no room")
+
+    monkeypatch.setattr(voxel_maps.GrowingMap, "finish", fail)
+    watching.unit_fused(UNIT, table)
+    with pytest.raises(RuntimeError, match="no room"):
+        watching.unit_finished(UNIT, table, summary_of(table))
+    watching.close()
+    verify(path)
+    assert set(series(read(path), r"/floor\ 1/series/map_vss/net\/x/numpy")) == {0, 1}
+
+
+def test_jobs_run_in_order_and_few_are_pending() -> None:
+    done: list[int] = []
+    stream = rr.RecordingStream("test")
+    beside = background.Background(stream, Clock())
+    for number in range(20):
+        beside.submit(number, None, functools.partial(done.append, number))
+        assert number - len(done) <= background.LOOK_BEHIND
+    beside.drain()
+    assert done == list(range(20))
+    beside.submit(20, None, functools.partial(done.remove, 99))
+    with pytest.raises(ValueError, match="not in list"):
+        beside.close()
+    stream.disconnect()
+
+
+def test_a_frame_whose_depth_reaches_nothing_has_a_camera(tmp_path) -> None:
+    path = tmp_path / "sky.rrd"
+    sky = frame(0, 0, (0.01, 0.01, 2.01))
+    far = Frame(0, np.full_like(sky.depth, np.inf), sky.intrinsics, sky.T_wc, labels=sky.labels)
+    record(path, [far, frame(1, 0, (0.01, 0.01, 2.01))])
+    assert any("Pinhole:image_from_camera" in row for row in read(path)[r"/floor\ 1/camera"])
 
 
 def test_utm_coordinates_are_recorded_relative_to_an_origin(tmp_path) -> None:

@@ -137,7 +137,8 @@ class Camera:
             K[:2, 2] += 0.5  # the viewer's pixel centres are at halves
             H, W = frame.shape
             depth = frame.depth[::16, ::16]
-            far = np.median(depth[np.isfinite(depth) & (depth > 0)]) if (depth > 0).any() else 1.0
+            valid = depth[np.isfinite(depth) & (depth > 0)]
+            far = np.median(valid) if len(valid) else 1.0
             pinhole = rr.Pinhole(
                 image_from_camera=K, width=W, height=H, camera_xyz=rr.ViewCoordinates.RDF,
                 image_plane_distance=0.2 * float(far),

@@ -151,12 +151,15 @@ class Recording(Observer):
     def close(self) -> None:
         """Write out what is pending and close the file; a second call does nothing."""
         stream, self._stream = self._stream, None
-        if stream is not None:
+        if stream is None:
+            return
+        try:
             if self._background is not None:
                 self._background.close()
             for camera in self._cameras.values():
                 if camera.unread is not None:
                     stream.log(path(camera.scene.name, "log"), rr.TextLog(f"without colour: {camera.unread}"))
+        finally:
             stream.flush()
             stream.disconnect()
 
