@@ -44,7 +44,7 @@ def partition_of(key):
 
 
 @serial
-def _row_keys(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, out):
+def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, out):
     """Packed keys of a row of pixels, -1 where a pixel does not count; returns 1 where one is out of reach, else 0.
 
     One loop without branches, which the compiler turns into vector instructions.
@@ -99,7 +99,7 @@ def _keys_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, 
 
 @serial
 def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, margin, out):
-    """What `_row_keys` returns, with the same keys in less time; `frame_terms` makes rays and margin."""
+    """What `exact_keys_of_row` returns, with the same keys in less time; `frame_terms` makes rays and margin."""
     a0 = (T[0, 1] * ray_y + T[0, 2]) / size
     b0 = (T[1, 1] * ray_y + T[1, 2]) / size
     c0 = (T[2, 1] * ray_y + T[2, 2]) / size
@@ -110,7 +110,7 @@ def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, 
         d, lab, keys = depth[first:to], labels[first:to], out[first:to]
         ray_a, ray_b, ray_c = rays[0, first:to], rays[1, first:to], rays[2, first:to]
         if _keys_fused(d, lab, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, keys):
-            lost |= _row_keys(d, lab, ray_x[first:to], ray_y, T, size, ox, oy, oz, ignore, keys)
+            lost |= exact_keys_of_row(d, lab, ray_x[first:to], ray_y, T, size, ox, oy, oz, ignore, keys)
     return lost
 
 

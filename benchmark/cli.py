@@ -28,6 +28,10 @@ DISAGREE, INTERRUPTED = 3, 130
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")]
 DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
+DatasetSettings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000."),
+]
 DatasetName = Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")]
 Scenes = Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")]
 Backbones = Annotated[
@@ -269,10 +273,7 @@ def check_(
     backbone: Backbones = None,
     voxel_size: VoxelSize = None,
     frames: Frames = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000."),
-    ] = None,
+    settings: DatasetSettings = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -293,10 +294,7 @@ def convert(
     scene: Scenes = None,
     backbone: Backbones = None,
     frames: Frames = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.root=FOLDER."),
-    ] = None,
+    settings: DatasetSettings = None,
     depth_error: Annotated[
         float, typer.Option(min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")
     ] = 0.0,

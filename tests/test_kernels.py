@@ -38,7 +38,7 @@ def test_keys_equal_the_protocols_expression(t, size, aligned, far, seed) -> Non
     origin = np.floor(T[:3, 3] / size)
     exact, quick = np.empty(W, dtype=np.int64), np.empty(W, dtype=np.int64)
     terms = kernels.frame_terms(ray_x, T, size)
-    lost = kernels._row_keys(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, exact)
+    lost = kernels.exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, exact)
     assert kernels.keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, *terms, quick) == lost
     np.testing.assert_array_equal(quick, exact)
 

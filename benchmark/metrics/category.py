@@ -65,14 +65,17 @@ def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) 
 
 
 def categorise(
-    op: npt.ArrayLike, sbd: npt.ArrayLike, bits: npt.ArrayLike, thresholds: CategoryThresholds | None = None
+    op: npt.NDArray[np.int32],
+    sbd: npt.NDArray[np.float64],
+    bits: npt.NDArray[np.float64],
+    thresholds: CategoryThresholds | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Category (n,) by OP, SBD in bits and entropy in bits, (n,) each; see `categories`."""
     limits = thresholds or CategoryThresholds()
-    category = np.full(np.shape(op), STABLE, dtype=np.uint8)
-    category[np.asarray(bits) >= limits.uncertain_bits] = UNCERTAIN
-    category[np.asarray(sbd) >= limits.drifting_bits] = DRIFTING
-    category[np.asarray(op) < limits.min_op] = LOW_PERSISTENCE
+    category = np.full(len(op), STABLE, dtype=np.uint8)
+    category[bits >= limits.uncertain_bits] = UNCERTAIN
+    category[sbd >= limits.drifting_bits] = DRIFTING
+    category[op < limits.min_op] = LOW_PERSISTENCE
     return category
 
 

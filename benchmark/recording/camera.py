@@ -162,7 +162,8 @@ class Camera:
         """Colour as JPEG, and its size (H, W); None where the frame has none, or it cannot be read."""
         import cv2
 
-        H, W = (-(-side // stride_of(frame.shape)) for side in frame.shape)
+        stride = stride_of(frame.shape)
+        H, W = (-(-side // stride) for side in frame.shape)
         if frame.color is not None:
             image = np.ascontiguousarray(frame.color[..., ::-1])
         else:
@@ -172,7 +173,7 @@ class Camera:
             data = file.read_bytes()
             if len(data) <= self._share and (size := _jpeg_size(data)) is not None:
                 return data, size
-            decoded = _decoded(data, frame.shape[1] // W)
+            decoded = _decoded(data, stride)
             if decoded is None:
                 self.unread = self.unread or f"{file}: the image cannot be decoded"
                 return None

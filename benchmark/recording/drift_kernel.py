@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.backends.kernels import _row_keys, mix, serial
+from semstab.backends.kernels import exact_keys_of_row, mix, serial
 from semstab.labels import IGNORE_8BIT
 
 
@@ -29,7 +29,7 @@ def find_voxels(depth: Any, ray_x: Any, ray_y: Any, T: Any, size: float, origin:
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
     labels, of_row = np.zeros(W, dtype=np.uint8), np.empty(W, dtype=np.int64)
     for v in range(H):
-        _row_keys(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, IGNORE_8BIT, of_row)
+        exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, IGNORE_8BIT, of_row)
         for u in range(W):
             if of_row[u] < 0:
                 continue
