@@ -93,6 +93,10 @@ def takes_option(name: str, option: str) -> bool:
     """Whether the backend of that name has such an option, for example 'device'."""
     return option in _options(REGISTRY.load(name))
 
+def keeps_log(name: str) -> bool:
+    """Whether the backend of that name can give the log of its observations: with option `history`, or always."""
+    return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
+
 
 def expected_bytes(name: str, voxels: int, observations: int, num_classes: int) -> int:
     """Bytes that a backend's map of that size takes, roughly; 0 for one that does not say.

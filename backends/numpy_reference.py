@@ -27,6 +27,8 @@ from semstab.voxels import Events, VoxelTable, index_columns
 class NumpyReference:
     """Fusion as the paper writes it: clear before fast; memory grows with every observation."""
 
+    keeps_log = True
+
     def __init__(self, voxel_size: float, num_classes: int) -> None:
         check_settings(voxel_size, num_classes)
         self.voxel_size = voxel_size

@@ -6,12 +6,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from semstab import backbones, backends, datasets, metrics, statistics, study
+    from semstab import backbones, backends, datasets, engine, metrics, statistics
+    from semstab.api import run, run_study
     from semstab.config import Config
+    from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
     from semstab.frames import Frame, Intrinsics
     from semstab.labels import LabelSpace
-    from semstab.pipeline import run
+    from semstab.settings import load_config, load_study
     from semstab.voxels import Events, VoxelTable
 
 __version__ = "0.1.0"
@@ -30,10 +32,14 @@ __all__ = [
     "backbones",
     "backends",
     "datasets",
+    "engine",
+    "load_config",
+    "load_result",
+    "load_study",
     "metrics",
     "run",
+    "run_study",
     "statistics",
-    "study",
 ]
 
 _HOMES = {
@@ -47,13 +53,17 @@ _HOMES = {
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
     "VoxelTable": "voxels",
-    "run": "pipeline",
+    "load_config": "settings",
+    "load_result": "engine.folder",
+    "load_study": "settings",
+    "run": "api",
+    "run_study": "api",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import the public names when they are first used: `import semstab` stays instant."""
-    if name in ("backbones", "backends", "datasets", "metrics", "statistics", "study"):
+    if name in ("backbones", "backends", "datasets", "engine", "metrics", "statistics"):
         return importlib.import_module(f"semstab.{name}")
     if name in _HOMES:
         value = getattr(importlib.import_module(f"semstab.{_HOMES[name]}"), name)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from semstab.metrics import macro_mean, pool
 from semstab.results import Means
 from semstab.statistics import number_at
-from semstab.study.results import Record, StudyResult, Variation
+from semstab.records import Record, Result, Variation
 
 ENOUGH = 1000
 """Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its
@@ -173,14 +173,14 @@ def _unknown(name: str) -> Sweep:
     return Sweep(name, title, title.capitalize())
 
 
-def swept(result: StudyResult) -> list[Sweep]:
+def swept(result: Result) -> list[Sweep]:
     """The sweeps of a study that have values, in a fixed order."""
     present = result.sweeps()
     known = [sweep for sweep in _SWEEPS if sweep.name in present]
     return [*known, *(describe(name) for name in present if describe(name) not in known)]
 
 
-def levels(result: StudyResult, sweep: str, backbone: str, scene: str | None = None) -> tuple[Level, ...]:
+def levels(result: Result, sweep: str, backbone: str, scene: str | None = None) -> tuple[Level, ...]:
     """The values of a sweep, ascending, over the scenes that have all of them: else levels would differ by scenes."""
     scenes = complete_scenes(result, sweep, backbone)
     found: dict[float, dict[int, list[Record]]] = {}
@@ -194,7 +194,7 @@ def levels(result: StudyResult, sweep: str, backbone: str, scene: str | None = N
     )
 
 
-def complete_scenes(result: StudyResult, sweep: str, backbone: str) -> tuple[str, ...]:
+def complete_scenes(result: Result, sweep: str, backbone: str) -> tuple[str, ...]:
     """The scenes of a sweep that have each of its values and repeats."""
     points: dict[str, set[Variation]] = {}
     for record in result.select(sweep, backbone=backbone):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,11 +17,11 @@ from semstab.process import settle
 
 if TYPE_CHECKING:
     from semstab.config import Config
-    from semstab.pipeline import Observer
+    from semstab.engine import Executor
+    from semstab.engine.observer import Observer
+    from semstab.recording import Recording
+    from semstab.records import Result
     from semstab.registry import Registry
-    from semstab.results import RunResult
-    from semstab.study import StudyConfig, StudyResult
-    from semstab.study.executors import Executor
 
 DISAGREE, INTERRUPTED = 3, 130
 
@@ -42,6 +43,16 @@ Frames = Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="F
 TrustGeometry = Annotated[
     bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
 ]
+Rerun = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|spawn|connect|URL|serve|off",
+        help="Recording: a file, OUT/recording.rrd by default; and a viewer to start, to connect to, or to serve.",
+    ),
+]
+Report = Annotated[str, typer.Option(metavar="on|off", help="Write tables, figures and report.html.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.")]
+Scheduler = Annotated[str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 
 # --- Commands ---------------------------------------------------------------------------------------------------------
@@ -133,13 +144,10 @@ def run(
         typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; runs/TIME by default.")] = None,
-    rerun: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|spawn|connect|URL|serve|off",
-            help="Recording: a file, RUN/recording.rrd by default; and a viewer to start, to connect to, or to serve.",
-        ),
-    ] = None,
+    rerun: Rerun = None,
+    report: Report = "on",
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     predict: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME[,KEY=VALUE...]", help="Model that makes the labels, nothing on disk; repeatable."),
@@ -170,20 +178,15 @@ def run(
     resolved = _load(config, overrides, predict or [])
     if device is not None:
         resolved = _on_device(resolved, device)
-    result = _run(resolved, out or _default_out(), rerun, quiet)
-    if not result.agrees:
-        _say("error: the backends disagree; the agreement table and summary.json say where")
-        raise typer.Exit(DISAGREE)
+    _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)
 
 
 @app.command()
 def study(
     file: Annotated[str, typer.Argument(metavar="FILE", help="Study file, or a shipped study: see `list`.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; studies/NAME by default.")] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.")] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.")
-    ] = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     only: Annotated[
         list[str] | None, typer.Option(metavar="PART", help="A sweep, shared_taxonomy or backends; repeatable.")
     ] = None,
@@ -191,23 +194,18 @@ def study(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
     ] = None,
+    rerun: Rerun = "off",
+    report: Report = "on",
     trust_geometry: TrustGeometry = False,
     quiet: Quiet = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
-    from semstab.study import load_study
+    from semstab.settings import load_study
 
     config = load_study(file, _overrides({"check_geometry": False if trust_geometry else None}, settings or []))
     if only is not None:
         config = config.only(only)
-    executor = _executor(jobs, scheduler)
-    out = out or Path("studies") / config.name
-    result = _study(config, out, executor, quiet)
-    if result.failures:
-        raise typer.Exit(2)
-    if not all(row.agrees for row in result.agreement):
-        _say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
-        raise typer.Exit(DISAGREE)
+    _execute(config, out or Path("studies") / config.name, _executor(jobs, scheduler), rerun, report, quiet)
 
 
 @app.command()
@@ -328,7 +326,7 @@ def list_() -> None:
 
     from semstab import backbones, backends, datasets
     from semstab.labels import LabelSpace, shipped_taxonomies
-    from semstab.study import load_study, shipped_studies
+    from semstab.settings import load_study, shipped_studies
 
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "what it is"):
@@ -355,45 +353,10 @@ def _ready(registry: Registry, name: str) -> str:
     return "[green]ready"
 
 
-def _run(config: Config, out: Path, rerun: str | None, quiet: bool) -> RunResult:
-    from rich.console import Console
-
-    from semstab import pipeline
-    from semstab.terminal import ProgressBar, print_summary
-
-    progress = ProgressBar(Console(stderr=True, quiet=quiet))
-    observers: list[Observer] = [progress]
-    closing: list[Any] = [progress]
-    recording = None
-    if rerun != "off":
-        from semstab.recording import Recording, Target
-
-        recording = Recording(Target.parse(rerun, out / "recording.rrd"), run=out)
-        observers.append(recording)
-        closing.append(recording)
-    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
-    try:
-        result = pipeline.run(config, out=out, observers=observers, command=sys.argv)
-        if not quiet:
-            console = Console()
-            print_summary(result, console)
-            console.print(f"run folder: {out}", soft_wrap=True)
-            if recording is not None:
-                file = recording.target.file
-                shown = out if file == out / "recording.rrd" else file
-                console.print(f"recording: semstab-bench view {shown}", soft_wrap=True)
-        if recording is not None:
-            recording.serve()
-    finally:
-        for observer in closing:
-            observer.close()
-    return result
-
-
 def _executor(jobs: int, scheduler: str | None) -> Executor:
     import logging
 
-    from semstab.study import DaskCluster, InProcess, LocalProcesses
+    from semstab.engine import DaskCluster, InProcess, LocalProcesses
 
     if scheduler is None:
         return LocalProcesses(jobs) if jobs > 1 else InProcess()
@@ -404,38 +367,65 @@ def _executor(jobs: int, scheduler: str | None) -> Executor:
     return cluster
 
 
-def _study(config: StudyConfig, out: Path, executor: Executor, quiet: bool) -> StudyResult:
+def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
+    """Run it, say what was found, and end with the exit code that this calls for."""
     from rich.console import Console
 
-    from semstab.plots import write_figures
-    from semstab.report import write_report
-    from semstab.study import run_study
-    from semstab.study.progress import StudyProgress, failure_lines
-    from semstab.tables import write_tables
+    from semstab.api import run_study
+    from semstab.progress import ProgressBar, failure_lines
     from semstab.terminal import print_summary
 
-    progress = StudyProgress(Console(stderr=True, quiet=quiet))
+    if report not in ("on", "off"):
+        raise ConfigError(f"--report {report}: write on or off")
+    recording = _recording(rerun, out)
+    observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
+    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
     try:
-        result = run_study(config, out, executor=executor, observers=[progress], command=sys.argv)
+        result = run_study(
+            config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on"
+        )
+        for line in failure_lines(result):
+            _say(f"error: {line}")
+        if not quiet:
+            console = Console()
+            if result.select():
+                print_summary(result, console)
+            for line in _where(result, out, recording, report):
+                console.print(line, soft_wrap=True, markup=False, highlight=False)
+        for each in recording:
+            each.serve()
     finally:
-        progress.close()
-    for line in failure_lines(result):
-        _say(f"error: {line}")
-    if result.records:
-        for write in (write_tables, write_figures, write_report):
-            write(result, out)
-    if not quiet:
-        console = Console()
-        if result.select():
-            print_summary(result.base_runs(), console)
-        console.print(f"study folder: {out}", soft_wrap=True)
-    return result
+        for observer in observers:
+            observer.close()
+    if result.failures:
+        raise typer.Exit(2)
+    if not result.agrees:
+        _say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
+        raise typer.Exit(DISAGREE)
+
+
+def _recording(rerun: str | None, out: Path) -> list[Recording]:
+    if rerun == "off":
+        return []
+    from semstab.recording import Recording, Target
+
+    return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
+
+
+def _where(result: Result, out: Path, recording: list[Recording], report: str) -> Iterator[str]:
+    """Where to find what."""
+    yield f"folder: {out}"
+    if report == "on" and result.select():
+        yield f"report: {out / 'report.html'}"
+    for each in recording:
+        file = each.target.file
+        yield f"recording: semstab-bench view {out if file == out / 'recording.rrd' else file}"
 
 
 def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> Config:
     """The configuration; with models whose predictions take the place of the dataset's labels."""
     if not predict:
-        from semstab.plan import load_config
+        from semstab.settings import load_config
 
         return load_config(path, overrides)
     from semstab.predict import parse_predictor, predicted_config
@@ -489,7 +479,7 @@ def _selection(
     frames: str | None,
 ) -> Config:
     """The resolved configuration of a file and options that select data."""
-    from semstab.plan import load_config, resolve
+    from semstab.settings import load_config, resolve
 
     overrides = _overrides(named, settings or [])
     _select_dataset(overrides, dataset, data, None)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from semstab.averages import ENOUGH, Level, Pooled, Sweep, complete_scenes, describe, levels, pooled
-from semstab.study.results import StudyResult
+from semstab.records import Result
 
 VISIBLE_VSS = 0.001
 """A difference of VSS counts from one unit of the last decimal of the paper's main tables on."""
@@ -97,7 +97,7 @@ class Finding:
         return Verdict.SHOWN if shown == tested else Verdict.NOT_SHOWN
 
 
-def findings(result: StudyResult) -> tuple[Finding, ...]:
+def findings(result: Result) -> tuple[Finding, ...]:
     """The four findings, in the paper's order."""
     return (_disagreement(result), _drift(result), _association(result), _sampling(result))
 
@@ -105,7 +105,7 @@ def findings(result: StudyResult) -> tuple[Finding, ...]:
 # --- Recurrent voxels disagree more than the aggregate says -----------------------------------------------------------
 
 
-def _disagreement(result: StudyResult) -> Finding:
+def _disagreement(result: Result) -> Finding:
     return Finding(
         "disagreement",
         "Recurrent voxels disagree more than the aggregate says.",
@@ -129,7 +129,7 @@ def more_disagreement(voxels: Pooled) -> Outcome:
 # --- Mean SBD falls with OP -------------------------------------------------------------------------------------------
 
 
-def _drift(result: StudyResult) -> Finding:
+def _drift(result: Result) -> Finding:
     return Finding(
         "drift",
         "Mean SBD falls with OP.",
@@ -155,7 +155,7 @@ def falling_drift(voxels: Pooled) -> Outcome:
 # --- Finer voxels and geometric noise raise aggregate VSS while lowering the recurrent share --------------------------
 
 
-def _association(result: StudyResult) -> Finding:
+def _association(result: Result) -> Finding:
     return Finding(
         "association",
         "Finer voxels and geometric noise raise aggregate VSS while lowering the share of recurrent voxels.",
@@ -196,7 +196,7 @@ def less_association(sweep: Sweep, found: Sequence[Level]) -> Outcome:
 # --- Denser sampling lowers aggregate VSS while recurrent VSS hardly moves --------------------------------------------
 
 
-def _sampling(result: StudyResult) -> Finding:
+def _sampling(result: Result) -> Finding:
     return Finding(
         "sampling",
         "Denser sampling lowers aggregate VSS while recurrent VSS hardly moves.",
@@ -230,13 +230,13 @@ def denser_sampling(sweep: Sweep, found: Sequence[Level]) -> Outcome:
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 
-def _base_evidence(result: StudyResult, backbone: str, test: Callable[[Pooled], Outcome]) -> Evidence:
+def _base_evidence(result: Result, backbone: str, test: Callable[[Pooled], Outcome]) -> Evidence:
     records = result.select(backbone=backbone)
     return _evidence(backbone, test(pooled(records)), [test(pooled([record])) for record in records])
 
 
 def _sweep_evidence(
-    result: StudyResult, sweeps: Sequence[str], test: Callable[[Sweep, Sequence[Level]], Outcome], nothing: str
+    result: Result, sweeps: Sequence[str], test: Callable[[Sweep, Sequence[Level]], Outcome], nothing: str
 ) -> tuple[Evidence, ...]:
     """For each sweep and backbone; one row a backbone that says so where nothing was swept."""
     found = []

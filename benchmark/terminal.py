@@ -1,4 +1,4 @@
-"""What a run looks like in the terminal: progress while it works, and the summary at its end."""
+"""The summary of a run or a study in the terminal."""
 
 from __future__ import annotations
 
@@ -7,65 +7,22 @@ from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from semstab.check import Verdict
-from semstab.frames import Frame
 from semstab.metrics import macro_mean, pool
-from semstab.pipeline import Observer
-from semstab.plan import Plan, Task
-from semstab.results import STAGES, Agreement, GroupResult, Means, RunResult, Unit, UnitSummary
-from semstab.run_folder import FrameRow
+from semstab.config import BACKENDS
+from semstab.records import Result
+from semstab.results import STAGES, Agreement, Means, UnitSummary
 
 NOTHING = "-"
 
 
-class ProgressBar(Observer):
-    """One bar for the whole run, in frames fused."""
-
-    def __init__(self, console: Console) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
-        self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
-        self.work = self.bar.add_task("starting", total=None)
-        self.notes: list[str] = []
-
-    def run_started(self, plan: Plan) -> None:
-        """Show the bar: every unit's frames are its total."""
-        self.bar.update(self.work, total=sum(len(task.indices) * len(task.backends) for task in plan.tasks))
-        self.bar.start()
-
-    def geometry_checked(self, task: Task, verdict: Verdict) -> None:
-        """Remember, until the run is through, what could not be told."""
-        if verdict.state == "unclear":
-            self.notes.append(f"{task.scene.name}: {verdict.text}")
-
-    def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
-        """One frame further."""
-        self.bar.update(self.work, advance=1, description=f"{unit.scene} · {unit.backbone} · {unit.backend}")
-
-    def group_kept(self, task: Task, result: GroupResult) -> None:
-        """Work that was found finished."""
-        self.bar.update(self.work, advance=len(task.indices) * len(task.backends))
-        self.bar.console.print(f"kept from before: {task.scene.name}, {task.backbone}", style="dim")
-
-    def run_finished(self, result: RunResult) -> None:
-        """Take the bar away, and say what could not be told."""
-        self.close()
-        for note in self.notes:
-            self.bar.console.print(note, style="dim", soft_wrap=True)
-
-    def close(self) -> None:
-        """Take the bar away, also where the run was interrupted."""
-        self.bar.stop()
-
-
-def print_summary(result: RunResult, console: Console) -> None:
+def print_summary(result: Result, console: Console) -> None:
     """The scene table, the strata, the agreement of the backends, and how to read them."""
-    shown = _first_backend(result)
+    shown = [record.summary for record in result.select()]
     console.print(_scene_table(shown))
     console.print(_strata_table(shown))
-    if len({run.unit.backend for run in result.runs}) > 1:
+    if result.agreement:
         console.print(_agreement_table(result.agreement))
     console.print(_stages_line(shown), soft_wrap=True)
     for line in _verdict_lines(result):
@@ -77,11 +34,13 @@ def print_summary(result: RunResult, console: Console) -> None:
     )
 
 
-def _verdict_lines(result: RunResult) -> Iterator[str]:
+def _verdict_lines(result: Result) -> Iterator[str]:
     """The verdict on each backbone, scene by scene, from the fullest statistics that a backend of the run has."""
-    several = len(_scenes(result.runs)) > 1
-    for group in result.groups:
-        judged = [run for run in group.runs if run.statistics]
+    several = len(result.scenes) > 1
+    units = [record.summary for record in (*result.select(), *result.select(BACKENDS))]
+    for base in result.select():
+        group = (base.unit.scene, base.unit.backbone)
+        judged = [run for run in units if (run.unit.scene, run.unit.backbone) == group and run.statistics]
         if judged:
             fullest = max(judged, key=lambda run: sum(section is not None for section in run.statistics.values()))
             scene = f"{fullest.unit.scene}, " if several else ""
@@ -90,11 +49,6 @@ def _verdict_lines(result: RunResult) -> Iterator[str]:
 
 def _once(run: UnitSummary) -> int:
     return sum(row.voxels for row in run.table.strata if row.name == "OP=1")
-
-
-def _first_backend(result: RunResult) -> list[UnitSummary]:
-    """The units of the backend that was named first: where backends agree, the others say the same."""
-    return [group.runs[0] for group in result.groups]
 
 
 def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:

@@ -33,7 +33,7 @@ from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.plan import selected
+from semstab.task import selected
 from semstab.prefetch import prefetch
 
 SCHEMA = 1

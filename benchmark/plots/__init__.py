@@ -17,7 +17,7 @@ from semstab.plots.maps import Overview, draw_overview, draw_stability
 from semstab.plots.style import Figure
 from semstab.plots.sweeps import draw_sweep
 from semstab.results import slug
-from semstab.study.results import OVERVIEW, Record, StudyResult
+from semstab.records import OVERVIEW, Record, Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -28,7 +28,7 @@ Histograms = Mapping[str, Mapping[str, Histogram]]
 """By backbone and scene."""
 
 
-def write_figures(result: StudyResult, folder: str | Path) -> list[Path]:
+def write_figures(result: Result, folder: str | Path) -> list[Path]:
     """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
 
     Other figures there are removed.
@@ -39,7 +39,7 @@ def write_figures(result: StudyResult, folder: str | Path) -> list[Path]:
     return written
 
 
-def figures(result: StudyResult, folder: str | Path) -> list[Figure]:
+def figures(result: Result, folder: str | Path) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
     kept = [record for record in result.select() if record.voxels is not None]
     return [
@@ -51,7 +51,7 @@ def figures(result: StudyResult, folder: str | Path) -> list[Figure]:
     ]
 
 
-def _overviews(result: StudyResult, kept: list[Record], folder: Path) -> Iterator[Figure]:
+def _overviews(result: Result, kept: list[Record], folder: Path) -> Iterator[Figure]:
     """One a backbone, of the first scene that has a saved frame."""
     for backbone, records in by_backbone(kept).items():
         for record in records:
@@ -111,7 +111,7 @@ def _distributions(kept: list[Record]) -> Iterator[Figure]:
     )
 
 
-def _maps(result: StudyResult, kept: list[Record]) -> Iterator[Figure]:
+def _maps(result: Result, kept: list[Record]) -> Iterator[Figure]:
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
         if scene in result.up:
@@ -131,7 +131,7 @@ def _draw_map(record: Record, up: tuple[float, float, float]) -> Canvas:
     return draw_stability(record.table(), up)
 
 
-def _sweeps(result: StudyResult) -> Iterator[Figure]:
+def _sweeps(result: Result) -> Iterator[Figure]:
     for sweep in swept(result):
         backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
         if backbones:

@@ -16,7 +16,7 @@ from semstab.plots.style import Figure
 from semstab.results import slug
 from semstab.statistics import estimate_at, expected_sbd
 from semstab.statistics.verdict import RELIABLE, TENTATIVE
-from semstab.study.results import Record, StudyResult
+from semstab.records import Record, Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -25,7 +25,7 @@ MEASURES = {"psa": "PSA", "alpha": "alpha", "vss": "VSS", "accuracy": "accuracy"
 """Those of a comparison that are drawn: higher is better for all."""
 
 
-def statistics_figures(result: StudyResult, kept: Sequence[Record]) -> list[Figure]:
+def statistics_figures(result: Result, kept: Sequence[Record]) -> list[Figure]:
     """Every one for which the study has records; `kept` are the base ones whose voxels were kept."""
     judged = [record for record in result.select() if record.statistics]
     return [
@@ -98,7 +98,7 @@ def _reliability(judged: Sequence[Record]) -> Iterator[Figure]:
         )
 
 
-def _comparison(result: StudyResult) -> Iterator[Figure]:
+def _comparison(result: Result) -> Iterator[Figure]:
     panels: dict[str, dict[str, dict[str, Any]]] = {}
     for found in result.comparisons:
         for row in found["paired"]["differences"]:
@@ -119,7 +119,7 @@ def _comparison(result: StudyResult) -> Iterator[Figure]:
         )
 
 
-def _maps(result: StudyResult, kept: Sequence[Record]) -> Iterator[Figure]:
+def _maps(result: Result, kept: Sequence[Record]) -> Iterator[Figure]:
     """Of the studies that were asked for statistics: they kept what the maps show beside the voxels."""
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
@@ -152,7 +152,7 @@ def _column(record: Record, name: str) -> npt.NDArray[Any] | None:
     return values
 
 
-def _sweeps(result: StudyResult) -> Iterator[Figure]:
+def _sweeps(result: Result) -> Iterator[Figure]:
     for sweep in swept(result):
         by_name = {name: levels(result, sweep.name, name) for name in result.backbones}
         found = {name: rows for name, rows in by_name.items() if any(level.judged for level in rows)}

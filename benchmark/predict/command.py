@@ -13,7 +13,7 @@ from rich.console import Console
 
 from semstab.config import FrameSelection, explain
 from semstab.errors import ConfigError
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 from semstab.predict.jobs import Job, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor
 from semstab.predict.sequence import SequenceOptions, SequenceReport, predict_sequence

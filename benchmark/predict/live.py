@@ -20,7 +20,7 @@ from semstab.datasets import GROUND_TRUTH, Timed, Tracked
 from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 from semstab.predict.predictor import PredictorConfig, load_predictor
 from semstab.predict.sources import ImageScene, open_images
 

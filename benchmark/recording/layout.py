@@ -14,7 +14,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
-from semstab.plan import Plan, Task
+from semstab.task import Task
+from semstab.engine.units import Plan
 from semstab.recording import legend
 from semstab.recording.entities import path
 from semstab.recording.series import SERIES, entity

@@ -7,7 +7,7 @@ import functools
 import logging
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ import rerun as rr
 
 from semstab.frames import Frame
 from semstab.metrics import compensated_flicker
-from semstab.pipeline import Observer
-from semstab.plan import Plan, Task
+from semstab.engine.observer import Observer
+from semstab.task import Task
+from semstab.engine.units import Plan, Planned
 from semstab.recording import legend, series
 from semstab.recording.background import Background
 from semstab.recording.camera import (
@@ -37,8 +38,9 @@ from semstab.recording.layout import Known, Scenery, blueprint, drawn, is_pointw
 from semstab.recording.target import DEFAULT_URL, Target
 from semstab.recording.tracker import FrameDrift, Tracker
 from semstab.recording.voxel_maps import CHUNKS, GrowingMap, chunks_of
-from semstab.results import GroupResult, RunResult, Unit, UnitSummary
-from semstab.run_folder import FrameRow
+from semstab.records import Result
+from semstab.results import Unit, UnitSummary
+from semstab.engine.series import FrameRow
 from semstab.voxels import VoxelTable
 
 SAMPLING = 2
@@ -71,7 +73,7 @@ class Recording(Observer):
         self._tasks: dict[tuple[str, str], Task] = {}
         self._stream: rr.RecordingStream | None = None
         self._clock = Clock()
-        self._kept: list[tuple[Task, GroupResult]] = []  # not logged yet
+        self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
         self._cameras: dict[str, Camera] = {}
         self._known = Known()
@@ -79,7 +81,7 @@ class Recording(Observer):
         self._group: _Group | None = None  # the backbone on a scene that is being fused
         self._background: Background | None = None
 
-    def run_started(self, plan: Plan) -> None:
+    def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
         """Keep the plan: layout, names and colours follow from it."""
         self._plan = plan
         self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
@@ -87,7 +89,7 @@ class Recording(Observer):
         self._known.chunks = {task.scene.name: first for task in plan.tasks}
 
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
-        """Log the unit's row of the time series; with the frame's last unit, what the camera and the map show."""
+        """Log the unit's row of the time series."""
         stream = self._opened()
         task = self._tasks[unit.scene, unit.backbone]
         self._clock.set(stream, frame.index, frame.timestamp)
@@ -98,13 +100,17 @@ class Recording(Observer):
         series.log_row(stream, unit, task, values)
         self._group.span(values)
         self._group.follow(row)
-        if unit.backend == task.backends[-1]:
-            assert self._background is not None
-            self._cameras[unit.scene].log(stream, frame, self._background)
-            self._group.log(stream, frame, self._background)
-            if chunks_of(self._group.grown) > self._known.chunks[unit.scene]:
-                show = functools.partial(self._show_chunks, stream, unit.scene, self._group.grown)
-                self._background.submit(frame.index, frame.timestamp, show)
+
+    def frame_finished(self, task: Task, frame: Frame) -> None:
+        """Log what the camera and the map show."""
+        stream, group, scene = self._opened(), self._group, task.scene.name
+        assert group is not None
+        assert self._background is not None
+        self._cameras[scene].log(stream, frame, self._background)
+        group.log(stream, frame, self._background)
+        if chunks_of(group.grown) > self._known.chunks[scene]:
+            show = functools.partial(self._show_chunks, stream, scene, group.grown)
+            self._background.submit(frame.index, frame.timestamp, show)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """Log the unit's voxels and flips, while they are measured; the time is that of its last frame."""
@@ -113,9 +119,6 @@ class Recording(Observer):
         assert background is not None
         tolerance = self._plan.config.tolerance
         background.submit(*group.last, functools.partial(group.log_map, stream, unit, table, tolerance))
-        if unit.backend == group.task.backends[-1]:
-            background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
-            background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
 
     def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
         """Log the unit's final numbers."""
@@ -126,13 +129,23 @@ class Recording(Observer):
         self._clock.set(stream, *group.last)
         self._log_numbers(stream, group, summary)
 
-    def group_kept(self, task: Task, result: GroupResult) -> None:
-        """Log the units' series and voxels from the run folder: their pictures are not in this recording."""
-        self._kept.append((task, result))
+    def group_finished(self, task: Task) -> None:
+        """Log what flipped, and lay out what there is now."""
+        stream, group, background = self._opened(), self._group, self._background
+        if group is None or background is None or not group.tables:
+            return
+        (*_, table) = group.tables.values()
+        background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
+        background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
+        background.drain()
+
+    def group_kept(self, task: Task, summaries: Sequence[UnitSummary]) -> None:
+        """Log the units' series and voxels from the folder: their pictures are not in this recording."""
+        self._kept.append((self._tasks[task.scene.name, task.backbone], summaries))
         if self._stream is not None:
             self._log_kept(self._stream)
 
-    def run_finished(self, result: RunResult) -> None:
+    def run_finished(self, result: Result) -> None:
         """Finish the file; where the recording is served, `serve` or `close` does that."""
         if not self.target.file.exists():
             self._opened()
@@ -205,9 +218,9 @@ class Recording(Observer):
 
     def _log_kept(self, stream: rr.RecordingStream) -> None:
         kept, self._kept = self._kept, []
-        for task, result in kept:
+        for task, summaries in kept:
             group: _Group | None = None
-            for summary in result.runs:
+            for summary in summaries:
                 self._clock.set(stream, task.indices[-1])
                 if self._run is None:
                     text = (
@@ -256,7 +269,8 @@ class _Group:
         self._followed = False  # the frame went into a map of the run that the tracker follows
         self._flips = FlipLog()
         self._maps: dict[str, GrowingMap] = {}
-        self._tables: dict[str, VoxelTable] = {}
+        self.tables: dict[str, VoxelTable] = {}
+        """By backend, as they are finished."""
         self._previous: Frame | None = None
         self._entity = path(task.scene.name, "camera", task.backbone)
         self._overlay = Overlay()
@@ -307,10 +321,10 @@ class _Group:
     def log_map(self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float) -> None:
         """Log a unit's final voxels, and where they differ from those of the drawn unit."""
         first = drawn(self.task)
-        self._tables[unit.backend] = table
+        self.tables[unit.backend] = table
         self.voxels = max(self.voxels, len(table))
-        if first in self._tables:
-            for backend in self._tables if unit.backend == first else [unit.backend]:
+        if first in self.tables:
+            for backend in self.tables if unit.backend == first else [unit.backend]:
                 self._compare(stream, first, backend, tolerance)
         self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
 
@@ -326,7 +340,7 @@ class _Group:
             return
         scene, backbone = self.task.scene.name, self.task.backbone
         entity = path(scene, "difference", backbone, f"{first} and {second}")
-        tables = {name: self._tables[name] for name in (first, second)}
+        tables = {name: self.tables[name] for name in (first, second)}
         found = log_difference(stream, entity, tables, self.origin, tolerance)
         stream.log(path(scene, "log"), rr.TextLog(f"{backbone}: {found}"))
         report = rr.TextDocument(f"{found}.", media_type=rr.MediaType.MARKDOWN)

@@ -10,7 +10,8 @@ from typing import Any
 import rerun as rr
 
 from semstab.errors import DataError
-from semstab.plan import Plan, Task
+from semstab.task import Task
+from semstab.engine.units import Plan
 from semstab.recording.entities import Clock, path
 from semstab.results import RECURRENT, Unit
 

@@ -1,4 +1,4 @@
-"""report.html: what a study found, on one page that needs no other file, no script and no network."""
+"""report.html: what a run or a study found, on one page that needs no other file, no script and no network."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from typing import Any
 
 from semstab import plots
 from semstab.averages import describe
+from semstab.engine.observer import Observer
 from semstab.files import write_text
 from semstab.findings import Finding, findings
 from semstab.plots.style import COLUMN, DPI, Figure
 from semstab.report.reading import reading
 from semstab.results import slug
-from semstab.study.results import Failure, StudyResult
-from semstab.tables import Table, tables
+from semstab.records import Failure, Result
+from semstab.tables import Table, tables, write_tables
 from semstab.tables.writers import ARROWS, relations, sections
 
-__all__ = ["write_report"]
+__all__ = ["Reporting", "write_report"]
 
 SCREEN_DPI = 200
 """Dense images are embedded with that many pixels an inch and in 256 colours: a quarter of the file's size."""
@@ -32,7 +33,21 @@ CSS_INCH = 122
 """Pixels of the page an inch of a figure: its smallest type then is as large as the text of the tables."""
 
 
-def write_report(result: StudyResult, folder: str | Path) -> list[Path]:
+class Reporting(Observer):
+    """Writes tables, figures and report.html into the folder when all has been computed."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self._folder = Path(folder)
+
+    def run_finished(self, result: Result) -> None:
+        """Write them; nothing where every unit failed."""
+        if result.select():
+            write_tables(result, self._folder)
+            plots.write_figures(result, self._folder)
+            write_report(result, self._folder)
+
+
+def write_report(result: Result, folder: str | Path) -> list[Path]:
     """Write FOLDER/report.html; return its path.
 
     Figures are taken from FOLDER/figures, where `semstab.plots.write_figures` puts them; one that is missing is drawn.
@@ -42,7 +57,7 @@ def write_report(result: StudyResult, folder: str | Path) -> list[Path]:
     return [path]
 
 
-def render(result: StudyResult, folder: Path) -> str:
+def render(result: Result, folder: Path) -> str:
     """The page."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -184,7 +199,7 @@ TOPICS = (
 )
 
 
-def _topics(result: StudyResult, folder: Path) -> Iterator[dict[str, Any]]:
+def _topics(result: Result, folder: Path) -> Iterator[dict[str, Any]]:
     """The sections for which the study has tables or figures."""
     all_tables, all_figures = tables(result), plots.figures(result, folder)
     for topic in TOPICS:
@@ -201,7 +216,7 @@ def _topics(result: StudyResult, folder: Path) -> Iterator[dict[str, Any]]:
             }
 
 
-def _unfolded(shown: Sequence[Figure], result: StudyResult) -> tuple[list[Figure], list[Figure]]:
+def _unfolded(shown: Sequence[Figure], result: Result) -> tuple[list[Figure], list[Figure]]:
     """The first figure of each kind and backbone, and the rest."""
     first: dict[tuple[str, str], Figure] = {}
     for figure in shown:
@@ -311,7 +326,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _subtitle(result: StudyResult) -> str:
+def _subtitle(result: Result) -> str:
     counts = [(len(result.scenes), "scene"), (len(result.backbones), "backbone"), (len(result.records), "unit")]
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     return " · ".join([*parts, f"fused by {result.backend}"])

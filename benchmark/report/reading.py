@@ -9,11 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from semstab.averages import ENOUGH, Pooled, by_backbone, pooled
 from semstab.findings import Finding
 from semstab.metrics import macro_mean
-from semstab.study.results import Record, StudyResult
+from semstab.records import Record, Result
 from semstab.tables.stability import comparable
 
 
-def reading(result: StudyResult, found: Sequence[Finding]) -> list[str]:
+def reading(result: Result, found: Sequence[Finding]) -> list[str]:
     """The summary of a study for somebody who will not read its tables."""
     records = result.select()
     if not records:
@@ -61,7 +61,7 @@ def _verdict(records: Sequence[Record]) -> Iterator[str]:
         yield f"Verdict on {judged[0].unit.backbone}: {', '.join(parts)}."
 
 
-def _ranking(result: StudyResult) -> Iterator[str]:
+def _ranking(result: Result) -> Iterator[str]:
     """Does the order of the backbones change where only recurrent voxels count?"""
     records = comparable(result)
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
@@ -114,7 +114,7 @@ def _findings(found: Sequence[Finding]) -> Iterator[str]:
         yield f"The paper's findings here: {'; '.join(parts)}."
 
 
-def _implementations(result: StudyResult) -> Iterator[str]:
+def _implementations(result: Result) -> Iterator[str]:
     """Which fusion implementations leave the base one's maps."""
     rows = {
         name: [row.agrees for row in result.agreement if row.backends == (result.backend, name)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from semstab.files import keep_only, write_json, write_text
-from semstab.study.results import StudyResult
+from semstab.records import Result
 from semstab.tables.comparison import comparison
 from semstab.tables.correctness import ceiling, correctness, rules
 from semstab.tables.fusion import agreement, fusion
@@ -37,12 +37,12 @@ BUILDERS = (
 """In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
 
 
-def tables(result: StudyResult) -> list[Table]:
+def tables(result: Result) -> list[Table]:
     """Every table that the study has records for, in the paper's order."""
     return [table for build in BUILDERS for table in build(result)]
 
 
-def write_tables(result: StudyResult, folder: str | Path) -> list[Path]:
+def write_tables(result: Result, folder: str | Path) -> list[Path]:
     """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, in place of all others there; return the paths."""
     written = []
     for table in tables(result):

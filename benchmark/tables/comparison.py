@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from semstab.statistics import estimate_at, number_at
-from semstab.study.results import StudyResult
+from semstab.records import Result
 from semstab.tables.table import Column, Group, Row, Table
 
 MEASURES = {
@@ -21,12 +21,12 @@ _COMMON = "On the voxels that every backbone saw twice or more."
 _INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
 
 
-def comparison(result: StudyResult) -> list[Table]:
+def comparison(result: Result) -> list[Table]:
     """Paired differences, ranking, and what each map covers; one group a scene."""
     return [_differences(result), _ranking(result), _coverage(result)] if result.comparisons else []
 
 
-def _differences(result: StudyResult) -> Table:
+def _differences(result: Result) -> Table:
     columns = (
         Column("a", "Backbone"),
         Column("b", "less backbone"),
@@ -50,7 +50,7 @@ def _difference_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
     )
 
 
-def _ranking(result: StudyResult) -> Table:
+def _ranking(result: Result) -> Table:
     columns = (
         Column("measure", "Measure"),
         Column("rank", "Rank", 0),
@@ -88,7 +88,7 @@ def _ranking_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
     return tuple(rows)
 
 
-def _coverage(result: StudyResult) -> Table:
+def _coverage(result: Result) -> Table:
     columns = (
         Column("backbone", "Backbone"),
         Column("voxels", "Voxels", 0),

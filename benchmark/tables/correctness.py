@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from semstab.statistics import number_at
-from semstab.study.results import Record, StudyResult
+from semstab.records import Record, Result
 from semstab.tables.stability import settings
 from semstab.tables.statistics import (
     INTERVALS,
@@ -22,7 +22,7 @@ from semstab.tables.statistics import (
 from semstab.tables.table import Column, Group, Row, Table
 
 
-def ceiling(result: StudyResult) -> list[Table]:
+def ceiling(result: Result) -> list[Table]:
     """Disagreement that the ground truth's labels have too, and the rest."""
     columns = (
         Column("disagreement", "1 - PSA", 4, "lower"),
@@ -44,12 +44,12 @@ def ceiling(result: StudyResult) -> list[Table]:
     return by_scene(result, "ceiling", "Geometry or model", caption, columns, numbers, "geometry")
 
 
-def correctness(result: StudyResult) -> list[Table]:
+def correctness(result: Result) -> list[Table]:
     """Right beside stable: by stratum of OP, and the four quadrants."""
     return [*_correct_by_stratum(result), *_quadrants(result)]
 
 
-def _correct_by_stratum(result: StudyResult) -> list[Table]:
+def _correct_by_stratum(result: Result) -> list[Table]:
     judged = judged_records(result, "correctness")
     if not judged:
         return []
@@ -70,7 +70,7 @@ def _correct_by_stratum(result: StudyResult) -> list[Table]:
     return [Table("correctness", "Right beside stable, by observation persistence", caption, columns, groups)]
 
 
-def _quadrants(result: StudyResult) -> list[Table]:
+def _quadrants(result: Result) -> list[Table]:
     columns = (
         Column("voxels", "Voxels", 0),
         Column("stable_right_percent", "right", 1, "higher", over="Stable (%)"),
@@ -90,7 +90,7 @@ def _quadrants(result: StudyResult) -> list[Table]:
     return by_scene(result, "quadrants", "Stable and right", caption, columns, numbers, "correctness")
 
 
-def rules(result: StudyResult) -> list[Table]:
+def rules(result: Result) -> list[Table]:
     """Other rules of fusion applied to the same log of observations, macro means over scenes."""
     judged = judged_records(result, "fusion_rules")
     if not judged:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from semstab.averages import Pooled, pooled
 from semstab.results import Agreement
-from semstab.study.results import BACKENDS, Record, StudyResult
+from semstab.config import BACKENDS
+from semstab.records import Record, Result
 from semstab.tables.stability import SBD_OVER, settings
 from semstab.tables.table import Column, Group, Row, Table
 
@@ -28,7 +29,7 @@ COLUMNS = (
 )
 
 
-def fusion(result: StudyResult) -> list[Table]:
+def fusion(result: Result) -> list[Table]:
     """Each backend beside the base one, over the scenes that every backend fused."""
     groups = tuple(group for name in result.backbones if (group := _group(result, name)) is not None)
     if not groups:
@@ -40,7 +41,7 @@ def fusion(result: StudyResult) -> list[Table]:
     return [Table("fusion", "Fusion implementations", caption, COLUMNS, groups)]
 
 
-def agreement(result: StudyResult) -> list[Table]:
+def agreement(result: Result) -> list[Table]:
     """How far each backend's map agrees with the base one's, voxel by voxel."""
     if not result.agreement:
         return []
@@ -65,7 +66,7 @@ def _agreement_row(row: Agreement) -> Row:
     return row.scene, row.backbone, sum(row.only_in), *largest, "agree" if row.agrees else "disagree"
 
 
-def _group(result: StudyResult, backbone: str) -> Group | None:
+def _group(result: Result, backbone: str) -> Group | None:
     others = result.select(BACKENDS, backbone=backbone)
     by_backend: dict[str, dict[str, Record]] = {}
     for record in (*result.select(backbone=backbone), *others):

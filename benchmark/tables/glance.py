@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from semstab.averages import by_backbone, pooled
 from semstab.metrics import macro_mean
-from semstab.study.results import Record, StudyResult
+from semstab.records import Record, Result
 from semstab.tables.stability import SBD_OVER, settings
 from semstab.tables.table import Column, Group, Row, Table
 
@@ -23,7 +23,7 @@ _COLUMNS = (
 )
 
 
-def glance(result: StudyResult) -> list[Table]:
+def glance(result: Result) -> list[Table]:
     """One row a backbone."""
     records = result.select()
     if not records:

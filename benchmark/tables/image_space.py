@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from semstab.metrics import macro_mean
-from semstab.study.results import ImageSpace, StudyResult
+from semstab.records import ImageSpace, Result
 from semstab.tables.table import Column, Group, Row, Table
 
 _NUMBERS = (
@@ -29,7 +29,7 @@ _REGIONS = (
 )
 
 
-def flicker(result: StudyResult) -> list[Table]:
+def flicker(result: Result) -> list[Table]:
     """Frame-wise flicker, macro means by backbone, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
     methods = _by_method(result)
     if not methods:
@@ -49,7 +49,7 @@ def flicker(result: StudyResult) -> list[Table]:
     return tables
 
 
-def _by_method(result: StudyResult) -> dict[str, dict[str, ImageSpace]]:
+def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
     """By backbone and scene; regions without classes have flicker only."""
     methods: dict[str, dict[str, ImageSpace]] = {}
     for record in result.select():

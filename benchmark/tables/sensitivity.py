@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from semstab.averages import ENOUGH, Level, Sweep, complete_scenes, levels, swept
-from semstab.study.results import StudyResult
+from semstab.records import Result
 from semstab.tables.stability import SBD_OVER
 from semstab.tables.table import Column, Group, Row, Table
 
 
-def sensitivity(result: StudyResult) -> list[Table]:
+def sensitivity(result: Result) -> list[Table]:
     """One table a sweep (paper, Sensitivity to World-Space Association), and one with what does not depend on OP."""
     found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
     return [table for pair in found for table in pair if table is not None]
 
 
-def _table(result: StudyResult, sweep: Sweep) -> Table:
+def _table(result: Result, sweep: Sweep) -> Table:
     columns = (
         Column("value", sweep.header),
         Column("repeats", "Repeats", 0),
@@ -42,7 +42,7 @@ def _table(result: StudyResult, sweep: Sweep) -> Table:
     return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
 
 
-def _agreement_table(result: StudyResult, sweep: Sweep) -> Table | None:
+def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
     """None where the units have no statistics, as in studies of earlier versions."""
     columns = (
         Column("value", sweep.header),

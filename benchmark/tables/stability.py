@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from semstab.averages import ENOUGH, by_backbone, pooled
 from semstab.metrics import macro_mean
 from semstab.results import Means
-from semstab.study.results import SHARED, Record, StudyResult
+from semstab.config import SHARED
+from semstab.records import Record, Result
 from semstab.tables.table import Column, Group, Row, Table
 
 VOXELS = Column("voxels", "Voxels", 0)
@@ -22,7 +23,7 @@ def vss(digits: int) -> Column:
     return Column("vss", "VSS", digits, "higher")
 
 
-def scenes(result: StudyResult) -> list[Table]:
+def scenes(result: Result) -> list[Table]:
     """The multi-scene table: each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability)."""
     records = result.select()
     if not records:
@@ -47,7 +48,7 @@ def scenes(result: StudyResult) -> list[Table]:
     return [Table("scenes", "Stability by scene", caption, columns, groups)]
 
 
-def persistence(result: StudyResult) -> list[Table]:
+def persistence(result: Result) -> list[Table]:
     """The persistence strata, the voxels of all scenes pooled (paper, Observation Persistence)."""
     records = result.select()
     if not records:
@@ -64,7 +65,7 @@ def persistence(result: StudyResult) -> list[Table]:
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 
 
-def classes(result: StudyResult) -> list[Table]:
+def classes(result: Result) -> list[Table]:
     """The dominant classes, the voxels of all scenes pooled (paper, Class-wise Stability)."""
     records = result.select()
     if not records:
@@ -81,7 +82,7 @@ def classes(result: StudyResult) -> list[Table]:
     return [Table("classes", "Stability by dominant class", caption, columns, groups)]
 
 
-def cross_backbone(result: StudyResult) -> list[Table]:
+def cross_backbone(result: Result) -> list[Table]:
     """The backbones in one taxonomy: all voxels and the recurrent ones (paper, Cross-Backbone Temporal Stability)."""
     records = comparable(result)
     if not records:
@@ -95,7 +96,7 @@ def cross_backbone(result: StudyResult) -> list[Table]:
     return [Table("cross_backbone", "Backbones in one taxonomy", caption, columns, groups)]
 
 
-def comparable(result: StudyResult) -> tuple[Record, ...]:
+def comparable(result: Result) -> tuple[Record, ...]:
     """Records of several backbones in one taxonomy: those fused for it, else the base ones where they share theirs."""
     records = result.select(SHARED) or result.select()
     several = len(by_backbone(records)) > 1

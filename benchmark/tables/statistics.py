@@ -10,7 +10,7 @@ from semstab.averages import by_backbone
 from semstab.metrics import macro_mean
 from semstab.statistics import Estimate, estimate_at, number_at
 from semstab.statistics.verdict import ADVICE
-from semstab.study.results import Record, StudyResult
+from semstab.records import Record, Result
 from semstab.tables.table import Column, Group, Row, Table
 
 SCENE = Column("scene", "Scene")
@@ -21,7 +21,7 @@ SEEN_TWICE = "Over the voxels seen twice or more."
 Number = Callable[[Record], float | Estimate]
 
 
-def temporal_agreement(result: StudyResult) -> list[Table]:
+def temporal_agreement(result: Result) -> list[Table]:
     """Do frames agree about a place? Measures that do not depend on OP."""
     columns = (
         REPEATED,
@@ -47,7 +47,7 @@ def temporal_agreement(result: StudyResult) -> list[Table]:
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
 
 
-def class_agreement(result: StudyResult) -> list[Table]:
+def class_agreement(result: Result) -> list[Table]:
     """Alpha of each class against all others, macro means over scenes."""
     judged = judged_records(result)
     if not judged:
@@ -66,7 +66,7 @@ def class_agreement(result: StudyResult) -> list[Table]:
     return [Table("class_agreement", "Agreement of the frames, by class", caption, columns, groups)]
 
 
-def drift(result: StudyResult) -> list[Table]:
+def drift(result: Result) -> list[Table]:
     """SBD beside what a random order of the same observations gives, and the drift in one direction."""
     columns = (
         Column("voxels", "Voxels", 0),
@@ -107,7 +107,7 @@ def drift(result: StudyResult) -> list[Table]:
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
 
 
-def uncertainty(result: StudyResult) -> list[Table]:
+def uncertainty(result: Result) -> list[Table]:
     """The entropy of the belief, within frames and between them."""
     columns = (
         Column("entropy", "Entropy", 4, "lower"),
@@ -134,7 +134,7 @@ def uncertainty(result: StudyResult) -> list[Table]:
     return by_scene(result, "uncertainty", "Where the uncertainty comes from", caption, columns, numbers)
 
 
-def verdicts(result: StudyResult) -> list[Table]:
+def verdicts(result: Result) -> list[Table]:
     """What the evidence says of each backbone on each scene, and what to do."""
     judged = judged_records(result)
     if not judged:
@@ -161,7 +161,7 @@ def verdicts(result: StudyResult) -> list[Table]:
 
 
 def by_scene(
-    result: StudyResult,
+    result: Result,
     name: str,
     title: str,
     caption: str,
@@ -190,7 +190,7 @@ def by_scene(
     return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
 
 
-def judged_records(result: StudyResult, section: str = "agreement") -> dict[str, list[Record]]:
+def judged_records(result: Result, section: str = "agreement") -> dict[str, list[Record]]:
     """The base units by backbone whose statistics have that section."""
     return by_backbone(record for record in result.select() if record.statistics.get(section))
 

@@ -13,7 +13,7 @@ from semstab.backends import expected_bytes
 from semstab.config import Config
 from semstab.errors import ConfigError
 from semstab.frames import Frame
-from semstab.plan import Task, read
+from semstab.task import Task, read
 
 if TYPE_CHECKING:
     from semstab.backends.aggregator import Aggregator

@@ -1,21 +1,15 @@
-"""The plan of a run: what its configuration selects, opened and checked before the first image is read."""
+"""A backbone on a scene: which frames, how its labels become rows of evidence, and a frame of it, ready to fuse."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-import importlib.resources
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
-from pydantic import ValidationError
-
-from semstab.backends import create
-from semstab.config import Config, Exclusion, Perturbation, explain, merge, read_yaml
-from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, options_model
+from semstab.config import Config, Exclusion, Part, Perturbation
+from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.exclusion import leave_out
@@ -48,55 +42,6 @@ class Task:
         return self.scene.digest(self.indices, self.backbone)
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """Everything that a run will do, checked before the first image is read."""
-
-    config: Config
-    tasks: tuple[Task, ...]
-
-    def last_of(self, scene: Scene) -> Task:
-        """The last task of a scene."""
-        return [task for task in self.tasks if task.scene is scene][-1]
-
-
-def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
-    """The configuration of a file with overrides on top, over what ships for its dataset in configs/datasets/."""
-    content = merge(read_yaml(path) if path is not None else {}, overrides or {})
-    return Config.build(merge(dataset_defaults(content), content), str(path or "configuration"))
-
-
-def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that ship for the dataset which the content names, or for the built-in one."""
-    dataset = content.get("dataset")
-    name = dataset.get("name") if isinstance(dataset, Mapping) else dataset
-    shipped = importlib.resources.files("semstab.configs") / "datasets" / f"{name or 'city'}.yaml"
-    return read_yaml(Path(str(shipped))) if shipped.is_file() else {}
-
-
-def resolve(config: Config) -> Config:
-    """The configuration with every default of its dataset's options filled in, paths absolute."""
-    name = config.dataset.name
-    model = options_model(name)
-    try:
-        options = model.model_validate(config.dataset.options)
-    except ValidationError as error:
-        raise ConfigError(f"dataset '{name}', options: {explain(error, model)}") from error
-    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
-    content = options.model_copy(update=paths).model_dump(mode="json")
-    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": content})})
-
-
-def make_plan(config: Config) -> Plan:
-    """Open what the configuration selects and check that it fits together; no image is read."""
-    for backend in config.fused_by():  # an engine that is missing is said before anything is computed
-        create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
-    dataset = open_dataset(config.dataset.name, config.dataset.options)
-    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
-    tasks = [task for name in names for task in tasks_of(dataset.scene(name), config)]
-    return Plan(config, tuple(tasks))
-
-
 def tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
     """The configuration's backbones on an open scene, checked; no image is read."""
     indices = frame_indices(scene, config)
@@ -107,10 +52,15 @@ def tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
-        fused_by = tuple(backend.name for backend in config.fused_by())
         mapping = source.mapping_to(target)
         _require_classes(config.exclude.classes, mapping, scene.name)
+        fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
         yield Task(scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude)
+
+
+def applies(part: Part, scene: str, backbone: str) -> bool:
+    """Whether a part of the configuration takes in that backbone on that scene."""
+    return scene in (part.scenes or [scene]) and backbone in (part.backbones or [backbone])
 
 
 def _require_classes(names: Sequence[str], mapping: LabelMapping, where: str) -> None:

@@ -1,4 +1,4 @@
-"""Where the jobs of a study run: in this process, in local processes, or on a Dask cluster; one interface."""
+"""Where jobs are done: in this process, in local processes, or on a Dask cluster; one interface."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.memory import available_bytes
+from semstab.engine.memory import available_bytes
 from semstab.prefetch import default_threads
 from semstab.process import settle
-from semstab.study.jobs import Job, Outcome, close_dataset, failed, message, run_job
+from semstab.engine.jobs import Job, Outcome, failed
+from semstab.engine.observer import Observers
+from semstab.engine.passes import run_job
 
 CONNECT_SECONDS = 10
 
@@ -29,15 +31,20 @@ Finished = tuple[Job, tuple[Outcome, ...]]
 class Executor(Protocol):
     """Runs jobs.
 
-    name   for the manifest
-    width  how many jobs it runs at once
+    name       for the manifest
+    width      how many jobs it runs at once
+    elsewhere  whether other processes do the work, so that observers here do not see it
     """
 
     name: str
     width: int
+    elsewhere: bool
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Finished, None, None]:
-        """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest."""
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest.
+
+        `observers` are told of the work that is done in this very process.
+        """
         ...
 
 
@@ -46,18 +53,18 @@ class InProcess:
 
     name = "in this process"
     width = 1
+    elsewhere = False
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Finished, None, None]:
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """In order."""
-        try:
-            for job in jobs:
-                yield job, run_job(job)
-        finally:
-            close_dataset()
+        for job in jobs:
+            yield job, run_job(job, observers)
 
 
 class LocalProcesses:
     """That many processes on this machine, which share its cores and its free memory."""
+
+    elsewhere = True
 
     def __init__(self, jobs: int) -> None:
         if jobs < 1:
@@ -65,7 +72,7 @@ class LocalProcesses:
         self.width = jobs
         self.name = f"{jobs} local processes"
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Finished, None, None]:
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """As they finish.
 
         Where a process dies, nobody knows of which job: what is left is tried again, then once more one by one. The job
@@ -81,7 +88,7 @@ class LocalProcesses:
             except BrokenProcessPool:
                 job = left.pop(min(left))
                 text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
-                yield job, failed(job.requests, text)
+                yield job, tuple(failed(job.requests, text))
 
     def _run(self, left: dict[int, Job], width: int) -> Generator[Finished, None, None]:
         """Run the jobs that are left, in order; take away those that are finished."""
@@ -116,7 +123,7 @@ def _check_start(pool: cf.ProcessPoolExecutor) -> None:
         pool.submit(os.getpid).result()
     except BrokenProcessPool as error:
         raise ConfigError(
-            "worker processes do not start; in a script of your own, call run_study under if __name__ == '__main__'"
+            "worker processes do not start; in a script of your own, call it under if __name__ == '__main__'"
         ) from error
 
 
@@ -142,6 +149,8 @@ class DaskCluster:
     Raises MissingDependencyError without dask, ConfigError where no scheduler answers.
     """
 
+    elsewhere = True
+
     def __init__(self, scheduler: str) -> None:
         try:
             self._client = _distributed().Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
@@ -152,7 +161,7 @@ class DaskCluster:
         self.width = max(1, sum(self._client.nthreads().values()))
         self.name = f"Dask, {self.width} threads"
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Finished, None, None]:
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """As they finish. The scheduler gives the job of a worker that died to another one."""
         with self._client:
             futures = {self._client.submit(run_job, job, pure=False): job for job in jobs}
@@ -174,7 +183,7 @@ def _outcomes(future: Any, job: Job) -> tuple[Outcome, ...]:
     try:
         outcomes: tuple[Outcome, ...] = future.result()
     except Exception as error:  # noqa: BLE001 - whatever happened to it on the cluster
-        return failed(job.requests, message(error))
+        return tuple(failed(job.requests, error))
     return outcomes
 
 

@@ -12,7 +12,7 @@ from semstab.metrics import (
     compensated_flicker,
     macro_mean,
 )
-from semstab.study.results import ImageSpace
+from semstab.records import ImageSpace
 
 CLIPS = (8, 16)
 """Frames a clip, as VSPW reports."""

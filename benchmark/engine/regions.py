@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -17,10 +16,10 @@ from semstab.exclusion import leave_out
 from semstab.frames import Frame
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.perturbation import perturb
-from semstab.plan import frame_indices
+from semstab.task import frame_indices
 from semstab.prefetch import prefetch
-from semstab.study.jobs import Job, Outcome, Request
-from semstab.study.results import RegionFlicker
+from semstab.engine.jobs import Job, Outcome, Request
+from semstab.records import RegionFlicker, UnitContent
 from semstab.warp import correspond
 
 
@@ -31,7 +30,7 @@ def measure_regions(job: Job, scene: Scene, request: Request) -> Outcome:
     flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
     found = RegionFlicker(job.scene, job.backbone, macro_mean(flicker), macro_mean(compensated), macro_mean(share))
     digest = scene.digest(frame_indices(scene, request.config), job.backbone)
-    return Outcome(request.identity, {"input": digest, "regions": dataclasses.asdict(found)})
+    return Outcome(request.identity, UnitContent(digest, regions=found))
 
 
 def _frames(job: Job, scene: Scene, request: Request) -> Iterator[Frame]:

@@ -1,4 +1,4 @@
-"""What a study found: one record a unit, and the voxel tables behind the units at its base settings."""
+"""What a run or a study found: one record a unit, and the voxel tables behind the units at its base settings."""
 
 from __future__ import annotations
 
@@ -9,35 +9,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semstab.results import Agreement, GroupResult, RunResult, Unit, UnitSummary
+from semstab.config import BACKENDS, BASE
+from semstab.results import Agreement, Unit, UnitSummary
 from semstab.voxels import VoxelTable
 
-SCHEMA = 1
-"""Version of the study's summary.json."""
+SCHEMA = 2
+"""Version of summary.json."""
 
-VOXELS = "voxels"
-"""Folder of the voxel tables, in the study's: SCENE__BACKBONE__BACKEND.parquet."""
-
-OVERVIEW = "overview"
-"""Folder of the frames that figures show, in the study's: SCENE__BACKBONE.npz with the arrays frame (its index), labels
-(H, W) rows 0..K-1 or the ignore id, palette (K, 3) and, where the dataset has it, color (H, W, 3)."""
-
-BASE = "base"
-"""The sweep of the units at the study's own settings."""
-
-SHARED = "shared_taxonomy"
-"""The sweep of the units fused in the taxonomy that the backbones are compared in; value is None."""
+UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
+"""Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
+the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
+SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
+where the dataset has it, color (H, W, 3)."""
 
 REGIONS = "region_maps"
 """Not a sweep: the label sources that hold regions without classes."""
 
-BACKENDS = "backends"
-"""The sweep of the units fused by the other backends; value is None, `unit.backend` says which."""
-
-
 @dataclass(frozen=True, order=True)
 class Variation:
-    """One point of one sweep, in one repeat: what differs from the study's base settings.
+    """One point of one sweep, in one repeat: what differs from the base settings.
 
     sweep   'base', 'shared_taxonomy', 'backends', or what is swept: 'voxel_size' (metres), 'pixel_stride',
             'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
@@ -74,13 +64,14 @@ class ImageSpace:
 
 @dataclass(frozen=True)
 class Record:
-    """One finished unit of a study.
+    """One finished unit.
 
     key         hash of its inputs and settings, under which it is kept
-    summary     what `semstab.run` reports of it: unit (scene, backbone, backend), means, strata, classes, times, and
+    summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
                 what `semstab.statistics` says of the map
     image_space of the 'base' units; all NaN elsewhere
-    voxels      file of its voxel table, for the 'base' and 'backends' units; None elsewhere
+    voxels      file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and where no folder is kept
+    truth       file of the ground truth's voxels of the same frames, where the statistics fused it
     """
 
     key: str
@@ -88,6 +79,7 @@ class Record:
     summary: UnitSummary
     image_space: ImageSpace = ImageSpace()
     voxels: Path | None = None
+    truth: Path | None = None
 
     @property
     def statistics(self) -> Mapping[str, Any]:
@@ -104,6 +96,11 @@ class Record:
         if self.voxels is None:
             raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
         return VoxelTable.load(self.voxels)
+
+    @property
+    def series(self) -> Path | None:
+        """File of its time series, beside that of its voxels."""
+        return None if self.voxels is None else self.voxels.parent.parent / "frames" / f"{self.unit.slug}.csv"
 
 
 @dataclass(frozen=True)
@@ -128,6 +125,48 @@ class RegionFlicker:
 
 
 @dataclass(frozen=True)
+class UnitContent:
+    """What the file of a finished unit holds, from which its record comes.
+
+    input    digest of its input
+    up       the scene's up axis, where it is known or could be estimated
+    files    digests of the unit's other files, by their path in the folder
+    regions  of a source of regions, instead of a summary
+    """
+
+    input: str
+    summary: UnitSummary | None = None
+    image_space: ImageSpace | None = None
+    up: tuple[float, float, float] | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    regions: RegionFlicker | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object; `from_dict` reads it back."""
+        return {
+            "input": self.input,
+            "summary": None if self.summary is None else self.summary.to_dict(),
+            "image_space": None if self.image_space is None else dataclasses.asdict(self.image_space),
+            "up": self.up,
+            "files": dict(self.files),
+            "regions": None if self.regions is None else dataclasses.asdict(self.regions),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> UnitContent:
+        """Read what `to_dict` wrote."""
+        summary, image_space, up, regions = (content[name] for name in ("summary", "image_space", "up", "regions"))
+        return cls(
+            input=content["input"],
+            summary=None if summary is None else UnitSummary.from_dict(summary),
+            image_space=None if image_space is None else read_image_space(image_space),
+            up=None if up is None else (up[0], up[1], up[2]),
+            files=content["files"],
+            regions=None if regions is None else RegionFlicker.from_dict(regions),
+        )
+
+
+@dataclass(frozen=True)
 class Failure:
     """A unit that could not be computed, and the one line that says why."""
 
@@ -137,11 +176,12 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class StudyResult:
-    """Everything that tables, figures and the report are made from; records are in the order of the study's grid.
+class Result:
+    """All that a run or a study found; tables, figures, report and terminal are made from it.
 
-    backend    the base backend: that of every unit but those of the 'backends' sweep
-    agreement  of each checked backend with the base one, on each scene and backbone
+    backend    the base backend: that of every unit but those of the 'backends' variation
+    records    in the order of the plan
+    agreement  of each pair of backends that must agree, on each scene and backbone that both fused
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
     regions    flicker of the label sources that are regions without classes
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
@@ -188,21 +228,13 @@ class StudyResult:
                 found.setdefault(record.variation.sweep, set()).add(record.variation.value)
         return {sweep: tuple(sorted(values)) for sweep, values in found.items()}
 
-    def base_runs(self) -> RunResult:
-        """The base units, with those of the other backends beside them, as one run."""
-        units = (*self.select(), *self.select(BACKENDS))
-        return RunResult(
-            tuple(
-                GroupResult(
-                    tuple(r.summary for r in units if (r.unit.scene, r.unit.backbone) == group),
-                    tuple(row for row in self.agreement if (row.scene, row.backbone) == group),
-                )
-                for group in dict.fromkeys((r.unit.scene, r.unit.backbone) for r in self.select())
-            )
-        )
+    @property
+    def agrees(self) -> bool:
+        """Whether backends that must agree do so everywhere."""
+        return all(row.agrees for row in self.agreement)
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of the study's summary.json; `load_study_result` reads it back."""
+        """The content of summary.json; `load_result` reads it back."""
         return {
             "schema": SCHEMA,
             "name": self.name,
@@ -219,7 +251,7 @@ class StudyResult:
         }
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any], folder: Path, manifest: Mapping[str, Any]) -> StudyResult:
+    def from_dict(cls, content: Mapping[str, Any], folder: Path, manifest: Mapping[str, Any]) -> Result:
         """Read what `to_dict` wrote; voxel files lie in `folder`."""
         return cls(
             name=content["name"],
@@ -230,7 +262,7 @@ class StudyResult:
             up={scene: (axis[0], axis[1], axis[2]) for scene, axis in content["up"].items()},
             manifest=manifest,
             regions=tuple(RegionFlicker.from_dict(row) for row in content["regions"]),
-            comparisons=tuple(content.get("comparisons", ())),  # studies of earlier versions have none
+            comparisons=tuple(content["comparisons"]),
         )
 
 
@@ -239,7 +271,8 @@ def _record_content(record: Record) -> dict[str, Any]:
         "key": record.key,
         "variation": dataclasses.asdict(record.variation),
         "image_space": dataclasses.asdict(record.image_space),
-        "voxels_file": None if record.voxels is None else f"{VOXELS}/{record.voxels.name}",
+        "voxels_file": _below(record.voxels),
+        "truth_file": _below(record.truth),
     }
 
 
@@ -250,7 +283,13 @@ def _record(row: Mapping[str, Any], folder: Path) -> Record:
         summary=UnitSummary.from_dict(row),
         image_space=read_image_space(row["image_space"]),
         voxels=None if row["voxels_file"] is None else folder / row["voxels_file"],
+        truth=None if row["truth_file"] is None else folder / row["truth_file"],
     )
+
+
+def _below(path: Path | None) -> str | None:
+    """A unit's file as it is called in the folder."""
+    return None if path is None else f"{path.parent.name}/{path.name}"
 
 
 def _failure(row: Mapping[str, Any]) -> Failure:

@@ -1,0 +1,45 @@
+"""What the command line does, from Python: a run or a study, with its tables, figures and report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from semstab.config import Config
+from semstab.engine import Executor, Observer
+from semstab.engine.execution import run as execute
+from semstab.engine.execution import run_study as execute_study
+from semstab.records import Result
+from semstab.report import Reporting
+
+
+def run(
+    config: Config,
+    *,
+    out: str | Path | None = None,
+    executor: Executor | None = None,
+    observers: Sequence[Observer] = (),
+    command: Sequence[str] = (),
+    report: bool = True,
+) -> Result:
+    """Fuse, measure and compare what the configuration selects, without printing.
+
+    A folder `out`, in which the finished units of an earlier start are kept, gets the summary, voxels, time series and,
+    unless `report` is False, tables, figures and report.html. An executor says where the work is done. Raises ConfigError or DataError; what was finished before stays in the folder.
+    """
+    reporting = [Reporting(out)] if report and out is not None else []
+    return execute(config, out=out, executor=executor, observers=[*observers, *reporting], command=command)
+
+
+def run_study(
+    config: Config,
+    out: str | Path,
+    *,
+    executor: Executor | None = None,
+    observers: Sequence[Observer] = (),
+    command: Sequence[str] = (),
+    report: bool = True,
+) -> Result:
+    """The same of a study: a unit that fails is among the result's failures, and the others finish."""
+    reporting = [Reporting(out)] if report else []
+    return execute_study(config, out, executor=executor, observers=[*observers, *reporting], command=command)

@@ -1,0 +1,235 @@
+"""Every setting, typed, with its default; a run is a study that varies nothing."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import yaml
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+
+from semstab.config.selection import FrameSelection
+from semstab.config.settings import Settings, explain, merge, read_yaml
+from semstab.config.sweeps import Counts, Deviation, Lengths, Noise, Part, Sweeps
+from semstab.errors import ConfigError
+
+__all__ = [
+    "BackendConfig",
+    "Config",
+    "Counts",
+    "DatasetConfig",
+    "Deviation",
+    "Exclusion",
+    "FrameSelection",
+    "Lengths",
+    "Noise",
+    "Part",
+    "Perturbation",
+    "Settings",
+    "Sweeps",
+    "explain",
+    "merge",
+    "nearest",
+    "read_yaml",
+]
+
+BASE = "base"
+"""The units at the configuration's own settings, fused by its first backend."""
+
+SHARED = "shared_taxonomy"
+"""The units fused in the taxonomy that backbones are compared in."""
+
+BACKENDS = "backends"
+"""The base units fused by the other backends."""
+
+
+class DatasetConfig(Settings):
+    """Which dataset, with the options of its own."""
+
+    name: str = Field("city", description="a name from `semstab-bench list`")
+    options: dict[str, Any] = Field(default_factory=dict, description="options of that dataset")
+
+
+class BackendConfig(Part):
+    """Which fusion backend, with the options of its own; where it fuses, and whether it must agree with the others."""
+
+    name: str = Field(description="a name from `semstab-bench list`")
+    options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
+    check: bool | None = Field(
+        None, description="whether it must agree with the others; not if it associates otherwise than pixel by pixel"
+    )
+
+
+class Perturbation(Settings):
+    """Noise added to depth and poses, to see what geometry alone does to the numbers; see `semstab.perturbation`.
+
+    Standard deviations, of each axis where there are three. 0 adds nothing.
+    """
+
+    depth_noise: Deviation = Field(0.0, description="of depth, relative to it, of each pixel by itself")
+    translation_noise: Deviation = Field(0.0, description="of the camera's position, metres, anew in every frame")
+    rotation_noise: Deviation = Field(0.0, description="of the camera's rotation, degrees, anew in every frame")
+    translation_drift: Deviation = Field(0.0, description="of a step of the position's random walk, metres a frame")
+    rotation_drift: Deviation = Field(0.0, description="of a step of the rotation's random walk, degrees a frame")
+    seed: int = Field(0, ge=0, description="of a unit; a configuration leaves it out, its own `seed` counts")
+
+    @property
+    def adds_noise(self) -> bool:
+        """Whether it changes a frame at all."""
+        return any(value for name, value in self if name != "seed")
+
+
+class Exclusion(Settings):
+    """What is left out of fusion because it moves; see `semstab.exclusion`."""
+
+    classes: tuple[str, ...] = Field((), description="classes, by their name in a backbone's or in the run's taxonomy")
+    masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
+
+
+class Config(Settings):
+    """What determines the numbers of a run or a study: scenes x backbones x backends x variations."""
+
+    name: str = Field("run", min_length=1, description="what the report calls it; a study's is its file's by default")
+    description: str = Field("", description="one line")
+    dataset: DatasetConfig = DatasetConfig()
+    scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
+    backbones: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
+    region_maps: list[str] = Field(
+        default_factory=list,
+        description="label sources whose ids mean nothing across frames (raw SAM); only their flicker is measured",
+    )
+    backends: list[BackendConfig] = Field(
+        [BackendConfig(name="numba")],
+        min_length=1,
+        description="fusion backends: the first one fuses every unit, the others the same frames of the base units",
+    )
+    check: str | None = Field(
+        "numpy", description="backend that the others are checked against, on all base units; null for none"
+    )
+    tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
+    taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
+    shared_taxonomy: str | None = Field(None, description="label space in which backbones are compared; null: none")
+    voxel_size: float = Field(0.2, gt=0, allow_inf_nan=False, description="edge of a voxel, metres")
+    pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
+    frames: FrameSelection = FrameSelection()
+    scene_frames: dict[str, FrameSelection] = Field(
+        default_factory=dict, description="frames of single scenes, instead of `frames`"
+    )
+    exclude: Exclusion = Exclusion()
+    perturbation: Perturbation | None = Field(None, description="noise in every unit; null for none")
+    strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
+    sweeps: Sweeps = Sweeps()
+    seed: int = Field(0, ge=0, description="of the noise; the n-th repeat of a sweep takes seed + n")
+    events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
+    statistics: bool = Field(
+        False,
+        description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
+        " other; keeps every observation, fuses the ground truth too",
+    )
+    threads: int | None = Field(
+        None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
+    )
+    memory_gb: float | None = Field(
+        None, gt=0, exclude=True, description="memory that maps may take, GB; what is free where not given; not kept"
+    )
+    check_geometry: bool = Field(
+        True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_earlier_versions(cls, content: Any) -> Any:
+        """Say what to write instead of a study's settings of version 0.1."""
+        if isinstance(content, Mapping):
+            others = content.get("backends")
+            if "backend" in content:
+                raise ValueError("'backend' is now the first of 'backends'; write backends: [numba, open3d, ...]")
+            if isinstance(others, Mapping):
+                raise ValueError(
+                    "'backends' is now a list, the base backend first;"
+                    " write backends: [numba, {name: open3d, scenes: [...]}]"
+                )
+        return content
+
+    @field_validator("backends", mode="before")
+    @classmethod
+    def _names_are_backends(cls, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        return [{"name": item} if isinstance(item, str) else item for item in value]
+
+    @field_validator("backends")
+    @classmethod
+    def _one_fuses_everything(cls, value: list[BackendConfig]) -> list[BackendConfig]:
+        if len({backend.name for backend in value}) < len(value):
+            raise ValueError("each backend can be named once")
+        if value[0].scenes is not None or value[0].backbones is not None:
+            raise ValueError("the first backend fuses every unit; leave out its scenes and backbones")
+        return value
+
+    @field_validator("perturbation")
+    @classmethod
+    def _noise_or_none(cls, value: Perturbation | None) -> Perturbation | None:
+        """Settings that add no noise are none, so that they are compared as such."""
+        if value is not None and value.seed:
+            raise ValueError("leave its seed out; 'seed' counts, which stands beside 'perturbation'")
+        return value if value is not None and value.adds_noise else None
+
+    @field_validator("region_maps")
+    @classmethod
+    def _regions_are_not_fused(cls, value: list[str], info: ValidationInfo) -> list[str]:
+        if both := [name for name in value if name in (info.data.get("backbones") or ())]:
+            raise ValueError(f"'{both[0]}' is named among the backbones too; use one of the two")
+        return value
+
+    @field_validator("strata")
+    @classmethod
+    def _edges_ascend(cls, value: list[int]) -> list[int]:
+        if value[0] < 1 or any(low >= high for low, high in itertools.pairwise(value)):
+            raise ValueError("edges must be ascending whole numbers from 1")
+        return value
+
+    @classmethod
+    def build(cls, content: Mapping[str, Any], where: str = "configuration") -> Self:
+        """Validate settings. Raises ConfigError that names `where`, the setting, the nearest known one."""
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise ConfigError(f"{where}: {explain(error, cls)}") from error
+
+    def fused_by(self) -> list[BackendConfig]:
+        """The backends that fuse the base units: those named, and the one they are checked against."""
+        named = [backend.name for backend in self.backends]
+        extra = [BackendConfig(name=self.check)] if self.check and self.check not in named else []
+        return [*self.backends, *extra]
+
+    def only(self, parts: Sequence[str]) -> Config:
+        """The base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.
+
+        Raises ConfigError for a part that there is not.
+        """
+        known = {name for name, _ in self.sweeps.given()} | {BASE, SHARED, BACKENDS}
+        for part in parts:
+            if part not in known:
+                raise ConfigError(f"study {self.name}: no part '{part}'; {nearest(part, sorted(known))}")
+        dropped = {name: None for name, _ in self.sweeps.given() if name not in parts}
+        return self.model_copy(
+            update={
+                "sweeps": self.sweeps.model_copy(update=dropped),
+                "shared_taxonomy": self.shared_taxonomy if SHARED in parts else None,
+                "backends": self.backends if BACKENDS in parts else self.backends[:1],
+                "check": self.check if BACKENDS in parts else None,
+            }
+        )
+
+    def to_yaml(self) -> str:
+        """YAML that reads back to the same settings."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """A hint at what may be meant by a name that is not known."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"

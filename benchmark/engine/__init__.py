@@ -1,0 +1,41 @@
+"""The one engine behind runs and studies: scenes x backbones x backends x variations, each unit kept when it is done."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from semstab.engine.executors import DaskCluster, Executor, InProcess, LocalProcesses
+    from semstab.engine.folder import load_result
+    from semstab.engine.observer import Observer
+    from semstab.engine.execution import run, run_study
+
+__all__ = [
+    "DaskCluster",
+    "Executor",
+    "InProcess",
+    "LocalProcesses",
+    "Observer",
+    "load_result",
+    "run",
+    "run_study",
+]
+
+_HOMES = {
+    "DaskCluster": "executors",
+    "Executor": "executors",
+    "InProcess": "executors",
+    "LocalProcesses": "executors",
+    "Observer": "observer",
+    "load_result": "folder",
+    "run": "execution",
+    "run_study": "execution",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public names when they are first used: what reads results does not load what computes them."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'semstab.engine' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"semstab.engine.{_HOMES[name]}"), name)

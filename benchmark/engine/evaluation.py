@@ -1,0 +1,42 @@
+"""The statistics of maps: each by itself and against the ground truth's, a scene's backbones beside each other."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from semstab.config import Config
+from semstab.datasets import GROUND_TRUTH
+from semstab.task import Task
+from semstab.errors import ConfigError
+from semstab.statistics import Analysis, analyse, compare_backbones, nulls
+from semstab.voxels import Events, VoxelTable
+
+
+def truth_task(task: Task) -> Task | None:
+    """The ground truth in the unit's label space; None where there is none, or where it does not map to that."""
+    if not task.scene.ground_truth or task.backbone == GROUND_TRUTH:
+        return None
+    try:
+        mapping = task.scene.label_space(GROUND_TRUTH).mapping_to(task.mapping.target)
+    except ConfigError:
+        return None
+    return dataclasses.replace(task, backbone=GROUND_TRUTH, mapping=mapping)
+
+
+def analyse_map(
+    task: Task, config: Config, table: VoxelTable, events: Events | None = None, truth: VoxelTable | None = None
+) -> Analysis:
+    """What the statistics say of one map; `truth` is what is right, and how far geometry lets labels agree."""
+    return analyse(table, events, truth, limit=truth, name=task.backbone, edges=config.strata)
+
+
+def comparison(scene: str, maps: Mapping[str, VoxelTable], truth: VoxelTable | None) -> dict[str, Any] | None:
+    """Maps of a scene beside each other; None where there are not two or more of them in one label space."""
+    if len(maps) < 2 or len({table.classes for table in maps.values()}) > 1:
+        return None
+    if truth is not None and truth.classes != next(iter(maps.values())).classes:
+        truth = None
+    found: dict[str, Any] = nulls({"scene": scene} | compare_backbones(maps, truth=truth))
+    return found

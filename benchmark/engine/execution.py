@@ -1,0 +1,314 @@
+"""A run or a study: every unit of its plan that is not kept from before, computed, and what they add up to."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from semstab.backends import REGISTRY
+from semstab.check import Verdict, quick_check, refuse_unsound
+from semstab.config import BACKENDS, BASE, Config
+from semstab.datasets import GROUND_TRUTH
+from semstab.engine.evaluation import comparison
+from semstab.engine.executors import Executor, InProcess
+from semstab.engine.folder import Folder
+from semstab.engine.jobs import Job, Request, split
+from semstab.engine.manifest import manifest
+from semstab.engine.observer import Factory, Observer, Observers
+from semstab.engine.passes import lend
+from semstab.settings import resolve
+from semstab.stopwatch import Stopwatch
+from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.errors import DataError
+from semstab.metrics import compare
+from semstab.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
+from semstab.results import Agreement
+from semstab.voxels import VoxelTable
+
+GB = 1e9
+
+
+def run(
+    config: Config,
+    *,
+    out: str | Path | None = None,
+    executor: Executor | None = None,
+    observers: Sequence[Observer] = (),
+    command: Sequence[str] = (),
+) -> Result:
+    """Fuse, measure and compare what the configuration selects; as `run_study`, but a failing unit is an error.
+
+    Without a folder `out` nothing is left on disk, and the result has summaries, but no voxels. Raises ConfigError or
+    DataError, or what a unit raised, once everything else has been written.
+    """
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)
+        result, causes = _execute(config, folder, executor or InProcess(), observers, command)
+    if result.failures:
+        first = result.failures[0]
+        raise causes.get(first.message) or DataError(first.message)
+    if out is None:
+        records = tuple(dataclasses.replace(record, voxels=None, truth=None) for record in result.records)
+        return dataclasses.replace(result, records=records)
+    return result
+
+
+def run_study(
+    config: Config,
+    out: str | Path,
+    *,
+    executor: Executor | None = None,
+    observers: Sequence[Observer] = (),
+    command: Sequence[str] = (),
+) -> Result:
+    """Compute what the folder `out` does not hold yet, and say what was found.
+
+    Each unit is kept when it is finished, under a key of its settings and its input: a killed study goes on where it
+    was, a changed setting computes again only what it touches. `command` goes into the manifest.
+
+    Raises ConfigError or DataError where the plan does not fit together, or a scene's depth and poses contradict each
+    other, before anything is computed. A unit that fails later is among the result's failures, and the others finish.
+    """
+    return _execute(config, Path(out), executor or InProcess(), observers, command)[0]
+
+
+def _execute(
+    config: Config, out: Path, executor: Executor, observers: Sequence[Observer], command: Sequence[str]
+) -> tuple[Result, Mapping[str, BaseException]]:
+    """The result, and what failing units raised in this process, by its message."""
+    started, told = time.perf_counter(), Observers(observers)
+    config = resolve(config)
+    plan = make_plan(config)
+    folder = Folder(out, config)
+    try:
+        found = _compute(plan, folder, executor, told)
+        result = _result(plan, folder, found)
+        found.watch.seconds["all"] = time.perf_counter() - started
+        content = manifest(config, found.inputs(plan), found.watch.seconds, command)
+        content |= {"units": found.counts() | {"executor": executor.name}}
+        content |= {"geometry": {scene: verdict.summary() for scene, verdict in found.geometry.items()}}
+        result = dataclasses.replace(result, manifest=content)
+        folder.save_result(result)
+        told.tell(lambda observer: observer.run_finished(result))
+    finally:
+        folder.close()
+    told.raise_first()
+    return result, found.causes
+
+
+@dataclass
+class _Found:
+    """What is known of the units, by their identity: the content of their files, or why they failed.
+
+    geometry  of the scenes of which something was computed
+    causes    what was raised in this process, by its message
+    """
+
+    contents: dict[str, UnitContent]
+    kept: int
+    geometry: dict[str, Verdict] = field(default_factory=dict)
+    errors: dict[str, str] = field(default_factory=dict)
+    causes: dict[str, BaseException] = field(default_factory=dict)
+    watch: Stopwatch = field(default_factory=Stopwatch)
+
+    def inputs(self, plan: Plan) -> dict[str, str]:
+        """The digest of the input of each base unit, and of each source of regions."""
+        return {
+            f"{each.unit.scene}/{each.unit.backbone}": self.contents[each.identity].input
+            for each in plan.every()
+            if each.variation.sweep in (BASE, REGIONS) and each.identity in self.contents
+        }
+
+    def counts(self) -> dict[str, Any]:
+        """How many units there are, were kept from before, computed and failed."""
+        failed = len(self.errors)
+        computed = len(self.contents) - self.kept
+        return {"units": len(self.contents) + failed, "kept": self.kept, "computed": computed, "failed": failed}
+
+
+def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) -> _Found:
+    """Take what is kept, compute the rest."""
+    units, watch = plan.distinct(), Stopwatch()
+    with watch("digest"):
+        contents = {identity: kept for identity, each in units.items() if (kept := folder.kept(each)) is not None}
+    found = _Found(contents, kept=len(contents), watch=watch)
+    told.tell(lambda observer: observer.run_started(plan, [units[identity] for identity in contents]))
+    _tell_kept(plan, contents, told)
+    missing = [each for identity, each in units.items() if identity not in contents]
+    if plan.config.check_geometry:
+        with watch("check"):
+            found.geometry = _checked(plan.config, missing, told)
+    with folder.started() as start, lend(start, plan.scenes):
+        _work_off(plan, folder, start, executor, told, found, missing)
+    return found
+
+
+def _work_off(
+    plan: Plan,
+    folder: Folder,
+    start: str,
+    executor: Executor,
+    told: Observers,
+    found: _Found,
+    missing: Sequence[Planned],
+) -> None:
+    """What is missing, kept as it finishes."""
+    units = {each.identity: each for each in missing}
+    factories = told.elsewhere(folder.path) if executor.elsewhere else ()
+    jobs = split(_jobs(plan.config, folder.path, start, missing, factories), executor.width)
+    with contextlib.closing(executor.run(jobs, told)) as finished:
+        for outcome in (outcome for _, outcomes in finished for outcome in outcomes):
+            each = units[outcome.identity]
+            if outcome.content is not None:
+                with found.watch("keep"):
+                    folder.save(outcome)
+                found.contents[outcome.identity] = outcome.content
+            else:
+                found.errors[outcome.identity] = outcome.error or ""
+                folder.save_trace(outcome)
+                if outcome.cause is not None:
+                    found.causes.setdefault(outcome.error or "", outcome.cause)
+            for stage, seconds in outcome.seconds.items():
+                found.watch.seconds[stage] += seconds
+            _tell_done(each, outcome.error, executor, told)
+
+
+def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers) -> None:
+    watched = [each for each in plan.units if each.kept and each.identity in contents]
+    for task in plan.tasks:
+        group = [each for each in watched if (each.unit.scene, each.unit.backbone) == (task.scene.name, task.backbone)]
+        summaries = [summary for each in group if (summary := contents[each.identity].summary) is not None]
+        if summaries:
+            told.tell(lambda observer, task=task, summaries=summaries: observer.group_kept(task, summaries))  # type: ignore[misc]
+
+
+def _tell_done(each: Planned, error: str | None, executor: Executor, told: Observers) -> None:
+    if executor.elsewhere or not isinstance(each, PlannedUnit):
+        what = f"{each.unit.scene} · {each.unit.backbone}"
+        told.tell(lambda observer: observer.advanced(each.frames, what))
+    told.tell(lambda observer: observer.unit_done(each, error))
+
+
+def _checked(config: Config, missing: Sequence[Planned], told: Observers) -> dict[str, Verdict]:
+    """The geometry of each scene with units to compute; what cannot be read is left to these to report.
+
+    Raises DataError where depth and poses contradict each other.
+    """
+    found: dict[str, Verdict] = {}
+    tasks = {each.task.scene.name: each.task for each in reversed(missing) if isinstance(each, PlannedUnit)}
+    for task in reversed(tasks.values()):
+        with contextlib.suppress(DataError):
+            found[task.scene.name] = quick_check(task.scene, task.indices, task.backbone, config.dataset.options)
+    for scene, verdict in found.items():
+        refuse_unsound(scene, verdict)
+        told.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]
+    return found
+
+
+def _jobs(
+    config: Config, folder: Path, start: str, missing: Sequence[Planned], observers: Sequence[Factory]
+) -> list[Job]:
+    """The units by the sequence that they read; scene by scene, for what a scene's backbones share stays at hand."""
+    sequences: dict[tuple[str, str], list[Request]] = {}
+    for each in missing:
+        sequences.setdefault((each.unit.scene, each.unit.backbone), []).append(each.request())
+    memory = None if config.memory_gb is None else config.memory_gb * GB
+    return [
+        Job(scene, backbone, tuple(requests), start, folder, config.threads, memory, tuple(observers))
+        for (scene, backbone), requests in sequences.items()
+    ]
+
+
+def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
+    contents, errors = found.contents, found.errors
+    records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
+    tables = _Tables(records)
+    with found.watch("agreement"):
+        agreement = tuple(_agreement(plan.config, records, tables))
+    with found.watch("comparisons"):
+        comparisons = tuple(_comparisons(records, tables)) if plan.config.statistics else ()
+    return Result(
+        name=plan.config.name,
+        backend=plan.config.backends[0].name,
+        records=records,
+        failures=tuple(
+            Failure(each.unit, each.variation, errors[each.identity])
+            for each in plan.every()
+            if each.identity in errors
+        ),
+        agreement=agreement,
+        comparisons=comparisons,
+        up=_up_axes(plan.units, contents),
+        regions=tuple(_regions(plan, contents)),
+    )
+
+
+class _Tables:
+    """Voxel tables of records, the last few of them at hand: those of one scene and backbone are asked for together."""
+
+    def __init__(self, records: Sequence[Record]) -> None:
+        self._most = len({record.unit.backend for record in records})
+        self._loaded: dict[str, VoxelTable] = {}
+
+    def of(self, record: Record) -> VoxelTable:
+        """The record's table."""
+        slug = record.unit.slug
+        if slug not in self._loaded:
+            while len(self._loaded) >= self._most:
+                self._loaded.pop(next(iter(self._loaded)))
+            self._loaded[slug] = record.table()
+        return self._loaded[slug]
+
+
+def _agreement(config: Config, records: Sequence[Record], tables: _Tables) -> Iterator[Agreement]:
+    """Of each pair of backends that must agree, on each scene and backbone that both fused."""
+    checked = {backend.name for backend in config.fused_by() if _must_agree(backend.name, backend.check)}
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.variation.sweep in (BASE, BACKENDS) and record.unit.backend in checked:
+            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
+    for group in groups.values():
+        for a, b in itertools.combinations(group, 2):
+            yield compare(tables.of(a), tables.of(b), (a.unit, b.unit), tolerance=config.tolerance)
+
+
+def _must_agree(name: str, check: bool | None) -> bool:
+    return getattr(REGISTRY.load(name), "pointwise", True) if check is None else check
+
+
+def _comparisons(records: Sequence[Record], tables: _Tables) -> Iterator[Mapping[str, Any]]:
+    """The base units of each scene beside each other; accuracy where there is ground truth."""
+    base = [record for record in records if record.variation.sweep == BASE]
+    for scene in dict.fromkeys(record.unit.scene for record in base):
+        there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
+        truths = [record.truth for record in there if record.truth is not None]
+        truth = VoxelTable.load(truths[0]) if truths and len(there) > 1 else None
+        found = comparison(scene, {record.unit.backbone: tables.of(record) for record in there}, truth)
+        if found is not None:
+            yield found
+
+
+def _regions(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[RegionFlicker]:
+    for each in plan.regions:
+        content = contents.get(each.identity)
+        if content is not None and content.regions is not None:
+            yield content.regions
+
+
+def _up_axes(
+    units: Sequence[PlannedUnit], contents: Mapping[str, UnitContent]
+) -> dict[str, tuple[float, float, float]]:
+    """Each scene's up axis, as the base unit of its first backbone has it that knows one."""
+    axes: dict[str, tuple[float, float, float]] = {}
+    for each in units:
+        content = contents.get(each.identity)
+        if each.variation.sweep == BASE and content is not None and content.up is not None:
+            axes.setdefault(each.unit.scene, content.up)
+    return axes

@@ -1,0 +1,211 @@
+"""The folder of a run or a study: what it leaves on disk, unit by unit, so that a killed one goes on where it was."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import logging
+import os
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from semstab.config import Config, read_yaml
+from semstab.datasets.disk import file_digest
+from semstab.engine.jobs import Outcome, shared_marker
+from semstab.engine.units import Planned, PlannedUnit
+from semstab.errors import ConfigError, DataError
+from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.records import EVENTS, FRAMES, OVERVIEW, TRUTH, UNITS, VOXELS, ImageSpace, Record, Result, UnitContent
+from semstab.results import Unit, slug
+
+logger = logging.getLogger("semstab")
+
+LAYOUT = "# semstab, folder layout 2"
+"""First line of config.yaml: a folder that begins otherwise is of another version."""
+
+SETTINGS = "config.yaml"
+FAILURES = "failures.log"
+LEFTOVERS = (
+    ".shared-*", ".config-*.yaml", ".summary-*.json", ".manifest-*.json",
+    *(f"{folder}/.*" for folder in (UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW, "tables", "figures")),
+)  # fmt: skip
+"""What a start that was killed may have left half-written."""
+
+
+class Folder:
+    """OUT/: of one run or study, or of changed versions of it; what was computed with the same settings is kept.
+
+    One process owns it until `close`, or until it dies. Raises ConfigError where another one does, or where the folder
+    holds something else, or what an earlier version left.
+    """
+
+    def __init__(self, path: str | Path, config: Config) -> None:
+        self.path = Path(path).absolute()
+        earlier = _claimed(self.path)
+        (self.path / UNITS).mkdir(parents=True, exist_ok=True)
+        self._lock: int | None = _locked(self.path)
+        if earlier is not None and (change := _first_change(earlier, yaml.safe_load(config.to_yaml()))):
+            logger.warning("%s: earlier results of other settings (%s) are replaced", path, change)
+        write_text(self.path / SETTINGS, f"{LAYOUT}\n{config.to_yaml()}")
+        self._files = {file.stem: file for file in (self.path / UNITS).glob("*.json")}
+
+    def close(self) -> None:
+        """Let another process have it."""
+        if self._lock is not None:
+            os.close(self._lock)
+        self._lock = None
+
+    def kept(self, planned: Planned) -> UnitContent | None:
+        """What an earlier start left of a unit, if its input is the same and nothing that is wanted is missing.
+
+        The input is read to compare it only where there is such a unit at all.
+        """
+        if not any(name.startswith(planned.identity) for name in self._files):
+            return None
+        try:
+            file = self._files.get(unit_key(planned.identity, planned.digest))
+        except DataError:
+            return None  # the input cannot be read: computing the unit will say so
+        content = None if file is None else _read_unit(file)
+        return content if content is not None and self._is_whole(planned, content) else None
+
+    def save(self, outcome: Outcome) -> None:
+        """Keep a finished unit."""
+        assert outcome.content is not None
+        for name, file in outcome.files.items():
+            with atomic_path(self.path / name) as temporary:
+                temporary.write_bytes(file)
+        key = unit_key(outcome.identity, outcome.content.input)
+        write_json(self.path / UNITS / f"{key}.json", outcome.content.to_dict())
+
+    def save_trace(self, outcome: Outcome) -> None:
+        """Keep where a unit's error was raised, for who mends it: failures.log of this start."""
+        if outcome.trace:
+            with (self.path / FAILURES).open("a", encoding="utf-8") as log:
+                log.write(f"{outcome.error}\n{outcome.trace}\n")
+
+    def record(self, planned: PlannedUnit, content: UnitContent) -> Record:
+        """The record of a unit from the content of its file."""
+        assert content.summary is not None
+        truth = self.path / f"{TRUTH}/{planned.unit.slug}.parquet"
+        return Record(
+            key=unit_key(planned.identity, content.input),
+            variation=planned.variation,
+            summary=content.summary,
+            image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
+            voxels=self.path / VOXELS / f"{planned.unit.slug}.parquet" if planned.kept else None,
+            truth=truth if planned.image_space and f"{TRUTH}/{truth.name}" in content.files else None,
+        )
+
+    def save_result(self, result: Result) -> None:
+        """Write summary.json and manifest.json."""
+        write_json(self.path / "summary.json", result.to_dict())
+        write_json(self.path / "manifest.json", result.manifest)
+
+    @contextlib.contextmanager
+    def started(self) -> Iterator[str]:
+        """A name for this start, by which workers know the folder while the block lasts."""
+        start = uuid.uuid4().hex
+        for leftover in (name for pattern in LEFTOVERS for name in self.path.glob(pattern)):
+            leftover.unlink()
+        (self.path / FAILURES).unlink(missing_ok=True)
+        marker = shared_marker(self.path, start)
+        marker.touch()
+        try:
+            yield start
+        finally:
+            marker.unlink(missing_ok=True)
+
+    def _is_whole(self, planned: Planned, content: UnitContent) -> bool:
+        """Whether the unit's file has what is wanted of it, and its other files are there as they were."""
+        if isinstance(planned, PlannedUnit):
+            has = content.summary is not None and (content.image_space is not None or not planned.image_space)
+            wanted = self._wanted(planned)
+        else:
+            has, wanted = content.regions is not None, []
+        paths = {name: self.path / name for name in wanted}
+        return has and all(
+            path.exists() and file_digest(path).hex() == content.files.get(name) for name, path in paths.items()
+        )
+
+    def _wanted(self, planned: PlannedUnit) -> list[str]:
+        unit: Unit = planned.unit
+        wanted = [f"{VOXELS}/{unit.slug}.parquet", f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
+        if planned.kept and planned.config.events and planned.logged:
+            wanted.append(f"{EVENTS}/{unit.slug}.parquet")
+        return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
+
+
+def unit_key(identity: str, digest: str) -> str:
+    """Under which a unit is kept: the hash of its settings, then one of its input."""
+    return identity + hashlib.blake2b(digest.encode(), digest_size=8).hexdigest()
+
+
+def load_result(folder: str | Path) -> Result:
+    """What a finished run or study found, from its folder. Raises DataError where it is not there or damaged."""
+    folder = Path(folder)
+    content = read_json(folder / "summary.json")
+    try:
+        return Result.from_dict(content, folder, read_json(folder / "manifest.json"))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{folder / 'summary.json'}: not the summary of a run or a study ({error!r})") from error
+
+
+def _read_unit(file: Path) -> UnitContent | None:
+    try:
+        return UnitContent.from_dict(read_json(file))
+    except (DataError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
+        logger.warning("%s: damaged; the unit is computed again", file)
+        return None
+
+
+def _claimed(path: Path) -> dict[str, Any] | None:
+    """The settings of an earlier start; None where there is none. Changes nothing."""
+    if not path.exists():
+        return None
+    if not path.is_dir():
+        raise ConfigError(f"{path}: is a file; name a folder")
+    settings = path / SETTINGS
+    if (path / "study.yaml").exists() or (settings.exists() and _first_line(settings) != LAYOUT):
+        raise ConfigError(f"{path}: holds results of an earlier version of semstab; choose another folder")
+    if settings.exists():
+        return read_yaml(settings)
+    beginnings = {UNITS} | {file.name for pattern in LEFTOVERS[:2] for file in path.glob(pattern)}
+    if any(entry.name not in beginnings for entry in path.iterdir()) or any(path.glob(f"{UNITS}/*")):
+        raise ConfigError(f"{path}: is not empty and holds no run or study; choose another folder")
+    return None
+
+
+def _first_line(path: Path) -> str:
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        return lines.readline(200).rstrip("\n")
+
+
+def _locked(path: Path) -> int:
+    """A lock on the folder, which ends with this process."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        raise ConfigError(f"{path}: another process works on it; wait for it, or choose another folder") from error
+    return handle
+
+
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
+    """The first setting that is there twice and differs."""
+    for key, a in old.items():
+        if key not in new or key in ("name", "description", "scenes", "backbones", "backends", "sweeps"):
+            continue
+        b = new[key]
+        if isinstance(a, dict) and isinstance(b, dict):
+            if change := _first_change(a, b, f"{prefix}{key}."):
+                return change
+        elif a != b:
+            return f"{prefix}{key}: {a} there, {b} here"
+    return None

@@ -1,0 +1,305 @@
+"""The plan: scenes x backbones x backends x variations, which unit each is, and what its numbers depend on."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+from semstab.backends import create, keeps_log
+from semstab.config import BACKENDS, BASE, SHARED, BackendConfig, Config, FrameSelection, Noise, Part, Perturbation, Sweeps
+from semstab.datasets import Regional, Scene, Tracked, open_dataset
+from semstab.engine.jobs import Request
+from semstab.task import Task, applies, frame_indices, selected, tasks_of
+from semstab.errors import ConfigError
+from semstab.records import REGIONS, Variation
+from semstab.results import Unit
+
+FORMAT = 2
+"""Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
+
+IN_KEYS = ("voxel_size", "pixel_stride", "exclude", "perturbation", "strata", "statistics")
+"""Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
+the input, frames, classes, the backend."""
+
+NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
+
+Change = Callable[[Config], Config]
+"""What a variation does to the settings of a base unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedUnit:
+    """A backbone on a scene, fused by a backend under one variation, and what is wanted of it.
+
+    config       its settings as those of a run of its own: one scene, one backbone, one backend
+    task         the unit, opened and checked
+    identity     hash of the settings that its numbers depend on; what shares it is computed once
+    image_space  whether its stability in image coordinates is wanted
+    kept         whether its voxels and its time series are kept
+    """
+
+    variation: Variation
+    config: Config
+    task: Task
+    identity: str
+    image_space: bool
+    kept: bool
+
+    @property
+    def unit(self) -> Unit:
+        """Its scene, backbone and backend."""
+        return self.task.units[0]
+
+    @property
+    def frames(self) -> int:
+        """How many go into its map."""
+        return len(self.task.indices)
+
+    @property
+    def digest(self) -> str:
+        """A hash of its input."""
+        return self.task.digest
+
+    @property
+    def logged(self) -> bool:
+        """Whether its backend can give the log of its observations."""
+        return keeps_log(self.unit.backend)
+
+    def request(self) -> Request:
+        """What a job is told of it."""
+        return Request(self.identity, self.config, self.image_space, self.kept)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRegions:
+    """A label source of regions without classes on a scene; config and identity are as in `PlannedUnit`."""
+
+    config: Config
+    scene: Scene
+    backbone: str
+    identity: str
+    image_space: bool = False
+    kept: bool = False
+
+    @property
+    def variation(self) -> Variation:
+        """It is varied in nothing."""
+        return Variation(REGIONS)
+
+    @property
+    def unit(self) -> Unit:
+        """Its scene and backbone; no backend fuses it."""
+        return Unit(self.scene.name, self.backbone, "none")
+
+    @property
+    def frames(self) -> int:
+        """How many are compared with the one before."""
+        return len(frame_indices(self.scene, self.config))
+
+    @property
+    def digest(self) -> str:
+        """A hash of its input."""
+        return self.scene.digest(frame_indices(self.scene, self.config), self.backbone)
+
+    def request(self) -> Request:
+        """What a job is told of it."""
+        return Request(self.identity, self.config, regions=True)
+
+
+Planned = PlannedUnit | PlannedRegions
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All that a run or a study computes, in order, checked before the first image is read."""
+
+    config: Config
+    scenes: Mapping[str, Scene]
+    units: tuple[PlannedUnit, ...]
+    regions: tuple[PlannedRegions, ...]
+
+    def every(self) -> list[Planned]:
+        """The units, then the regions."""
+        return [*self.units, *self.regions]
+
+    def distinct(self) -> dict[str, Planned]:
+        """What is to be computed, by its identity, with all that is wanted of it anywhere."""
+        distinct: dict[str, Planned] = {each.identity: each for each in self.regions}
+        for each in self.units:
+            known = distinct.get(each.identity, each)
+            distinct[each.identity] = dataclasses.replace(
+                known, image_space=known.image_space or each.image_space, kept=known.kept or each.kept
+            )
+        return distinct
+
+    @cached_property
+    def tasks(self) -> tuple[Task, ...]:
+        """Each backbone on each scene at the base settings, with all backends that fuse it so."""
+        backends: dict[tuple[str, str], list[str]] = {}
+        for each in self.units:
+            if each.variation.sweep in (BASE, BACKENDS):
+                backends.setdefault((each.unit.scene, each.unit.backbone), []).append(each.unit.backend)
+        return tuple(
+            dataclasses.replace(each.task, backends=tuple(backends[each.unit.scene, each.unit.backbone]))
+            for each in self.units
+            if each.variation.sweep == BASE
+        )
+
+
+def make_plan(config: Config) -> Plan:
+    """Open what the configuration selects and check that it fits together; no image is read.
+
+    Raises ConfigError, DataError or MissingDependencyError where something does not.
+    """
+    for backend in config.fused_by():  # an engine that is missing is said before all else
+        create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
+    _check_names(config.scene_frames, names, "scene_frames")
+    scenes = {name: dataset.scene(name) for name in names}
+    base = tuple(_base_units(config, scenes))
+    units = (*base, *_varied_units(config, base, scenes))
+    return Plan(config, scenes, units, tuple(_planned_regions(config, scenes)))
+
+
+def _base_settings(config: Config, scene: str, backbones: list[str] | None) -> Config:
+    """The settings of a scene's base units, fused by the first backend."""
+    noise = config.perturbation
+    return config.model_copy(
+        update={
+            "scenes": [scene],
+            "backbones": backbones,
+            "frames": config.scene_frames.get(scene, config.frames),
+            "backends": config.backends[:1],
+            "check": None,
+            "perturbation": None if noise is None else noise.model_copy(update={"seed": config.seed}),
+            "sweeps": Sweeps(),
+            "shared_taxonomy": None,
+        }
+    )
+
+
+def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+    for name, scene in scenes.items():
+        fused = config.backbones
+        if fused is None:
+            fused = [backbone for backbone in scene.backbones if backbone not in config.region_maps]
+        settings = _base_settings(config, name, fused)
+        for task in tasks_of(scene, settings):
+            one = settings.model_copy(update={"backbones": [task.backbone]})
+            yield PlannedUnit(Variation(BASE), one, task, identity(one, task), image_space=True, kept=True)
+
+
+def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedRegions]:
+    for name, scene in scenes.items():
+        regions = scene.regions if isinstance(scene, Regional) else ()
+        for backbone in selected(config.region_maps, scene.backbones, regions, "region map", name):
+            settings = _base_settings(config, name, [backbone])
+            unit, frames = [name, backbone], frame_indices(scene, settings)
+            fused_only = {"voxel_size", "strata", "statistics"}
+            key = _hash(settings, {"regions": unit, "frames": frames}, fused_only)
+            yield PlannedRegions(settings, scene, backbone, key)
+
+
+def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+    for variation, part, change in _variations(config):
+        for each in _restricted(base, part, variation.sweep):
+            varied = change(each.config)
+            (task,) = tasks_of(scenes[each.unit.scene], varied)
+            _check_count(variation, task)
+            kept = variation.sweep == BACKENDS
+            yield PlannedUnit(variation, varied, task, identity(varied, task), image_space=False, kept=kept)
+
+
+def _variations(config: Config) -> Iterator[tuple[Variation, Part, Change]]:
+    """Each point of each sweep, where it applies, and what it changes."""
+    if config.shared_taxonomy is not None:
+        yield Variation(SHARED), Part(), partial(_changed, {"taxonomy": config.shared_taxonomy})
+    for sweep, part in config.sweeps.given():
+        for value in part.values:
+            repeats = part.repeats if isinstance(part, Noise) and value else 1
+            for repeat in range(repeats):
+                yield Variation(sweep, value, repeat), part, _change(sweep, value, config.seed + repeat)
+    _, *others = config.fused_by()
+    logged = next((backend for backend in config.fused_by() if keeps_log(backend.name)), None)
+    for backend in others:
+        yield Variation(BACKENDS), backend, partial(_fused_by, backend, config.statistics and backend is logged)
+
+
+def _change(sweep: str, value: float, seed: int) -> Change:
+    if sweep == "frame_count":
+        return partial(_evenly_sampled, int(value))
+    if sweep in NOISES:
+        return partial(_disturbed, {sweep: value, "seed": seed})
+    return partial(_changed, {sweep: value})
+
+
+def _changed(settings: Mapping[str, Any], base: Config) -> Config:
+    return base.model_copy(update=settings)
+
+
+def _disturbed(noise: Mapping[str, Any], base: Config) -> Config:
+    """With that noise beside what there is in every unit."""
+    disturbed = (base.perturbation or Perturbation()).model_copy(update=noise)
+    return base.model_copy(update={"perturbation": disturbed if disturbed.adds_noise else None})
+
+
+def _fused_by(backend: BackendConfig, statistics: bool, base: Config) -> Config:
+    """By another backend; its map is compared with the base one, whose statistics are enough where they are full."""
+    named = BackendConfig(name=backend.name, options=backend.options)
+    return base.model_copy(update={"backends": [named], "statistics": statistics})
+
+
+def _evenly_sampled(count: int, base: Config) -> Config:
+    """`count` frames, evenly spaced over the extent of the base's: from its start to its stop, or over its list."""
+    extent = base.frames.model_dump(include={"start", "stop", "from_time", "to_time"})
+    even = FrameSelection(**extent, spacing="even", count=count)
+    if (listed := base.frames.list) is not None:
+        even = FrameSelection(list=[listed[k] for k in even.indices(len(listed))])
+    return base.model_copy(update={"frames": even})
+
+
+def _check_count(variation: Variation, task: Task) -> None:
+    """Fewer frames than asked for would pass for another sampling density."""
+    tracked = isinstance(task.scene, Tracked)  # frames without a pose are left out, and said so
+    if variation.sweep == "frame_count" and len(task.indices) != variation.value and not tracked:
+        raise ConfigError(
+            f"sweeps.frame_count: {task.scene.name} has {len(task.indices)} frames over the extent of the base ones,"
+            f" not {variation.value}; leave it out with 'scenes', or widen 'frames'"
+        )
+
+
+def identity(config: Config, task: Task) -> str:
+    """Hash of the settings that a unit's numbers depend on, beside its input."""
+    mapping = task.mapping
+    content = {
+        "unit": dataclasses.asdict(task.units[0]),
+        "options": config.backends[0].options,
+        "frames": task.indices,
+        "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
+    }
+    return _hash(config, content)
+
+
+def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:
+    settings = config.model_dump(mode="json", include={*IN_KEYS} - {*without})
+    text = json.dumps([FORMAT, settings, content], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _restricted(base: Sequence[PlannedUnit], part: Part, name: str) -> list[PlannedUnit]:
+    """The base units of the scenes and backbones that a part names."""
+    _check_names(part.scenes, [each.unit.scene for each in base], f"{name}.scenes")
+    _check_names(part.backbones, [each.unit.backbone for each in base], f"{name}.backbones")
+    return [each for each in base if applies(part, each.unit.scene, each.unit.backbone)]
+
+
+def _check_names(wanted: Iterable[str] | None, known: Sequence[str], where: str) -> None:
+    for name in wanted or ():
+        if name not in known:
+            raise ConfigError(f"{where}: '{name}' is not among {', '.join(dict.fromkeys(known))}")

@@ -1,0 +1,73 @@
+"""What a run or a study looks like in the terminal while it works, and what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from semstab.check import Verdict
+from semstab.engine.observer import Observer
+from semstab.engine.units import Plan, Planned
+from semstab.config import BASE
+from semstab.records import Failure, Result
+from semstab.task import Task
+
+
+class ProgressBar(Observer):
+    """One bar for all of it, in frames that go into maps."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+        self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
+        self.work = self.bar.add_task("starting", total=None)
+        self.notes: list[str] = []
+
+    def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
+        """Show the bar: the frames of every unit that is to be computed are its total."""
+        units = plan.distinct()
+        if kept:
+            self.bar.console.print(f"kept from before: {len(kept)} of {len(units)} units", style="dim")
+        missing = units.keys() - {each.identity for each in kept}
+        self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
+        self.bar.start()
+
+    def geometry_checked(self, task: Task, verdict: Verdict) -> None:
+        """Remember, until the run is through, what could not be told."""
+        if verdict.state == "unclear":
+            self.notes.append(f"{task.scene.name}: {verdict.text}")
+
+    def advanced(self, frames: int, what: str) -> None:
+        """So many frames further."""
+        self.bar.update(self.work, advance=frames, description=what[:40])
+
+    def run_finished(self, result: Result) -> None:
+        """Take the bar away, and say what could not be told."""
+        self.close()
+        for note in self.notes:
+            self.bar.console.print(note, style="dim", soft_wrap=True)
+
+    def close(self) -> None:
+        """Take the bar away, also where the run was interrupted."""
+        self.bar.stop()
+
+
+def failure_lines(result: Result) -> Iterator[str]:
+    """One line for what failed for the same reason."""
+    reasons: dict[tuple[str, str, str], list[Failure]] = {}
+    for failure in result.failures:
+        reasons.setdefault((failure.unit.scene, failure.unit.backbone, failure.message), []).append(failure)
+    for (scene, backbone, message), failures in reasons.items():
+        varied = [name for failure in failures if (name := _named(failure))]
+        what = f"{varied[0]}{f' and {len(varied) - 1} more' if len(varied) > 1 else ''}: " if varied else ""
+        where = "" if message.startswith(f"{scene}, {backbone}") else f"{scene}, {backbone}: "
+        yield f"{where}{what}{message}"
+
+
+def _named(failure: Failure) -> str:
+    """What was varied; nothing of a unit at the base settings."""
+    if failure.variation.sweep == BASE:
+        return ""
+    value = failure.variation.value
+    return f"{failure.variation.sweep} {failure.unit.backend if value is None else value}"

@@ -1,0 +1,71 @@
+"""From a file and options to the configuration of a run or a study, with all that its dataset brings along."""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from semstab.config import Config, explain, merge, nearest, read_yaml
+from semstab.datasets import options_model
+from semstab.errors import ConfigError
+
+
+def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
+    """The configuration of a file with overrides on top, over what ships for its dataset in configs/datasets/."""
+    content = merge(read_yaml(path) if path is not None else {}, overrides or {})
+    return Config.build(merge(dataset_defaults(content), content), str(path or "configuration"))
+
+
+def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
+    """The same of a study's file, or of a shipped study by its name.
+
+    It is called as its file, and checked against no backend that it does not name. Raises ConfigError where there is no
+    such study.
+    """
+    path = _find(str(study))
+    content = merge(read_yaml(path), overrides or {})
+    own = {"name": path.stem, "check": None}
+    return Config.build(merge(own, merge(dataset_defaults(content), content)), str(path))
+
+
+def shipped_studies() -> tuple[str, ...]:
+    """Names of the studies that ship with semstab."""
+    return tuple(sorted(path.stem for path in _shipped("studies").glob("*.yaml")))
+
+
+def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that ship for the dataset which the content names, or for the built-in one."""
+    dataset = content.get("dataset")
+    name = dataset.get("name") if isinstance(dataset, Mapping) else dataset
+    shipped = _shipped("datasets") / f"{name or 'city'}.yaml"
+    return read_yaml(shipped) if shipped.is_file() else {}
+
+
+def resolve(config: Config) -> Config:
+    """The configuration with every default of its dataset's options filled in, paths absolute."""
+    name = config.dataset.name
+    model = options_model(name)
+    try:
+        options = model.model_validate(config.dataset.options)
+    except ValidationError as error:
+        raise ConfigError(f"dataset '{name}', options: {explain(error, model)}") from error
+    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
+    content = options.model_copy(update=paths).model_dump(mode="json")
+    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": content})})
+
+
+def _find(study: str) -> Path:
+    if study in shipped_studies():
+        return _shipped("studies") / f"{study}.yaml"
+    path = Path(study)
+    if path.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"study '{study}' is not known; {nearest(study, shipped_studies())}, or name a .yaml file")
+    return path
+
+
+def _shipped(kind: str) -> Path:
+    return Path(str(importlib.resources.files("semstab.configs") / kind))
