@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Collection, Iterator
@@ -14,6 +13,7 @@ from typing import Any
 import yaml
 
 from semstab.errors import ConfigError, DataError, one_line
+from semstab.json_form import to_json
 
 
 @contextmanager
@@ -45,8 +45,8 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write `value` atomically as JSON; undefined numbers (NaN, infinity) become null."""
-    write_text(path, json.dumps(_defined(value), indent=2, allow_nan=False) + "\n")
+    """Write `value`, a dataclass for example, atomically as JSON; undefined numbers (NaN, infinity) become null."""
+    write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
 
 
 def keep_only(written: Collection[Path], folder: Path) -> None:
@@ -63,8 +63,8 @@ def read_json(path: str | Path) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({error})") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
 
 
 def parse_yaml(text: str, where: str) -> Any:
@@ -77,16 +77,3 @@ def parse_yaml(text: str, where: str) -> Any:
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
-
-
-def _defined(value: Any) -> Any:
-    """JSON has no NaN: an undefined number is null, never 0."""
-    if isinstance(value, dict):
-        return {key: _defined(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_defined(item) for item in value]
-    if hasattr(value, "item"):  # a numpy scalar
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
