@@ -25,7 +25,8 @@ def run(
     """Fuse, measure and compare what the configuration selects, without printing.
 
     A folder `out`, in which the finished units of an earlier start are kept, gets the summary, voxels, time series and,
-    unless `report` is False, tables, figures and report.html. An executor says where the work is done. Raises ConfigError or DataError; what was finished before stays in the folder.
+    unless `report` is False, tables, figures and report.html. An executor says where the work is done.
+    Raises ConfigError or DataError; what was finished before stays in the folder.
     """
     reporting = [Reporting(out)] if report and out is not None else []
     return execute(config, out=out, executor=executor, observers=[*observers, *reporting], command=command)

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from semstab.metrics import macro_mean, pool
+from semstab.records import Record, Result, Variation
 from semstab.results import Means
 from semstab.statistics import number_at
-from semstab.records import Record, Result, Variation
 
 ENOUGH = 1000
 """Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its

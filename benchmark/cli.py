@@ -381,9 +381,7 @@ def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, r
     observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
     gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
     try:
-        result = run_study(
-            config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on"
-        )
+        result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
         for line in failure_lines(result):
             _say(f"error: {line}")
         if not quiet:

@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from semstab.check import Verdict
+from semstab.config import BASE
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan, Planned
-from semstab.config import BASE
 from semstab.records import Failure, Result
 from semstab.task import Task
 

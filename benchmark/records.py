@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import BACKENDS, BASE
+from semstab.json_form import INLINE
 from semstab.results import Agreement, Unit, UnitSummary
 from semstab.voxels import VoxelTable
-
-SCHEMA = 2
-"""Version of summary.json."""
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
@@ -24,6 +21,7 @@ where the dataset has it, color (H, W, 3)."""
 
 REGIONS = "region_maps"
 """Not a sweep: the label sources that hold regions without classes."""
+
 
 @dataclass(frozen=True, order=True)
 class Variation:
@@ -70,16 +68,16 @@ class Record:
     summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
                 what `semstab.statistics` says of the map
     image_space of the 'base' units; all NaN elsewhere
-    voxels      file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and where no folder is kept
-    truth       file of the ground truth's voxels of the same frames, where the statistics fused it
+    voxels_file file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and without a folder
+    truth_file  file of the ground truth's voxels of the same frames, where the statistics fused it
     """
 
     key: str
     variation: Variation
-    summary: UnitSummary
+    summary: UnitSummary = field(metadata=INLINE)
     image_space: ImageSpace = ImageSpace()
-    voxels: Path | None = None
-    truth: Path | None = None
+    voxels_file: Path | None = None
+    truth_file: Path | None = None
 
     @property
     def statistics(self) -> Mapping[str, Any]:
@@ -93,14 +91,14 @@ class Record:
 
     def table(self) -> VoxelTable:
         """Its voxels, read from their file."""
-        if self.voxels is None:
+        if self.voxels_file is None:
             raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
-        return VoxelTable.load(self.voxels)
+        return VoxelTable.load(self.voxels_file)
 
     @property
     def series(self) -> Path | None:
         """File of its time series, beside that of its voxels."""
-        return None if self.voxels is None else self.voxels.parent.parent / "frames" / f"{self.unit.slug}.csv"
+        return None if self.voxels_file is None else self.voxels_file.parent.parent / "frames" / f"{self.unit.slug}.csv"
 
 
 @dataclass(frozen=True)
@@ -116,12 +114,6 @@ class RegionFlicker:
     flicker_percent: float
     compensated_flicker_percent: float
     compensated_share: float
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> RegionFlicker:
-        """Read the JSON object; null is NaN."""
-        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in content.items()}
-        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -141,36 +133,12 @@ class UnitContent:
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        return {
-            "input": self.input,
-            "summary": None if self.summary is None else self.summary.to_dict(),
-            "image_space": None if self.image_space is None else dataclasses.asdict(self.image_space),
-            "up": self.up,
-            "files": dict(self.files),
-            "regions": None if self.regions is None else dataclasses.asdict(self.regions),
-        }
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> UnitContent:
-        """Read what `to_dict` wrote."""
-        summary, image_space, up, regions = (content[name] for name in ("summary", "image_space", "up", "regions"))
-        return cls(
-            input=content["input"],
-            summary=None if summary is None else UnitSummary.from_dict(summary),
-            image_space=None if image_space is None else read_image_space(image_space),
-            up=None if up is None else (up[0], up[1], up[2]),
-            files=content["files"],
-            regions=None if regions is None else RegionFlicker.from_dict(regions),
-        )
-
 
 @dataclass(frozen=True)
 class Failure:
     """A unit that could not be computed, and the one line that says why."""
 
-    unit: Unit
+    unit: Unit = field(metadata=INLINE)
     variation: Variation
     message: str
 
@@ -229,77 +197,16 @@ class Result:
         return {sweep: tuple(sorted(values)) for sweep, values in found.items()}
 
     @property
+    def runs(self) -> tuple[UnitSummary, ...]:
+        """The summaries of the units at the base settings, by whatever backend, those of a scene and backbone together."""
+        units = (*self.select(), *self.select(BACKENDS))
+        groups = dict.fromkeys((record.unit.scene, record.unit.backbone) for record in units)
+        return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.backbone) == group)
+
+    @property
     def agrees(self) -> bool:
         """Whether backends that must agree do so everywhere."""
         return all(row.agrees for row in self.agreement)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The content of summary.json; `load_result` reads it back."""
-        return {
-            "schema": SCHEMA,
-            "name": self.name,
-            "backend": self.backend,
-            "up": {scene: list(axis) for scene, axis in self.up.items()},
-            "runs": [_record_content(record) for record in self.records],
-            "failures": [
-                dataclasses.asdict(row.unit) | {"variation": dataclasses.asdict(row.variation), "message": row.message}
-                for row in self.failures
-            ],
-            "agreement": [row.to_dict() for row in self.agreement],
-            "regions": [dataclasses.asdict(row) for row in self.regions],
-            "comparisons": [dict(row) for row in self.comparisons],
-        }
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any], folder: Path, manifest: Mapping[str, Any]) -> Result:
-        """Read what `to_dict` wrote; voxel files lie in `folder`."""
-        return cls(
-            name=content["name"],
-            backend=content["backend"],
-            records=tuple(_record(row, folder) for row in content["runs"]),
-            failures=tuple(_failure(row) for row in content["failures"]),
-            agreement=tuple(Agreement.from_dict(row) for row in content["agreement"]),
-            up={scene: (axis[0], axis[1], axis[2]) for scene, axis in content["up"].items()},
-            manifest=manifest,
-            regions=tuple(RegionFlicker.from_dict(row) for row in content["regions"]),
-            comparisons=tuple(content["comparisons"]),
-        )
-
-
-def _record_content(record: Record) -> dict[str, Any]:
-    return record.summary.to_dict() | {
-        "key": record.key,
-        "variation": dataclasses.asdict(record.variation),
-        "image_space": dataclasses.asdict(record.image_space),
-        "voxels_file": _below(record.voxels),
-        "truth_file": _below(record.truth),
-    }
-
-
-def _record(row: Mapping[str, Any], folder: Path) -> Record:
-    return Record(
-        key=row["key"],
-        variation=Variation(**row["variation"]),
-        summary=UnitSummary.from_dict(row),
-        image_space=read_image_space(row["image_space"]),
-        voxels=None if row["voxels_file"] is None else folder / row["voxels_file"],
-        truth=None if row["truth_file"] is None else folder / row["truth_file"],
-    )
-
-
-def _below(path: Path | None) -> str | None:
-    """A unit's file as it is called in the folder."""
-    return None if path is None else f"{path.parent.name}/{path.name}"
-
-
-def _failure(row: Mapping[str, Any]) -> Failure:
-    unit = Unit(row["scene"], row["backbone"], row["backend"])
-    return Failure(unit, Variation(**row["variation"]), row["message"])
-
-
-def read_image_space(row: Mapping[str, float | None]) -> ImageSpace:
-    """The measures from JSON, where null is NaN."""
-    return ImageSpace(**{name: math.nan if value is None else value for name, value in row.items()})
 
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:

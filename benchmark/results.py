@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-SCHEMA = 1
+from semstab.json_form import INLINE
+
+SCHEMA = 2
 """Version of summary.json."""
 
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
@@ -121,48 +122,15 @@ class UnitSummary:
     nothing was asked for.
     """
 
-    unit: Unit
+    unit: Unit = field(metadata=INLINE)
     taxonomy: str
     frames: int
-    table: TableSummary
+    table: TableSummary = field(metadata=INLINE)
     flicker_percent: float
     fuse_ms_per_frame: float
-    stages_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
     left_out: int = 0
-    statistics: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        rest = {name: getattr(self, name) for name in _UNIT_FIELDS}
-        return (
-            dataclasses.asdict(self.unit)
-            | rest
-            | {"stages_ms": dict(self.stages_ms), "left_out": self.left_out}
-            | dataclasses.asdict(self.table)
-            | {"statistics": dict(self.statistics)}
-        )
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> UnitSummary:
-        """Read one entry of 'runs'; null is NaN."""
-        content = _defined(content)
-        groups = {
-            "strata": tuple(_means(row) for row in content["strata"]),
-            "classes": tuple(_means(row) for row in content["classes"]),
-            "recurrent": _means(content["recurrent"]),
-        }
-        table = {field.name: content[field.name] for field in dataclasses.fields(TableSummary)}
-        return cls(
-            Unit(content["scene"], content["backbone"], content["backend"]),
-            table=TableSummary(**table | groups),
-            **{name: content[name] for name in _UNIT_FIELDS},
-            stages_ms=_defined(content.get("stages_ms", {})),  # runs of earlier versions have none
-            left_out=content.get("left_out", 0),
-            statistics=content.get("statistics", {}),
-        )
-
-
-_UNIT_FIELDS = ("taxonomy", "frames", "flicker_percent", "fuse_ms_per_frame")
+    statistics: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -184,76 +152,3 @@ class Agreement:
     only_in: tuple[int, int]
     differences: Mapping[str, Difference]
     agrees: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Agreement:
-        """Read one entry of 'agreement'; null is NaN."""
-        differences = {name: Difference(**_defined(row)) for name, row in content["differences"].items()}
-        pairs = {name: tuple(content[name]) for name in ("backends", "voxels", "only_in")}
-        return cls(**dict(content) | pairs | {"differences": differences})
-
-
-@dataclass(frozen=True)
-class GroupResult:
-    """A backbone on a scene, fused by every backend of the run: the units' summaries and how far they agree."""
-
-    runs: tuple[UnitSummary, ...]
-    agreement: tuple[Agreement, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        return {"runs": [run.to_dict() for run in self.runs], "agreement": [row.to_dict() for row in self.agreement]}
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> GroupResult:
-        """Read what `to_dict` wrote."""
-        runs = tuple(UnitSummary.from_dict(row) for row in content["runs"])
-        return cls(runs, tuple(Agreement.from_dict(row) for row in content["agreement"]))
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """All that a run found; `to_dict` is summary.json.
-
-    comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
-    """
-
-    groups: tuple[GroupResult, ...]
-    comparisons: tuple[Mapping[str, Any], ...] = ()
-
-    @property
-    def runs(self) -> tuple[UnitSummary, ...]:
-        """The summaries of all units."""
-        return tuple(run for group in self.groups for run in group.runs)
-
-    @property
-    def agreement(self) -> tuple[Agreement, ...]:
-        """The agreement of each pair of backends on each group."""
-        return tuple(row for group in self.groups for row in group.agreement)
-
-    @property
-    def agrees(self) -> bool:
-        """Whether every pair of backends agrees everywhere."""
-        return all(row.agrees for row in self.agreement)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The content of summary.json."""
-        return {
-            "schema": SCHEMA,
-            "runs": [run.to_dict() for run in self.runs],
-            "agreement": [row.to_dict() for row in self.agreement],
-            "comparisons": [dict(row) for row in self.comparisons],
-        }
-
-
-def _means(row: Mapping[str, Any]) -> Means:
-    return Means(**_defined(row))
-
-
-def _defined(row: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON's null is NaN."""
-    return {key: math.nan if value is None else value for key, value in row.items()}

@@ -9,8 +9,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from semstab.metrics import macro_mean, pool
 from semstab.config import BACKENDS
+from semstab.metrics import macro_mean, pool
 from semstab.records import Result
 from semstab.results import STAGES, Agreement, Means, UnitSummary
 

@@ -70,8 +70,14 @@ def _name(item: Any) -> str | None:
     """What an entry is called among its neighbours."""
     if not isinstance(item, dict):
         return None
-    found = [json.dumps(item[key], sort_keys=True).strip('"') for key in NAMED_BY if key in item]
+    given = [key for key in NAMED_BY if key in item and not _base(key, item)]
+    found = [json.dumps(item[key], sort_keys=True).strip('"') for key in given]
     return " ".join(found) or None
+
+
+def _base(key: str, item: dict[str, Any]) -> bool:
+    """Units at the base settings, by whatever backend, go without a variation: summaries of version 1 have none."""
+    return key == "variation" and item[key]["sweep"] in ("base", "backends")
 
 
 def _is_ignored(key: str) -> bool:

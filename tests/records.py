@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.metrics import summarise
+from semstab.records import BASE, Record, Result, Variation
 from semstab.results import Unit, UnitSummary
-from semstab.study.results import BASE, Record, StudyResult, Variation
 from semstab.voxels import VoxelTable
 
 CLASSES = ("a", "b", "c")
@@ -44,4 +44,4 @@ def record(table, sweep=BASE, value=None, repeat=0, scene="s", backbone="m", bac
 
 def study(*records, **more):
     """A study of these records."""
-    return StudyResult("by hand", "numpy", records, **more)
+    return Result("by hand", "numpy", records, **more)

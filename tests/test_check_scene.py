@@ -27,7 +27,7 @@ from semstab.config import Config
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 
@@ -80,7 +80,7 @@ def test_motion_is_that_of_the_poses(sound):
 
 def test_persistence_is_that_of_the_run(folder, sound):
     """All 12 frames are fused, so that OP is the run's own."""
-    (run,) = semstab.run(configured(folder, voxel_size=0.1, backbones=["gt"], backends=["numpy"])).runs
+    (run,) = semstab.engine.run(configured(folder, voxel_size=0.1, backbones=["gt"], backends=["numpy"])).runs
     row = next(row for row in sound.persistence if row.voxel_size == 0.1)
     assert sound.fused_frames == 12
     assert (row.voxels, row.mean_op) == (run.table.voxels, pytest.approx(run.table.mean_op))
@@ -361,10 +361,10 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
     config = configured(folder, backbones=["net"], backends=["numpy"], check=None)
     with pytest.raises(DataError, match=r"room: depth reprojects .* pose_convention: world_to_camera"):
-        semstab.run(config, out=tmp_path / "run")
+        semstab.engine.run(config, out=tmp_path / "run")
     assert not list((tmp_path / "run").rglob("*.parquet"))
     trusting = config.model_copy(update={"check_geometry": False})
-    (run,) = semstab.run(trusting, out=tmp_path / "run").runs  # the same folder: the numbers do not depend on it
+    (run,) = semstab.engine.run(trusting, out=tmp_path / "run").runs  # the same folder: the numbers do not depend on it
     assert run.table.voxels > 0
     assert "check" not in json.loads((tmp_path / "run/manifest.json").read_text())["seconds"]
     arguments = ("--data", folder, "-b", "numpy", "--rerun", "off", "-q", "--out")
@@ -396,13 +396,13 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
             seen.append((task.scene.name, verdict.state))
 
     config = configured(folder, backends=["numpy"], backbones=["net", "gt"])
-    semstab.run(config, out=tmp_path / "run", observers=[Watching()])
+    semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
     assert manifest["geometry"]["room"]["state"] == "sound"
     assert manifest["geometry"]["room"]["frames"] == 4
     assert manifest["seconds"]["check"] > 0
     assert seen == [("room", "sound")]  # once a scene, not once a backbone
-    semstab.run(config, out=tmp_path / "run", observers=[Watching()])
+    semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
     assert len(seen) == 1  # what is kept is not checked again
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from semstab.config import BackendConfig, Config, FrameSelection, merge, read_yaml
 from semstab.errors import ConfigError
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 
 
 def test_defaults_are_the_papers() -> None:

@@ -27,7 +27,7 @@ from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Intrinsics
 from semstab.labels import LabelSpace
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 from semstab.testing.builders import assert_same_map
 
 CITY = {

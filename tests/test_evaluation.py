@@ -19,18 +19,17 @@ from records import record, study, voxels
 
 import semstab
 from semstab.config import Config
+from semstab.engine import Observer, load_result, run_study
+from semstab.engine.memory import estimate
 from semstab.errors import ConfigError
-from semstab.memory import estimate
 from semstab.metrics import sbd
-from semstab.pipeline import Observer
-from semstab.plan import load_config, make_plan
 from semstab.plots import figures
 from semstab.plots.maps import right_or_wrong
 from semstab.plots.statistics import DriftByOP, draw_intervals, draw_reliability
 from semstab.report import TOPICS, write_report
+from semstab.settings import load_config, make_plan
 from semstab.statistics import Estimate, analyse, describe, nulls
 from semstab.statistics.__main__ import main
-from semstab.study import load_study_result, run_study
 from semstab.tables import tables, to_json
 from semstab.terminal import print_summary
 from semstab.voxels import Events, VoxelTable
@@ -120,13 +119,13 @@ def test_the_verdict_on_each_backbone_is_printed(ran) -> None:
 
 def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.run(configure(root, events=True), out=tmp_path / "run")
+    result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     assert entry.statistics == nulls(describe(table, name="a"))
     assert entry.statistics["drift"]["tests"] is None
     assert result.comparisons == ()
-    again = semstab.run(configure(root, events=True), out=tmp_path / "run")  # kept
+    again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
     assert again.runs[0].statistics == entry.statistics
 
 
@@ -141,10 +140,10 @@ class Interrupting(Observer):
 def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall")
     config = configure(root, statistics=True)
-    whole = semstab.run(config)
+    whole = semstab.engine.run(config)
     with pytest.raises(KeyboardInterrupt):
-        semstab.run(config, out=tmp_path / "run", observers=[Interrupting()])
-    resumed = semstab.run(config, out=tmp_path / "run")
+        semstab.engine.run(config, out=tmp_path / "run", observers=[Interrupting()])
+    resumed = semstab.engine.run(config, out=tmp_path / "run")
     assert [entry.statistics for entry in resumed.runs] == [entry.statistics for entry in whole.runs]
     assert resumed.comparisons == whole.comparisons
     assert whole.comparisons[0]["paired"]["values"]["accuracy"]["a"]["value"] > 0.5  # the truth was fused again
@@ -152,20 +151,20 @@ def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> N
 
 def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.run(configure(root, backends=["open3d"], check="numpy", statistics=True))
+    result = semstab.engine.run(configure(root, backends=["open3d"], check="numpy", statistics=True))
     open3d, numpy = result.runs
     assert open3d.statistics["drift"]["tests"] is None
     assert open3d.statistics["correctness"] is not None
     assert numpy.statistics["drift"]["tests"] is not None
     assert numpy.statistics["agreement"]["alpha"] == pytest.approx(open3d.statistics["agreement"]["alpha"])
-    plain = semstab.run(configure(root, backends=["open3d"], check="numpy"))
+    plain = semstab.engine.run(configure(root, backends=["open3d"], check="numpy"))
     assert [bool(entry.statistics) for entry in plain.runs] == [True, False]
 
 
 def test_frames_without_ground_truth_are_left_out_of_the_truth(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=4)
     (root / "labels/gt/0002.png").unlink()
-    (entry,) = semstab.run(configure(root, statistics=True)).runs
+    (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
     assert entry.statistics["correctness"]["accuracy"]["value"] > 0.5
 
 
@@ -174,7 +173,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
     for path in (root / "labels/gt").iterdir():
         path.unlink()
     (root / "labels/gt").rmdir()
-    (entry,) = semstab.run(configure(root, statistics=True)).runs
+    (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
     assert entry.statistics["correctness"] is entry.statistics["geometry"] is None
     assert entry.statistics["drift"]["tests"] is not None
 
@@ -182,7 +181,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
 def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall")
     (root / "labels/b/label_space.yaml").write_text("name: other\nclasses: [wall, door, window, sky]\n")
-    assert semstab.run(configure(root, statistics=True)).comparisons == ()
+    assert semstab.engine.run(configure(root, statistics=True)).comparisons == ()
 
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
@@ -194,7 +193,7 @@ def test_the_log_counts_as_memory(tmp_path) -> None:
     assert expected.observations == without.observations == 30 * 48
     assert expected.bytes - without.bytes > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):
-        semstab.run(configure(root, backends=["numba"], statistics=True, memory_gb=1e-6))
+        semstab.engine.run(configure(root, backends=["numba"], statistics=True, memory_gb=1e-6))
 
 
 def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, capsys) -> None:
@@ -202,7 +201,7 @@ def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, cap
 
     for scene in ("x", "y"):
         tiny_scene.write(tmp_path / "walls" / scene, ("a",))
-    print_summary(semstab.run(configure(tmp_path / "walls")), Console(width=80))
+    print_summary(semstab.engine.run(configure(tmp_path / "walls")), Console(width=80))
     printed = " ".join(capsys.readouterr().out.split())
     assert "x, a: no verdict" in printed
     assert "y, a: no verdict" in printed
@@ -222,9 +221,9 @@ def studied(tmp_path_factory):
     base = tmp_path_factory.mktemp("studied")
     root = tiny_study.write(base / "wall", frames=8)
     noise = {"depth_noise": {"values": [0, 0.05], "repeats": 2}}
-    settings = {"backbones": list(BACKBONES), "backends": [], "statistics": True, "frames": {}, "sweeps": noise}
+    settings = {"backbones": list(BACKBONES), "backends": ["numpy"], "statistics": True, "frames": {}, "sweeps": noise}
     run_study(tiny_study.configure(root, **settings), base / "out")
-    return load_study_result(base / "out"), base / "out"
+    return load_result(base / "out"), base / "out"
 
 
 def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:

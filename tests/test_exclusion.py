@@ -17,7 +17,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.exclusion import leave_out
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
-from semstab.plan import load_config, make_plan, read
+from semstab.settings import load_config, make_plan, read
 
 CAMERA = Intrinsics(4, 4, 2, 2)
 
@@ -86,9 +86,9 @@ def test_a_mask_of_another_size_or_type_is_refused() -> None:
 
 
 def test_a_run_leaves_out_a_class_and_says_how_many_pixels(root, tmp_path) -> None:
-    everything = semstab.run(configure(root)).runs[0]
+    everything = semstab.engine.run(configure(root)).runs[0]
     out = tmp_path / "run"
-    still = semstab.run(configure(root, exclude={"classes": ["Door"]}), out=out).runs[0]
+    still = semstab.engine.run(configure(root, exclude={"classes": ["Door"]}), out=out).runs[0]
     assert still.left_out > 0
     assert still.table.points + still.left_out == everything.table.points
     classes = {group.name: group.voxels for group in still.table.classes}

@@ -10,10 +10,10 @@ import semstab
 from semstab import memory
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
+from semstab.engine.memory import available_bytes, estimate, require_memory
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
-from semstab.memory import available_bytes, estimate, require_memory
-from semstab.plan import Task, load_config, make_plan, read
+from semstab.task import Task, load_config, make_plan, read
 
 FRAMES = 30
 
@@ -31,7 +31,7 @@ def planned(root, **settings) -> tuple[Task, Config]:
 
 def test_the_estimate_is_exact_for_a_steady_flight(root) -> None:
     task, config = planned(root)
-    table = semstab.run(config).runs[0].table
+    table = semstab.engine.run(config).runs[0].table
     expected = estimate(task, config)
     assert expected.voxels == table.voxels
     assert expected.observations == table.observations
@@ -46,7 +46,7 @@ def test_what_does_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) ->
     _, config = planned(root, memory_gb=1e-6)
     said = r"wall, a: about .* million voxels of 0.25 m would take .* GB, and 1e-06 GB is memory_gb; use larger voxels"
     with pytest.raises(ConfigError, match=said + r".*pixel_stride.*\(numpy\)"):
-        semstab.run(config, out=tmp_path / "run")
+        semstab.engine.run(config, out=tmp_path / "run")
     assert not (tmp_path / "run" / "voxels").exists()
 
 

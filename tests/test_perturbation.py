@@ -12,11 +12,12 @@ import tiny_scene
 
 import semstab
 from semstab.config import Config, Perturbation
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.perturbation import perturb
-from semstab.plan import load_config, make_plan, read
-from semstab.run_folder import group_key
+from semstab.settings import load_config
+from semstab.task import read
 
 H, W = 40, 50
 
@@ -177,18 +178,19 @@ def test_no_noise_changes_nothing(config) -> None:
     np.testing.assert_array_equal(read(task, 1).T_wc, original.T_wc)
 
 
-def test_runs_without_noise_keep_the_keys_of_versions_that_knew_none(config) -> None:
-    plain, noisy = config(), config(perturbation=NOISE)
-    settings = plain.model_dump(mode="json", exclude={"scenes", "backbones", "perturbation"})
-    assert group_key(plain, "s", "b", "d") == group_key(Config.build(settings), "s", "b", "d")
-    assert group_key(plain, "s", "b", "d") != group_key(noisy, "s", "b", "d")
+def test_the_seed_counts_where_there_is_noise(config) -> None:
+    def keys(**settings):
+        return [each.identity for each in make_plan(config(**settings)).units]
+
+    assert keys(seed=4) == keys(seed=5)
+    assert keys(perturbation=NOISE, seed=4) == keys(perturbation=NOISE, seed=4) != keys(perturbation=NOISE, seed=5)
 
 
 def test_a_run_takes_it_as_a_setting_and_keeps_it(config, tmp_path) -> None:
-    plain = semstab.run(config())
-    noisy = semstab.run(config(perturbation=NOISE), out=tmp_path / "run")
+    plain = semstab.engine.run(config())
+    noisy = semstab.engine.run(config(perturbation=NOISE), out=tmp_path / "run")
     assert noisy.runs[0].table != plain.runs[0].table
-    again = semstab.run(load_config(tmp_path / "run" / "config.yaml"))
+    again = semstab.engine.run(load_config(tmp_path / "run" / "config.yaml"))
     assert [run.table for run in again.runs] == [run.table for run in noisy.runs]
     assert json.loads(json.dumps(config(perturbation=NOISE).model_dump(mode="json")))["perturbation"]["seed"] == 3
 

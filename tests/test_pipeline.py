@@ -16,10 +16,13 @@ import semstab
 from semstab import metrics
 from semstab.config import Config
 from semstab.datasets import disk
+from semstab.engine import Observer, load_result
+from semstab.engine.folder import Folder
 from semstab.errors import ConfigError, DataError
-from semstab.pipeline import Observer
-from semstab.plan import load_config
-from semstab.results import STAGES, RunResult, Unit
+from semstab.json_form import to_json
+from semstab.records import Result
+from semstab.results import STAGES, Unit
+from semstab.settings import load_config
 
 
 @pytest.fixture
@@ -32,17 +35,17 @@ def configure(root, **settings) -> Config:
     return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25, **settings})
 
 
-def without_times(summary: dict) -> dict:
+def without_times(result: Result) -> list:
     times = ("fuse_ms_per_frame", "stages_ms")
-    runs = [{key: value for key, value in run.items() if key not in times} for run in summary["runs"]]
-    return {**summary, "runs": runs}
+    runs = [{key: value for key, value in to_json(run).items() if key not in times} for run in result.runs]
+    return [runs, to_json(result.agreement), to_json(result.comparisons)]
 
 
 class Watching(Observer):
     def __init__(self) -> None:
         self.seen: list[str] = []
 
-    def run_started(self, plan) -> None:
+    def run_started(self, plan, kept) -> None:
         self.seen.append(f"start {len(plan.tasks)}")
 
     def frame_fused(self, unit, frame, row) -> None:
@@ -51,7 +54,7 @@ class Watching(Observer):
     def unit_finished(self, unit, table, summary) -> None:
         self.seen.append(f"{unit.slug} done {len(table)}")
 
-    def group_kept(self, task, result) -> None:
+    def group_kept(self, task, summaries) -> None:
         self.seen.append(f"kept {task.backbone}")
 
     def run_finished(self, result) -> None:
@@ -71,7 +74,7 @@ class Interrupting(Observer):
 
 def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     """Pixels are as large as voxels here, and the truth is tied to the wall: every voxel keeps one label."""
-    (run,) = semstab.run(configure(root, backbones=["gt"])).runs
+    (run,) = semstab.engine.run(configure(root, backbones=["gt"])).runs
     # 8 columns, and one more a frame; 6 rows
     assert run.table.voxels == (8 + 2) * 6
     assert run.table.points == run.table.observations == 3 * 48
@@ -85,13 +88,13 @@ def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
 
 def test_observers_see_everything_in_order(root) -> None:
     watching = Watching()
-    semstab.run(configure(root, backbones=["a"]), observers=[watching])
+    semstab.engine.run(configure(root, backbones=["a"]), observers=[watching])
     unit = "wall__a__numpy"
     assert watching.seen == ["start 1", f"{unit} 0", f"{unit} 1", f"{unit} 2", f"{unit} done 60", "finished"]
 
 
 def test_every_backbone_goes_through_every_backend_and_they_agree(root) -> None:
-    result = semstab.run(configure(root, backends=["open3d"]))
+    result = semstab.engine.run(configure(root, backends=["open3d"]))
     assert [run.unit.slug for run in result.runs] == [
         "wall__a__open3d", "wall__a__numpy", "wall__b__open3d", "wall__b__numpy"
     ]  # fmt: skip
@@ -101,10 +104,10 @@ def test_every_backbone_goes_through_every_backend_and_they_agree(root) -> None:
 
 def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     out = tmp_path / "run"
-    result = semstab.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"])
+    result = semstab.engine.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"])
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(summary))
-    assert summary["schema"] == 1
+    assert summary["schema"] == 2
     first = summary["runs"][0]
     for key in (
         "scene", "backbone", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",
@@ -138,7 +141,7 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
     """The map's running means, kept frame by frame, equal those of the final table."""
     for backend in ("numpy", "open3d"):
         out = tmp_path / backend
-        (run,) = semstab.run(configure(root, backbones=["b"], backends=[backend], check=None), out=out).runs
+        (run,) = semstab.engine.run(configure(root, backbones=["b"], backends=[backend], check=None), out=out).runs
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
         assert int(last["map_voxels"]) == run.table.voxels
@@ -148,55 +151,98 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
 
 
 def test_running_the_resolved_configuration_again_gives_the_same_numbers(root, tmp_path) -> None:
-    first = semstab.run(configure(root), out=tmp_path / "one")
-    again = semstab.run(load_config(tmp_path / "one" / "config.yaml"), out=tmp_path / "two")
-    assert without_times(again.to_dict()) == without_times(first.to_dict())
+    first = semstab.engine.run(configure(root), out=tmp_path / "one")
+    again = semstab.engine.run(load_config(tmp_path / "one" / "config.yaml"), out=tmp_path / "two")
+    assert without_times(again) == without_times(first)
     assert (tmp_path / "one" / "config.yaml").read_text() == (tmp_path / "two" / "config.yaml").read_text()
 
 
 def test_an_interrupted_run_keeps_what_was_finished_and_goes_on(root, tmp_path) -> None:
     out, config = tmp_path / "run", configure(root)
     with pytest.raises(KeyboardInterrupt):
-        semstab.run(config, out=out, observers=[Interrupting("wall__b__numpy")])
-    kept = json.loads((out / "summary.json").read_text())
-    assert [run["backbone"] for run in kept["runs"]] == ["a"]
+        semstab.engine.run(config, out=out, observers=[Interrupting("wall__b__numpy")])
+    assert not (out / "summary.json").exists()
     watching = Watching()
-    resumed = semstab.run(config, out=out, observers=[watching])
+    resumed = semstab.engine.run(config, out=out, observers=[watching])
     assert "kept a" in watching.seen
     assert not any(line.startswith("wall__a") for line in watching.seen)
-    whole = semstab.run(config, out=tmp_path / "whole")
-    assert without_times(resumed.to_dict()) == without_times(whole.to_dict())
-    assert RunResult(resumed.groups).agrees
+    whole = semstab.engine.run(config, out=tmp_path / "whole")
+    assert without_times(resumed) == without_times(whole)
+    assert resumed.agrees
 
 
 def test_a_changed_input_is_computed_again(root, tmp_path) -> None:
     out, config = tmp_path / "run", configure(root)
-    semstab.run(config, out=out)
+    semstab.engine.run(config, out=out)
     cv2.imwrite(str(root / "labels/b/0001.png"), np.zeros((6, 8), np.uint8))
     watching = Watching()
-    semstab.run(config, out=out, observers=[watching])
+    semstab.engine.run(config, out=out, observers=[watching])
     assert "kept a" in watching.seen
     assert "kept b" not in watching.seen
 
 
-def test_a_folder_of_another_run_is_refused(root, tmp_path) -> None:
+def test_a_folder_of_another_run_is_told_and_of_something_else_refused(root, tmp_path, caplog) -> None:
     out = tmp_path / "run"
-    semstab.run(configure(root), out=out)
-    with pytest.raises(ConfigError, match=r"holds a run with other settings \(voxel_size: 0\.25 there, 0\.5 here\)"):
-        semstab.run(configure(root, voxel_size=0.5), out=out)
+    semstab.engine.run(configure(root), out=out)
+    changed = semstab.engine.run(configure(root, voxel_size=0.5), out=out)
+    assert "earlier results of other settings (voxel_size: 0.25 there, 0.5 here) are replaced" in caplog.text
+    assert changed.manifest["units"]["kept"] == 0
     with pytest.raises(ConfigError, match="is not empty and holds no run"):
-        semstab.run(configure(root), out=root)
+        semstab.engine.run(configure(root), out=root)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="is a file"):
-        semstab.run(configure(root), out=tmp_path / "file")
+        semstab.engine.run(configure(root), out=tmp_path / "file")
 
 
-def test_a_damaged_unit_file_is_named(root, tmp_path) -> None:
+@pytest.mark.parametrize(("name", "text"), [("config.yaml", "voxel_size: 0.2\n"), ("study.yaml", "name: x\n")])
+def test_a_folder_of_an_earlier_version_is_refused_and_not_touched(root, tmp_path, name, text) -> None:
+    out = tmp_path / "run"
+    (out / "units").mkdir(parents=True)
+    (out / name).write_text(text)
+    with pytest.raises(ConfigError, match=r"run: holds results of an earlier version .*; choose another folder"):
+        semstab.engine.run(configure(root), out=out)
+    assert sorted(path.name for path in out.rglob("*")) == sorted(["units", name])
+    assert (out / name).read_text() == text
+
+
+def test_a_folder_that_a_killed_start_only_began_is_taken_over(root, tmp_path) -> None:
+    out = tmp_path / "run"
+    (out / "units").mkdir(parents=True)
+    (out / ".config-ab12.yaml").write_text("half")
+    semstab.engine.run(configure(root, backbones=["a"]), out=out)
+    assert not list(out.rglob(".*"))
+
+
+def test_one_process_owns_a_folder_at_a_time(root, tmp_path) -> None:
+    out = tmp_path / "run"
+    held = Folder(out, configure(root))
+    with pytest.raises(ConfigError, match=r"run: another process works on it"):
+        semstab.engine.run(configure(root), out=out)
+    held.close()
+    semstab.engine.run(configure(root), out=out)
+
+
+def test_a_damaged_unit_file_is_computed_again_and_told(root, tmp_path, caplog) -> None:
     out, config = tmp_path / "run", configure(root)
-    semstab.run(config, out=out)
-    (out / "units" / "wall__a.json").write_text('{"key": ')
-    with pytest.raises(DataError, match=r"wall__a\.json: not valid JSON"):
-        semstab.run(config, out=out)
+    whole = semstab.engine.run(config, out=out)
+    unit, *_ = sorted((out / "units").iterdir())
+    unit.write_text('{"key": ')
+    again = semstab.engine.run(config, out=out)
+    assert f"{unit.name}: damaged; the unit is computed again" in caplog.text
+    assert again.manifest["units"]["computed"] == 1
+    assert without_times(again) == without_times(whole)
+
+
+def test_an_observer_that_fails_costs_nothing_else_and_is_told_at_the_end(root, tmp_path) -> None:
+    class Failing(Observer):
+        def frame_fused(self, unit, frame, row) -> None:
+            raise OSError(28, "No space left on device", "recording.rrd")
+
+    watching, out = Watching(), tmp_path / "run"
+    with pytest.raises(OSError, match="No space left"):
+        semstab.engine.run(configure(root, backbones=["a"]), out=out, observers=[Failing(), watching])
+    assert watching.seen[-1] == "finished"
+    assert load_result(out).runs[0].table.voxels == 60
 
 
 def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, monkeypatch) -> None:
@@ -205,7 +251,7 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     table = NumpyReference.table
     late = {"first_frame": np.full(60, 7), "last_frame": np.full(60, 8)}
     monkeypatch.setattr(NumpyReference, "table", lambda self: dataclasses.replace(table(self), **late))
-    agreeing = semstab.run(configure(root, backbones=["a"], backends=["open3d"]))
+    agreeing = semstab.engine.run(configure(root, backbones=["a"], backends=["open3d"]))
     assert agreeing.agrees  # frame numbers are not compared, evidence is
 
     def half(self):
@@ -213,7 +259,7 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
         return dataclasses.replace(whole, evidence=whole.evidence / 2)
 
     monkeypatch.setattr(NumpyReference, "table", half)
-    result = semstab.run(configure(root, backbones=["a"], backends=["open3d"]), out=tmp_path / "run")
+    result = semstab.engine.run(configure(root, backbones=["a"], backends=["open3d"]), out=tmp_path / "run")
     assert not result.agrees
     assert result.agreement[0].differences["evidence"].max > 0.1
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
@@ -223,14 +269,14 @@ def test_a_scene_without_a_valid_pixel_says_what_is_missing(root) -> None:
     for path in (root / "labels/a").iterdir():
         cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
     with pytest.raises(DataError, match=r"wall, a: no pixel of 3 frames is valid .*depth in 100%.*label in 0%"):
-        semstab.run(configure(root))
+        semstab.engine.run(configure(root))
 
 
 def test_a_label_outside_the_taxonomy_names_its_file(root) -> None:
     path = root / "labels/a/0002.png"
     cv2.imwrite(str(path), np.full((6, 8), 9, np.uint8))
     with pytest.raises(DataError, match=r"labels/a/0002\.png: label id 9 \(48 pixels\) is outside the taxonomy"):
-        semstab.run(configure(root))
+        semstab.engine.run(configure(root))
 
 
 @pytest.mark.parametrize(
@@ -254,11 +300,11 @@ def test_a_label_outside_the_taxonomy_names_its_file(root) -> None:
 )
 def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, settings, message) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
-        semstab.run(configure(root, **settings))
+        semstab.engine.run(configure(root, **settings))
 
 
 def test_pixel_stride_keeps_every_nth_pixel_at_its_place(root) -> None:
-    (run,) = semstab.run(configure(root, backbones=["gt"], pixel_stride=2)).runs
+    (run,) = semstab.engine.run(configure(root, backbones=["gt"], pixel_stride=2)).runs
     assert run.table.points == 3 * 4 * 3
     assert run.table.vss == 1.0
 
@@ -266,7 +312,7 @@ def test_pixel_stride_keeps_every_nth_pixel_at_its_place(root) -> None:
 def test_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
     path = tmp_path / "two.yaml"
     path.write_text(yaml.safe_dump({"classes": ["wall", {"name": "opening", "members": ["door", "window"]}]}))
-    (run,) = semstab.run(configure(root, backbones=["gt"], taxonomy=str(path))).runs
+    (run,) = semstab.engine.run(configure(root, backbones=["gt"], taxonomy=str(path))).runs
     assert (run.taxonomy, run.table.K) == ("two", 2)
     assert [row.name for row in run.table.classes] == ["wall", "opening"]
 
@@ -274,11 +320,11 @@ def test_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
 def test_the_number_of_threads_changes_no_number(root, tmp_path) -> None:
     """And is no part of what a run folder is compared by: what one thread finished, four keep."""
     out = tmp_path / "run"
-    one = semstab.run(configure(root, threads=1), out=out)
-    four = semstab.run(configure(root, threads=4), out=tmp_path / "four")
-    assert without_times(one.to_dict()) == without_times(four.to_dict())
+    one = semstab.engine.run(configure(root, threads=1), out=out)
+    four = semstab.engine.run(configure(root, threads=4), out=tmp_path / "four")
+    assert without_times(one) == without_times(four)
     watching = Watching()
-    semstab.run(configure(root, threads=4), out=out, observers=[watching])
+    semstab.engine.run(configure(root, threads=4), out=out, observers=[watching])
     assert watching.seen == ["start 2", "kept a", "kept b", "finished"]
 
 
@@ -286,17 +332,17 @@ def test_a_damaged_image_stops_the_run_at_its_frame(root) -> None:
     (root / "depth/0002.png").write_bytes(b"no image")
     watching = Watching()
     with pytest.raises(DataError, match=r"depth/0002\.png: not a PNG image"):
-        semstab.run(configure(root, backbones=["a"], threads=4), observers=[watching])
+        semstab.engine.run(configure(root, backbones=["a"], threads=4), observers=[watching])
     assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1"]
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
-    (run,) = semstab.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
+    (run,) = semstab.engine.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
     assert tuple(run.stages_ms) == STAGES
     assert all(run.stages_ms[stage] >= 0 for stage in ("decode", "wait", "flicker", "logging"))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["runs"][0]["stages_ms"]["association"] is None  # numpy does not tell its parts apart
-    (kept,) = semstab.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
+    (kept,) = semstab.engine.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
     assert kept.stages_ms["decode"] == run.stages_ms["decode"]
     header, first, *_ = (tmp_path / "run" / "frames" / "wall__a__numpy.csv").read_text().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
@@ -314,10 +360,10 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
         def frame_fused(self, unit, frame, row) -> None:
             seen.append(frame.color is not None)
 
-    semstab.run(configure(root, backbones=["a"]), observers=[Painting()])
+    semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
     Painting.wants_color = True
-    semstab.run(configure(root, backbones=["a"]), observers=[Painting()])
-    assert seen == [False] * 3 + [True] * 3
+    semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
+    assert seen == [False, True, False] + [True] * 3  # that in the middle is for the figures
 
 
 def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
@@ -327,9 +373,9 @@ def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
         disk, "file_digest", lambda path, digest=disk.file_digest: (read.append(path.name), digest(path))[1]
     )
     config = configure(root, backbones=["a"])
-    semstab.run(config, out=tmp_path / "run")
+    semstab.engine.run(config, out=tmp_path / "run")
     assert not [name for name in read if name.endswith(".png")]
     watching = Watching()
-    semstab.run(config, out=tmp_path / "run", observers=[watching])
+    semstab.engine.run(config, out=tmp_path / "run", observers=[watching])
     assert "kept a" in watching.seen
     assert len([name for name in read if name.endswith(".png")]) == 2 * tiny_scene.FRAMES

@@ -22,10 +22,10 @@ from semstab.backbones import Prediction, create
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.images import read_labels
+from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.labels import LabelSpace
 from semstab.metrics import matched_region_flicker
-from semstab.pipeline import run
 from semstab.predict import (
     ImageFiles,
     PredictionObserver,
@@ -425,15 +425,15 @@ def test_regions_that_lack_frames_stop_nobody_else(scene):
 
 
 def test_a_study_measures_regions_by_name(scene):
-    from semstab.study import StudyConfig
-    from semstab.study.grid import make_grid
+    from semstab.config import Config
+    from semstab.engine.units import make_plan
 
     predict(scene, Tiles(), name="tiles")
     predict(scene, Shifting(), name="thirds")
     content = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "region_maps": ["tiles"]}
-    grid = make_grid(StudyConfig.build(content))
+    grid = make_plan(Config.build(content))
     assert [cell.backbone for cell in grid.regions] == ["tiles"]
-    assert {cell.unit.backbone for cell in grid.cells} == {"thirds"}
+    assert {cell.unit.backbone for cell in grid.units} == {"thirds"}
 
 
 def test_regions_of_single_images_have_no_camera(scene, tmp_path):

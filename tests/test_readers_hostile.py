@@ -25,9 +25,9 @@ from semstab.datasets.scannet import read_class_table
 from semstab.datasets.selection import select_frames
 from semstab.datasets.text_tables import read_table, records
 from semstab.datasets.transforms_json import read_transforms
+from semstab.engine import run
 from semstab.errors import DataError, SemstabError
-from semstab.pipeline import run
-from semstab.plan import load_config
+from semstab.settings import load_config
 from semstab.voxels import VoxelTable
 
 

@@ -32,7 +32,7 @@ from semstab.datasets import open_dataset
 from semstab.datasets.city.classes import uavid8
 from semstab.datasets.uavid3d import Uavid3dOptions
 from semstab.errors import ConfigError, DataError
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 
 FRAMES = 3
 

@@ -19,18 +19,18 @@ import tiny_scene
 import semstab
 from semstab import backends, metrics
 from semstab.config import Config
+from semstab.engine import Observer
+from semstab.engine.series import FrameRow
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
-from semstab.pipeline import Observer
-from semstab.plan import Plan, Task, load_config
 from semstab.recording import MEASURES, SERIES, Recording, background, observer, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
 from semstab.recording.voxel_maps import SBD_MAX, TITLES
 from semstab.results import GroupResult, RunResult, Unit, UnitSummary
-from semstab.run_folder import FrameRow
+from semstab.task import Plan, Task, load_config
 from semstab.voxels import VoxelTable
 
 NANOSECONDS = 1_000_000_000
@@ -47,7 +47,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     root = tiny_scene.write(folder / "data" / "wall")
     out = folder / "run"
-    semstab.run(config_of(root), out=out, observers=[Recording(out / "recording.rrd")])
+    semstab.engine.run(config_of(root), out=out, observers=[Recording(out / "recording.rrd")])
     return out
 
 
@@ -279,14 +279,14 @@ def test_the_world_stands_upright(run) -> None:
 def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> None:
     path = run / "recording.rrd"
     before = path.read_bytes()
-    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(path)])
+    semstab.engine.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(path)])
     assert path.read_bytes() == before
     other = run.parent / "kept.rrd"  # there is none yet: it says at least why it is empty
-    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(other)])
+    semstab.engine.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(other)])
     verify(other)
     assert len(notes(read(other))) == 2
     whole = run.parent / "whole.rrd"  # from the run folder it is whole, but for what only the images show
-    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(whole, run=run)])
+    semstab.engine.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(whole, run=run)])
     verify(whole)
     first, again = read(path), read(whole)
     for column in SERIES:
@@ -309,7 +309,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     path = tmp_path / "run" / "recording.rrd"
     first = Recording(path)
     with pytest.raises(KeyboardInterrupt):
-        semstab.run(config, out=path.parent, observers=[first, Interrupting()])
+        semstab.engine.run(config, out=path.parent, observers=[first, Interrupting()])
     first.close()
     first.close()
     verify(path)
@@ -317,7 +317,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     assert len(series(rows, "/wall/series/updated_voxels/a/numpy")) == 3
     assert len(series(rows, "/wall/series/updated_voxels/b/numpy")) == 1
 
-    semstab.run(config, out=path.parent, observers=[Recording(path, run=path.parent)])
+    semstab.engine.run(config, out=path.parent, observers=[Recording(path, run=path.parent)])
     verify(path)
     rows = read(path)
     kept, fused_now = notes(rows)
@@ -334,16 +334,16 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
 def test_a_path_that_cannot_be_written_is_named(run, tmp_path) -> None:
     config = config_of(run.parent / "data" / "wall")
     with pytest.raises(ConfigError, match=r"recording cannot be written"):
-        semstab.run(config, observers=[Recording(tmp_path)])
+        semstab.engine.run(config, observers=[Recording(tmp_path)])
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"file/x\.rrd: the recording cannot be written"):
-        semstab.run(config, observers=[Recording(tmp_path / "file" / "x.rrd")])
+        semstab.engine.run(config, observers=[Recording(tmp_path / "file" / "x.rrd")])
 
 
 def test_without_a_recording_rerun_is_not_imported(run) -> None:
     program = (
-        "import sys, semstab; from semstab.plan import load_config;"
-        f"semstab.run(load_config({str(run / 'config.yaml')!r}));"
+        "import sys, semstab; from semstab.settings import load_config;"
+        f"semstab.engine.run(load_config({str(run / 'config.yaml')!r}));"
         "assert 'semstab.pipeline' in sys.modules and 'rerun' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

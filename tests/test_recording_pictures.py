@@ -28,13 +28,13 @@ from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.metrics import compensated_flicker
-from semstab.plan import load_config, make_plan
-from semstab.plan import read as read_frame
 from semstab.recording import Recording, Target, camera, flips, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
 from semstab.recording.voxel_maps import TITLES
+from semstab.settings import load_config, make_plan
+from semstab.task import read as read_frame
 
 CLASSES = LabelSpace("abc", ("a", "b", "c"))
 
@@ -56,7 +56,7 @@ def compared(tmp_path_factory):
         cv2.imwrite(str(root / "color" / f"{i:04d}.jpg"), picture)
     config = config_with(root, "numba", "open3d-projective")
     out = folder / "run"
-    semstab.run(config, out=out, observers=[Recording(out / "recording.rrd", run=out)])
+    semstab.engine.run(config, out=out, observers=[Recording(out / "recording.rrd", run=out)])
     return config, out
 
 
@@ -434,8 +434,8 @@ def test_a_killed_run_leaves_a_recording_that_optimize_makes_whole(tmp_path) -> 
     path = tmp_path / "killed.rrd"
     program = f"""
 import os, signal, time, semstab
-from semstab.pipeline import Observer
-from semstab.plan import load_config
+from semstab.engine import Observer
+from semstab.settings import load_config
 from semstab.recording import Recording
 class Killing(Observer):
     def unit_finished(self, unit, table, summary):
@@ -443,7 +443,7 @@ class Killing(Observer):
         os.kill(os.getpid(), signal.SIGKILL)
 config = load_config(overrides={{"dataset": {{"name": "posed_folder", "options": {{"root": {str(root)!r}}}}},
     "backends": ["numba"], "check": None, "voxel_size": 0.25}})
-semstab.run(config, observers=[Recording({str(path)!r}), Killing()])
+semstab.engine.run(config, observers=[Recording({str(path)!r}), Killing()])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
     assert done.returncode == -signal.SIGKILL
@@ -513,7 +513,7 @@ def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
             time.sleep(0.1)
         target = Target(tmp_path / "own.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
         root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
-        semstab.run(config_with(root, "numba"), observers=[Recording(target)])
+        semstab.engine.run(config_with(root, "numba"), observers=[Recording(target)])
         time.sleep(1)
     finally:
         viewer.send_signal(signal.SIGINT)

@@ -16,10 +16,10 @@ from wall_study import BACKBONES, CLASSES, STEPS, drawn_walls
 from semstab.averages import ENOUGH, pooled
 from semstab.findings import findings
 from semstab.plots import figures
+from semstab.records import BASE, SHARED, Failure, ImageSpace, Variation
 from semstab.report import write_report
 from semstab.report.reading import reading
 from semstab.results import Agreement, Unit
-from semstab.study.results import BASE, SHARED, Failure, ImageSpace, Variation
 from semstab.tables import tables
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]

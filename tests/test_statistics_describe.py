@@ -198,7 +198,7 @@ def test_the_command_reads_a_run_folder(tmp_path, capsys, monkeypatch):
     scene = tiny_scene.write(tmp_path / "wall")
     config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": 0.25}
     content = config | {"backbones": ["a", "b", "gt"], "backends": ["numpy"], "check": None, "events": True}
-    semstab.run(Config.build(content, "test"), out=tmp_path / "run")
+    semstab.engine.run(Config.build(content, "test"), out=tmp_path / "run")
     monkeypatch.setattr(
         "sys.argv",
         ["", str(tmp_path / "run"), "--json", str(tmp_path / "found.json"), "--maps", str(tmp_path / "maps")],

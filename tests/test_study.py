@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,19 +15,21 @@ import tiny_study
 from tiny_study import Counting, Interrupting, configure, summary
 
 import semstab
+from semstab.config import Config
 from semstab.datasets.posed_folder import PosedScene
+from semstab.engine import load_result, run_study
+from semstab.engine.folder import Folder
+from semstab.engine.jobs import Job, Request, split
+from semstab.engine.passes import run_job
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
+from semstab.json_form import to_json
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
-from semstab.plan import read
+from semstab.records import BACKENDS, Variation
 from semstab.results import Unit
+from semstab.settings import resolve
 from semstab.statistics import compare_backbones, nulls
-from semstab.study import load_study_result, run_study
-from semstab.study.folder import StudyFolder
-from semstab.study.grid import make_grid
-from semstab.study.jobs import Job, Request, run_job
-from semstab.study.results import BACKENDS, Variation
-from semstab.study.run import split
-from semstab.tables import tables
+from semstab.task import read
 
 
 @pytest.fixture
@@ -42,23 +45,23 @@ def count(config, out, **options) -> Counting:
 
 def test_every_unit_has_the_numbers_of_a_run_with_its_settings(root, tmp_path) -> None:
     """Though its frames were decoded once for all of them."""
-    config = configure(root, shared_taxonomy=None, strata=[1, 3]).resolved()
+    config = resolve(configure(root, shared_taxonomy=None, strata=[1, 3]))
     result = run_study(config, tmp_path / "out")
-    cells = make_grid(config).cells
+    cells = make_plan(config).units
     assert [record.variation for record in result.records] == [cell.variation for cell in cells]
     for cell, record in zip(cells, result.records, strict=True):
-        (run,) = semstab.run(cell.config, out=tmp_path / "run" / record.key).runs
-        expected, found = run.to_dict(), record.summary.to_dict()
+        (run,) = semstab.engine.run(cell.config, out=tmp_path / "run" / record.key).runs
+        expected, found = to_json(run), to_json(record.summary)
         for name in tiny_study.TIMES:
             expected.pop(name), found.pop(name)
         np.testing.assert_equal(found, expected)
-        if record.voxels is not None:
+        if record.voxels_file is not None:
             voxels = semstab.VoxelTable.load(tmp_path / "run" / record.key / "voxels" / f"{record.unit.slug}.parquet")
             assert compare(record.table(), voxels, (record.unit, record.unit), tolerance=0).agrees
 
 
 def test_the_grid_goes_through_every_sweep_scene_and_backbone(root) -> None:
-    cells = make_grid(configure(root, seed=7)).cells
+    cells = make_plan(configure(root, seed=7)).units
     assert [(cell.variation.sweep, cell.variation.value, cell.variation.repeat) for cell in cells[::2]][:7] == [
         ("base", None, 0), ("voxel_size", 0.25, 0), ("voxel_size", 0.5, 0), ("depth_noise", 0.0, 0),
         ("depth_noise", 0.05, 0), ("depth_noise", 0.05, 1), ("frame_count", 5, 0),
@@ -85,8 +88,8 @@ def test_a_point_at_the_base_settings_is_the_base_unit(root, tmp_path) -> None:
     # base, voxel 0.5, two noisy ones, stride 2 and backend numba for each backbone; ten frames for a
     assert counting.units == len(counting.computed) == 2 * 6 + 1
     assert len(list((out / "units").iterdir())) == 13
-    assert {record.voxels is None for record in of_a if record.variation.sweep in ("base", "backends")} == {False}
-    assert {record.voxels for record in of_a if record.variation.sweep not in ("base", "backends")} == {None}
+    assert {record.voxels_file is None for record in of_a if record.variation.sweep in ("base", "backends")} == {False}
+    assert {record.voxels_file for record in of_a if record.variation.sweep not in ("base", "backends")} == {None}
 
 
 def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, monkeypatch) -> None:
@@ -119,14 +122,14 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
 
     monkeypatch.setattr(PosedScene, "frame", counted)
     grown = itertools.count(step=1_000_000)
-    monkeypatch.setattr("semstab.study.passes._resident_bytes", lambda: next(grown))
+    monkeypatch.setattr("semstab.engine.passes._resident_bytes", lambda: next(grown))
     run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")
     assert len(decoded) > 25
     assert summary(tmp_path / "tight") == summary(tmp_path / "whole")
 
 
 def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path) -> None:
-    config = configure(root, backends=[], sweeps={"pixel_stride": [8]}, memory_gb=0.00003)
+    config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, memory_gb=0.00003)
     result = run_study(config, tmp_path / "out")
     assert {failure.variation.sweep for failure in result.failures} == {"base"}
     assert "would take" in result.failures[0].message
@@ -164,7 +167,7 @@ def test_a_changed_setting_computes_only_what_it_touches(root, tmp_path) -> None
 def test_what_was_a_sweep_becomes_the_base_with_all_that_a_base_has(root, tmp_path) -> None:
     out = tmp_path / "out"
     run_study(configure(root), out)
-    coarse = configure(root, voxel_size=0.5, sweeps={}, backends=[])
+    coarse = configure(root, voxel_size=0.5, sweeps={}, backends=["numpy"])
     assert len(count(coarse, out).computed) == 2  # now with its voxels and in image space
     run_study(coarse, tmp_path / "fresh")
     assert summary(out) == summary(tmp_path / "fresh")
@@ -182,7 +185,7 @@ def test_a_changed_input_computes_what_reads_it(root, tmp_path) -> None:
 
 
 def test_voxels_that_were_lost_or_damaged_are_computed_again(root, tmp_path) -> None:
-    out, config = tmp_path / "out", configure(root, sweeps={}, backends=[])
+    out, config = tmp_path / "out", configure(root, sweeps={}, backends=["numpy"])
     run_study(config, out)
     (out / "voxels/wall__a__numpy.parquet").unlink()
     (out / "voxels/wall__b__numpy.parquet").write_bytes(b"x")
@@ -202,7 +205,7 @@ def test_a_failing_unit_is_reported_and_the_others_finish(root, tmp_path) -> Non
     assert of_a.variation == Variation("frame_count", 10)
     assert "depth/0003.png: not a PNG image" in of_a.message
     assert all("labels/b/0002.png" in failure.message for failure in result.failures if failure is not of_a)
-    assert load_study_result(out).failures == result.failures
+    assert load_result(out).failures == result.failures
     # mended, it goes on
     shutil.copy(root / "depth/0002.png", root / "depth/0003.png")
     shutil.copy(root / "labels/b/0001.png", root / "labels/b/0002.png")
@@ -226,7 +229,7 @@ def test_a_backend_that_breaks_fails_its_own_units(root, tmp_path, monkeypatch) 
 def test_a_unit_without_a_valid_pixel_says_what_is_missing(root, tmp_path) -> None:
     for path in (root / "labels/a").iterdir():
         cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
-    result = run_study(configure(root, sweeps={}, backends=[]), tmp_path / "out")
+    result = run_study(configure(root, sweeps={}, backends=["numpy"]), tmp_path / "out")
     assert [record.unit.backbone for record in result.select()] == ["b"]
     assert "no pixel of 5 frames is valid" in result.failures[0].message
 
@@ -234,10 +237,10 @@ def test_a_unit_without_a_valid_pixel_says_what_is_missing(root, tmp_path) -> No
 def test_the_result_is_read_back_from_its_folder(root, tmp_path) -> None:
     out = tmp_path / "out"
     result = run_study(configure(root), out, command=["semstab-bench", "study"])
-    again = load_study_result(out)
-    assert json.dumps(again.to_dict()) == json.dumps(result.to_dict())
+    again = load_result(out)
+    assert json.dumps(to_json(again)) == json.dumps(to_json(result))
     assert again.manifest["command"] == ["semstab-bench", "study"]
-    assert again.manifest["study"] == {
+    assert again.manifest["units"] == {
         "units": 13, "kept": 0, "computed": 13, "failed": 0, "executor": "in this process"
     }  # fmt: skip
     assert set(again.manifest["inputs"]) == {"wall/a", "wall/b"}
@@ -245,16 +248,16 @@ def test_the_result_is_read_back_from_its_folder(root, tmp_path) -> None:
     assert summarise(again.select()[0].table()) == again.select()[0].summary.table
     assert (again.scenes, again.backbones) == (("wall",), ("a", "b"))
     with pytest.raises(DataError, match=r"summary\.json: cannot be read"):
-        load_study_result(tmp_path)
+        load_result(tmp_path)
     (out / "summary.json").write_text('{"name": "x"}')
-    with pytest.raises(DataError, match=r"summary\.json: not the summary of a study"):
-        load_study_result(out)
+    with pytest.raises(DataError, match=r"summary\.json: not a summary of this version"):
+        load_result(out)
 
 
 def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> None:
-    config = configure(root, frames={}, sweeps={"pixel_stride": [2]}, backends=[]).resolved()
+    config = resolve(configure(root, frames={}, sweeps={"pixel_stride": [2]}, backends=["numpy"]))
     result = run_study(config, tmp_path / "out")
-    (task, _) = [cell.task for cell in make_grid(config).cells][:2]
+    (task, _) = [cell.task for cell in make_plan(config).units][:2]
     frames = [read(task, i) for i in range(10)]
     truth = [read(dataclasses.replace(task, backbone="gt"), i) for i in range(10)]
     pairs = list(itertools.pairwise(frames))
@@ -274,7 +277,7 @@ def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> 
 
 
 def test_ground_truth_is_consistent_wherever_it_stays_the_same(root, tmp_path) -> None:
-    config = configure(root, frames={}, backbones=["gt", "a"], sweeps={}, backends=[])
+    config = configure(root, frames={}, backbones=["gt", "a"], sweeps={}, backends=["numpy"])
     gt, a = run_study(config, tmp_path / "out").select()
     assert np.isnan(gt.image_space.vc8)  # nothing to compare it with
     assert gt.image_space.compensated_flicker_percent == 0
@@ -283,20 +286,20 @@ def test_ground_truth_is_consistent_wherever_it_stays_the_same(root, tmp_path) -
 
 def test_frames_without_ground_truth_are_in_no_clip(root, tmp_path) -> None:
     (root / "labels/gt/0005.png").unlink()
-    config = configure(root, frames={}, backbones=["a"], sweeps={}, backends=[])
+    config = configure(root, frames={}, backbones=["a"], sweeps={}, backends=["numpy"])
     (a,) = run_study(config, tmp_path / "out").select()
     assert np.isnan(a.image_space.vc8)
     assert a.image_space.self_vc8 >= 0
 
 
 def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(root, tmp_path) -> None:
-    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a", "gt"])
+    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a", "gt"])
     before = run_study(config, tmp_path / "out").records
-    wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a", "gt"], statistics=True)
+    wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a", "gt"], statistics=True)
     assert len(count(wanted, tmp_path / "out").computed) == 4
     result = run_study(wanted, tmp_path / "out")
-    settings = make_grid(wanted.resolved()).cells[0].config.model_copy(update={"events": True})
-    run = semstab.run(settings, out=tmp_path / "run").runs[0]
+    settings = make_plan(resolve(wanted)).units[0].config.model_copy(update={"events": True})
+    run = semstab.engine.run(settings, out=tmp_path / "run").runs[0]
     events = semstab.Events.load(tmp_path / "run" / "events" / f"{run.unit.slug}.parquet")
     base, gt, *swept = result.records
     assert base.statistics["agreement"]["psa"]["value"] == pytest.approx(psa_by_definition(events))
@@ -311,7 +314,7 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
 
 
 def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_path) -> None:
-    settings = {"sweeps": {}, "backends": [], "backbones": ["a", "b", "gt"]}
+    settings = {"sweeps": {}, "backends": ["numpy"], "backbones": ["a", "b", "gt"]}
     assert run_study(configure(root, **settings), tmp_path / "plain").comparisons == ()
     config = configure(root, **settings, statistics=True)
     result = run_study(config, tmp_path / "out")
@@ -321,22 +324,17 @@ def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_p
     expected = {"scene": "wall"} | nulls(compare_backbones(maps, truth=truth))
     assert found == expected
     assert {row["measure"] for row in found["paired"]["differences"]} >= {"psa", "alpha", "accuracy"}
-    for other in (load_study_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept
+    for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept
         assert other.comparisons == result.comparisons
         assert [r.statistics for r in other.records] == [r.statistics for r in result.records]
 
 
-def test_a_study_of_an_earlier_version_still_loads(root, tmp_path) -> None:
-    result = run_study(configure(root, sweeps={}, backends=[]), tmp_path / "out")
+def test_the_summary_of_an_earlier_version_is_refused(root, tmp_path) -> None:
+    run_study(configure(root, sweeps={}, backends=["numpy"]), tmp_path / "out")
     content = json.loads((tmp_path / "out" / "summary.json").read_text())
-    del content["comparisons"]
-    for run in content["runs"]:
-        run["statistics"] = {}
-    (tmp_path / "out" / "summary.json").write_text(json.dumps(content))
-    loaded = load_study_result(tmp_path / "out")
-    assert [record.statistics for record in loaded.records] == [{}] * len(result.records)
-    assert "scenes" in (names := [table.name for table in tables(loaded)])
-    assert not {"verdicts", "temporal_agreement", "drift"} & set(names)
+    (tmp_path / "out" / "summary.json").write_text(json.dumps({**content, "schema": 1}))
+    with pytest.raises(DataError, match=r"summary\.json: not a summary of this version of semstab; run it again"):
+        load_result(tmp_path / "out")
 
 
 def psa_by_definition(events) -> float:
@@ -347,14 +345,13 @@ def psa_by_definition(events) -> float:
 
 
 def test_units_fused_by_another_backend_are_checked_unless_they_differ_by_design(root, tmp_path) -> None:
-    result = run_study(configure(root, sweeps={}, backends=["numba", "open3d-projective"]), tmp_path / "out")
+    result = run_study(configure(root, sweeps={}, backends=["numpy", "numba", "open3d-projective"]), tmp_path / "out")
     assert [row.backends for row in result.agreement] == [("numpy", "numba")] * 2
     assert all(row.agrees for row in result.agreement)
     assert [record.unit.backend for record in result.select(BACKENDS)] == ["numba"] * 2 + ["open3d-projective"] * 2
-    unchecked = configure(root, sweeps={}, backends=[{"name": "numba", "check": False}])
+    unchecked = configure(root, sweeps={}, backends=["numpy", {"name": "numba", "check": False}])
     assert run_study(unchecked, tmp_path / "out").agreement == ()
-    (group, _) = result.base_runs().groups
-    assert [run.unit.backend for run in group.runs] == ["numpy", "numba", "open3d-projective"]
+    assert [run.unit.backend for run in result.runs][:3] == ["numpy", "numba", "open3d-projective"]
 
 
 def test_a_backend_that_disagrees_is_told(root, tmp_path, monkeypatch) -> None:
@@ -374,12 +371,12 @@ def test_a_backend_that_disagrees_is_told(root, tmp_path, monkeypatch) -> None:
 def test_backbones_are_compared_in_the_shared_taxonomy(root, tmp_path) -> None:
     path = tmp_path / "two.yaml"
     path.write_text("classes: [wall, {name: opening, members: [door, window]}]\n")
-    result = run_study(configure(root, sweeps={}, backends=[], shared_taxonomy=str(path)), tmp_path / "out")
+    result = run_study(configure(root, sweeps={}, backends=["numpy"], shared_taxonomy=str(path)), tmp_path / "out")
     assert [record.summary.table.K for record in result.select("shared_taxonomy")] == [2, 2]
     assert [record.summary.taxonomy for record in result.select("shared_taxonomy")] == ["two", "two"]
     # the file's content counts, not its name
     path.rename(tmp_path / "zwei.yaml")
-    renamed = configure(root, sweeps={}, backends=[], shared_taxonomy=str(tmp_path / "zwei.yaml"))
+    renamed = configure(root, sweeps={}, backends=["numpy"], shared_taxonomy=str(tmp_path / "zwei.yaml"))
     assert len(count(renamed, tmp_path / "out").computed) == 2  # the name stands in the summary
     (tmp_path / "zwei.yaml").write_text("classes: [{name: wall, members: [door]}, window]\nname: zwei\n")
     assert len(count(renamed, tmp_path / "out").computed) == 2
@@ -390,11 +387,13 @@ def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
         tiny_study.write(tmp_path / "data" / name, backbones=("a",))
     frames = {"long": {"stop": 8, "stride": 4}}
     sweeps = {"frame_count": {"values": [2, 8], "scenes": ["long"]}}
-    config = configure(tmp_path / "data", frames={}, scene_frames=frames, sweeps=sweeps, backends=[])
-    cells = make_grid(config).cells
+    config = configure(tmp_path / "data", frames={}, scene_frames=frames, sweeps=sweeps, backends=["numpy"])
+    cells = make_plan(config).units
     assert [cell.task.indices for cell in cells] == [[0, 4], [*range(10)], [0, 7], [*range(8)]]
-    listed = configure(tmp_path / "data", frames={"list": [1, 2, 5, 6, 9]}, sweeps={"frame_count": [3]}, backends=[])
-    assert [cell.task.indices for cell in make_grid(listed).cells][2:] == [[1, 5, 9]] * 2
+    listed = configure(
+        tmp_path / "data", frames={"list": [1, 2, 5, 6, 9]}, sweeps={"frame_count": [3]}, backends=["numpy"]
+    )
+    assert [cell.task.indices for cell in make_plan(listed).units][2:] == [[1, 5, 9]] * 2
 
 
 @pytest.mark.parametrize(
@@ -402,18 +401,18 @@ def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
     [
         ({"scenes": ["wal"]}, "no scene 'wal'; did you mean 'wall'"),
         ({"backbones": ["c"]}, "wall: no backbone 'c'"),
-        ({"scene_frames": {"hall": {}}}, "scene_frames: 'hall' is not among the study's wall"),
+        ({"scene_frames": {"hall": {}}}, "scene_frames: 'hall' is not among wall"),
         (
             {"sweeps": {"voxel_size": {"values": [1], "scenes": ["x"]}}},
-            "voxel_size.scenes: 'x' is not among the study's",
+            "voxel_size.scenes: 'x' is not among wall",
         ),
         (
-            {"backends": {"values": ["numba"], "backbones": ["x"]}},
-            "backends.backbones: 'x' is not among the study's a, b",
+            {"backends": ["numpy", {"name": "numba", "backbones": ["x"]}]},
+            "backends.backbones: 'x' is not among a, b",
         ),
         ({"sweeps": {"frame_count": [11]}}, "frame_count: wall has 10 frames over the extent of the base ones, not 11"),
         ({"backends": ["open4d"]}, "backend 'open4d' is not known"),
-        ({"backend": {"name": "numpy", "options": {"x": 1}}}, "backend 'numpy' has no option 'x'"),
+        ({"backends": [{"name": "numpy", "options": {"x": 1}}]}, "backend 'numpy' has no option 'x'"),
         ({"shared_taxonomy": "uavid3"}, "no class takes 'wall, door, window'"),
     ],
 )
@@ -424,8 +423,8 @@ def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp
 
 
 def test_a_folder_of_something_else_is_refused(root, tmp_path) -> None:
-    config = configure(root, sweeps={}, backends=[])
-    with pytest.raises(ConfigError, match="is not empty and holds no study"):
+    config = configure(root, sweeps={}, backends=["numpy"])
+    with pytest.raises(ConfigError, match="is not empty and holds no run or study"):
         run_study(config, root)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="is a file"):
@@ -434,29 +433,16 @@ def test_a_folder_of_something_else_is_refused(root, tmp_path) -> None:
     run_study(config, tmp_path / "empty")
 
 
-def test_a_damaged_unit_file_is_named(root, tmp_path) -> None:
-    out, config = tmp_path / "out", configure(root, sweeps={}, backends=[])
-    run_study(config, out)
-    unit = next((out / "units").iterdir())
-    unit.write_text('{"key": ')
-    with pytest.raises(DataError, match=r"units/\w+\.json: not valid JSON"):
-        run_study(config, out)
-    unit.unlink()
-    run_study(config, out)
-    unit.write_text(json.dumps({**json.loads(unit.read_text()), "summary": {}}))
-    with pytest.raises(DataError, match=r"units/\w+\.json: damaged"):
-        run_study(config, out)
-
-
 def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_path) -> None:
-    config = configure(root, sweeps={}, backends=[], backbones=["a"]).resolved()
-    (cell,) = make_grid(config).cells
+    config = resolve(configure(root, sweeps={}, backends=["numpy"], backbones=["a"]))
+    (cell,) = make_plan(config).units
     elsewhere = tmp_path / "elsewhere"
-    job = Job("wall", "a", (Request(cell.identity, cell.config, image_space=True, voxels=True),), "start", elsewhere)
+    job = Job("wall", "a", (Request(cell.identity, cell.config, image_space=True, kept=True),), "start", elsewhere)
     (outcome,) = run_job(job)
     assert not elsewhere.exists()
-    folder = StudyFolder(tmp_path / "out", config)
+    folder = Folder(tmp_path / "out", config)
     folder.save(outcome)
+    folder.close()
     counting = Counting()
     result = run_study(config, tmp_path / "out", observers=[counting])
     assert counting.kept == 1
@@ -464,17 +450,32 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_p
 
 
 def test_a_job_that_cannot_even_begin_fails_as_a_whole(root, tmp_path) -> None:
-    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=[], backbones=["a"]).resolved()
-    requests = tuple(Request(c.identity, c.config, image_space=False, voxels=False) for c in make_grid(config).cells)
+    config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a"]))
+    requests = tuple(Request(c.identity, c.config, image_space=False, kept=False) for c in make_plan(config).units)
     outcomes = run_job(Job("hall", "a", requests, "start", tmp_path))
     assert [outcome.error for outcome in outcomes] == [outcomes[0].error] * 2
     assert "scene 'hall' is not there" in outcomes[0].error
 
 
 def test_jobs_are_halved_until_every_worker_has_one() -> None:
-    jobs = [Job("s", "a", tuple("123456"), "", None), Job("s", "b", tuple("78"), "", None)]
+    jobs = [job("s", "123456"), job("t", "78")]
     assert split(jobs, 2) == jobs
-    assert [job.requests for job in split(jobs, 4)] == [("1",), ("2", "3"), ("4", "5", "6"), ("7", "8")]
-    assert [len(job.requests) for job in split(jobs, 100)] == [1] * 8
-    assert "".join(request for job in split(jobs, 5) for request in job.requests) == "12345678"
+    assert [names(each) for each in split(jobs, 4)] == ["1", "23", "456", "78"]
+    assert [len(each.requests) for each in split(jobs, 100)] == [1] * 8
+    assert "".join(names(each) for each in split(jobs, 5)) == "12345678"
     assert split([], 3) == []
+
+
+def test_what_is_watched_stays_in_one_job() -> None:
+    """Observers see all backends of a frame together."""
+    requests = tuple(Request(name, Config(), kept=name in "15") for name in "123456")
+    parts = split([Job("s", "a", requests, "", Path())], 9)
+    assert [names(part) for part in parts] == ["15", "2", "3", "4", "6"]
+
+
+def job(backbone: str, identities: str) -> Job:
+    return Job("s", backbone, tuple(Request(name, Config()) for name in identities), "", Path())
+
+
+def names(part: Job) -> str:
+    return "".join(request.identity for request in part.requests)

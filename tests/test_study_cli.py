@@ -16,7 +16,7 @@ import pytest
 import tiny_study
 import yaml
 
-from semstab.study import run_study
+from semstab.engine import run_study
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 ENVIRONMENT = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
@@ -30,7 +30,7 @@ def root(tmp_path):
 @pytest.fixture
 def file(root, tmp_path):
     path = tmp_path / "tiny.yaml"
-    path.write_text(yaml.safe_dump(tiny_study.content(root, backends=[])))
+    path.write_text(yaml.safe_dump(tiny_study.content(root, backends=["numpy"])))
     return path
 
 
@@ -63,7 +63,7 @@ def wait_for_units(out: Path, count: int) -> None:
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file, tmp_path, jobs) -> None:
-    run_study(tiny_study.configure(root, backends=[]), tmp_path / "whole")
+    run_study(tiny_study.configure(root, backends=["numpy"]), tmp_path / "whole")
     moments = random.Random(jobs)
     for after in (0, moments.randrange(1, 6), moments.randrange(7, 12)):
         process = started(file, "--out", "out", "--jobs", jobs, "--quiet", cwd=tmp_path)
@@ -73,7 +73,7 @@ def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file,
         process.communicate()
     kept = units(tmp_path / "out")
     counting = tiny_study.Counting()
-    run_study(tiny_study.configure(root, backends=[]), tmp_path / "out", observers=[counting])
+    run_study(tiny_study.configure(root, backends=["numpy"]), tmp_path / "out", observers=[counting])
     assert counting.kept == kept > 0
     assert tiny_study.summary(tmp_path / "out") == tiny_study.summary(tmp_path / "whole")
     assert not list((tmp_path / "out").rglob(".*"))  # not even what was half-written when it was killed

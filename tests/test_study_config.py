@@ -7,10 +7,9 @@ import tiny_study
 import yaml
 
 from semstab.config import Config
+from semstab.engine.units import IN_KEYS, make_plan
 from semstab.errors import ConfigError
-from semstab.study import StudyConfig, load_study, shipped_studies
-from semstab.study.config import BASE_SETTINGS
-from semstab.study.grid import NOT_IN_KEYS, make_grid
+from semstab.settings import load_config, load_study, resolve, shipped_studies
 
 
 def write(tmp_path, **content):
@@ -20,12 +19,8 @@ def write(tmp_path, **content):
 
 
 def test_short_forms_mean_the_long_ones(tmp_path) -> None:
-    short = load_study(write(tmp_path, sweeps={"voxel_size": [0.1]}, backend="numpy", backends=["open3d"]))
-    long = {
-        "sweeps": {"voxel_size": {"values": [0.1]}},
-        "backend": {"name": "numpy"},
-        "backends": {"values": [{"name": "open3d"}]},
-    }
+    short = load_study(write(tmp_path, sweeps={"voxel_size": [0.1]}, backends=["numpy", "open3d"]))
+    long = {"sweeps": {"voxel_size": {"values": [0.1]}}, "backends": [{"name": "numpy"}, {"name": "open3d"}]}
     assert short == load_study(write(tmp_path, **long))
     assert [name for name, _ in short.sweeps.given()] == ["voxel_size"]
 
@@ -40,28 +35,35 @@ def test_the_name_is_the_file_s_and_the_dataset_s_defaults_lie_below(tmp_path) -
 
 
 def test_a_resolved_study_is_read_back(tmp_path) -> None:
-    study = load_study("city").resolved()
+    study = resolve(load_study("city"))
     (tmp_path / "study.yaml").write_text(study.to_yaml())
     assert load_study(tmp_path / "study.yaml") == study
     assert study.dataset.options["seed"] == 0  # defaults are filled in
 
 
-def test_base_settings_are_a_run_s(tmp_path) -> None:
-    study = load_study(
-        write(tmp_path, strata=[1, 3], seed=4, perturbation={"depth_noise": 0.01}, scene_frames={"scene0": {"stop": 3}})
-    )
-    base = study.base("scene0")
-    assert (base.strata, base.scenes, base.check) == ([1, 3], ["scene0"], None)
-    assert (base.frames.stop, study.base("scene3").frames.stop) == (3, None)
+def test_a_run_is_a_study_without_sweeps(tmp_path) -> None:
+    """The same settings by the same names; only what nobody asked for differs: its name, and the check."""
+    run, study = load_config(write(tmp_path, voxel_size=0.5)), load_study(write(tmp_path, voxel_size=0.5))
+    assert (run.check, study.check) == ("numpy", None)
+    assert run.model_copy(update={"name": "mine", "check": None}) == study
+
+
+def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
+    settings = {"strata": [1, 3], "seed": 4, "perturbation": {"depth_noise": 0.01}, "backbones": ["sim-soft"]}
+    plan = make_plan(resolve(load_study("city", {**settings, "scene_frames": {"scene0": {"stop": 3}}})).only([]))
+    base, other, *_ = (each.config for each in plan.units)
+    assert (base.strata, base.scenes, base.check, base.backbones) == ([1, 3], ["scene0"], None, ["sim-soft"])
+    assert (base.frames.stop, other.frames.stop) == (3, None)
     assert base.perturbation is not None
     assert base.perturbation.seed == 4
 
 
-def test_every_setting_of_a_run_is_a_study_s_or_has_a_reason_not_to_be() -> None:
-    """A new one must be thought of: as part of the key, or not."""
-    only_of_runs = {"backends", "check", "events", "check_geometry", "threads", "memory_gb"}
-    assert set(Config.model_fields) - only_of_runs == set(BASE_SETTINGS)
-    assert set(NOT_IN_KEYS) <= set(Config.model_fields)
+def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> None:
+    """A new one must be thought of."""
+    selects = {"dataset", "scenes", "backbones", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
+    plans = {"name", "description", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
+    elsewhere = {"check_geometry", "threads", "memory_gb"}
+    assert set(Config.model_fields) == selects | plans | elsewhere | set(IN_KEYS)
 
 
 @pytest.mark.parametrize(
@@ -76,9 +78,11 @@ def test_every_setting_of_a_run_is_a_study_s_or_has_a_reason_not_to_be() -> None
         ({"sweeps": {"frame_count": [2.5]}}, r"sweeps\.frame_count\.values\.0: input should be a valid integer"),
         ({"sweeps": {"pixel_stride": {"values": [2], "repeats": 3}}}, "unknown setting 'sweeps.pixel_stride.repeats'"),
         ({"sweeps": {"voxel_size": [1, 0.5, 1.0]}}, "name each value once"),
-        ({"backends": ["numpy", "numpy"]}, r"backends\.values: name each value once"),
-        ({"backend": "numpy", "backends": ["numpy"]}, "backends: 'numpy' is named twice; the base backend is 'numpy'"),
-        ({"perturbation": {"seed": 3}}, "perturbation: leave its seed out; the study's own 'seed' counts"),
+        ({"backends": ["numpy", "numpy"]}, "backends: each backend can be named once"),
+        ({"backends": [{"name": "numpy", "scenes": ["s"]}]}, "backends: the first backend fuses every unit"),
+        ({"backend": "numpy"}, r"'backend' is now the first of 'backends'; write backends: \[numba, open3d, ...\]"),
+        ({"backends": {"values": ["numpy"]}}, "'backends' is now a list, the base backend first; write backends: "),
+        ({"perturbation": {"seed": 3}}, "perturbation: leave its seed out; 'seed' counts"),
         ({"region_maps": ["x"], "backbones": ["x"]}, "region_maps: 'x' is named among the backbones too"),
         ({"strata": [2, 1]}, "strata: edges must be ascending"),
         ({"frames": {"spacing": "even"}}, "spacing: even needs count"),
@@ -94,15 +98,15 @@ def test_bad_settings_are_one_line_that_names_the_setting(tmp_path, content, mes
 def test_the_shipped_studies_fit_together() -> None:
     assert shipped_studies() == ("city", "uavid3d")
     assert all(load_study(name).description for name in shipped_studies())
-    grid = make_grid(load_study("city").resolved())
-    assert {cell.variation.sweep for cell in grid.cells} == {
+    grid = make_plan(resolve(load_study("city")))
+    assert {cell.variation.sweep for cell in grid.units} == {
         "base", "shared_taxonomy", "backends", "voxel_size", "depth_noise", "translation_noise", "rotation_noise",
         "translation_drift", "rotation_drift", "frame_count", "pixel_stride",
     }  # fmt: skip
-    assert len(grid.units()) < 300  # they take minutes
+    assert len(grid.distinct()) < 300  # they take minutes
     paper = load_study("uavid3d")
-    assert paper.base("scene1").frames.indices(200) == [*range(0, 80, 4)]
-    assert len(paper.base("scene5").frames.indices(200)) == 20
+    assert paper.scene_frames["scene1"].indices(200) == [*range(0, 80, 4)]
+    assert len(paper.frames.indices(200)) == 20
     assert (paper.taxonomy, paper.shared_taxonomy, paper.voxel_size) == ("uavid7", "uavid3", 0.2)
 
 
@@ -110,18 +114,18 @@ def test_a_part_of_a_study(tmp_path) -> None:
     study = load_study("city")
     part = study.only(["depth_noise"])
     assert [name for name, _ in part.sweeps.given()] == ["depth_noise"]
-    assert (part.shared_taxonomy, part.backends.values) == (None, [])
+    assert (part.shared_taxonomy, [backend.name for backend in part.backends]) == (None, ["numba"])
     assert study.only(["backends", "shared_taxonomy"]).backends == study.backends
-    assert study.only(["base"]).sweeps == StudyConfig().sweeps
+    assert study.only(["base"]).sweeps == Config().sweeps
 
 
 def test_perturbed_base_units_are_varied_on_top(tmp_path) -> None:
     root = tiny_study.write(tmp_path / "wall", backbones=("a",))
     study = tiny_study.configure(
-        root, seed=2, perturbation={"translation_noise": 0.01}, sweeps={"depth_noise": [0, 0.1]}, backends=[]
+        root, seed=2, perturbation={"translation_noise": 0.01}, sweeps={"depth_noise": [0, 0.1]}, backends=["numpy"]
     )
-    noises = [cell.config.perturbation for cell in make_grid(study).cells]
+    noises = [cell.config.perturbation for cell in make_plan(study).units]
     assert [(noise.translation_noise, noise.depth_noise, noise.seed) for noise in noises] == [
         (0.01, 0, 2), (0.01, 0, 2), (0.01, 0.1, 2)
     ]  # fmt: skip
-    assert len(make_grid(study).units()) == 2
+    assert len(make_plan(study).distinct()) == 2

@@ -14,17 +14,18 @@ import pytest
 import tiny_study
 from tiny_study import Counting, Interrupting, summary
 
+from semstab.engine import DaskCluster, LocalProcesses, run_study
+from semstab.engine.jobs import Job
+from semstab.engine.observer import Observers
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.study import DaskCluster, LocalProcesses, run_study
-from semstab.study.grid import make_grid
-from semstab.study.jobs import Job
 
 BACKBONES = ("a", "b", "c", "d")
 
 
 def configure(root):
     """Eight units in four jobs."""
-    return tiny_study.configure(root, sweeps={"voxel_size": [0.5]}, backends=[])
+    return tiny_study.configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"])
 
 
 @pytest.fixture
@@ -68,8 +69,8 @@ class Killing(Counting):
         super().__init__()
         self.worker = worker
 
-    def unit_finished(self, cell, error) -> None:
-        super().unit_finished(cell, error)
+    def unit_done(self, cell, error) -> None:
+        super().unit_done(cell, error)
         if self.worker is not None:
             process, self.worker = self.worker(), None
             os.kill(process, signal.SIGKILL)
@@ -79,7 +80,7 @@ def test_local_processes_give_the_same_numbers(root, tmp_path, expected) -> None
     counting = Counting()
     result = run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[counting])
     assert summary(tmp_path / "out") == expected
-    assert result.manifest["study"]["executor"] == "2 local processes"
+    assert result.manifest["units"]["executor"] == "2 local processes"
     assert len(counting.computed) == counting.units
     assert children() == set()
     again = Counting()
@@ -104,10 +105,10 @@ class Deadly:
 
 
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
-    config = tiny_study.configure(root, sweeps={}, backends=[]).resolved()
-    fine = [Job("wall", cell.unit.backbone, (cell.request(),), "start", tmp_path) for cell in make_grid(config).cells]
+    config = tiny_study.resolve(configure(root, sweeps={}, backends=["numpy"]))
+    fine = [Job("wall", cell.unit.backbone, (cell.request(),), "start", tmp_path) for cell in make_plan(config).units]
     jobs = [fine[0], Job("wall", "x", (Deadly(),), "start", tmp_path), *fine[1:]]
-    found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs)}
+    found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs, Observers([]))}
     assert sorted(found) == ["a", "b", "c", "d", "x"]
     assert found["x"].error.startswith("its process was killed, perhaps for want of memory")
     assert [found[name].error for name in BACKBONES] == [None] * 4
@@ -126,7 +127,7 @@ def test_an_interruption_ends_the_processes_and_keeps_what_is_finished(root, tmp
 def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> None:
     code = (
         "import multiprocessing, time\n"
-        "from semstab.study.executors import _start_worker\n"
+        "from semstab.engine.executors import _start_worker\n"
         "if __name__ == '__main__':\n"
         "    context = multiprocessing.get_context('spawn')\n"
         "    listening, alive = context.Pipe(duplex=False)\n"
@@ -138,7 +139,7 @@ def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> N
     )
     (tmp_path / "parent.py").write_text(code)
     (tmp_path / "worker.py").write_text(
-        "import time\nfrom semstab.study.executors import _start_worker\n"
+        "import time\nfrom semstab.engine.executors import _start_worker\n"
         "def work(listening):\n    _start_worker(listening, 1)\n    time.sleep(60)\n"
     )
     parent = subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
@@ -151,12 +152,12 @@ def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> N
 
 def test_a_script_without_a_main_guard_is_told_so(root, tmp_path) -> None:
     (tmp_path / "script.py").write_text(
-        "from semstab.study import *\n"
-        f"config = StudyConfig.build({tiny_study.content(root)!r})\n"
+        "from semstab.engine import *\n"
+        f"config = Config.build({tiny_study.content(root)!r})\n"
         "run_study(config, 'out', executor=LocalProcesses(2))\n"
     )
     result = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert "call run_study under if __name__ == '__main__'" in result.stderr
+    assert "call it under if __name__ == '__main__'" in result.stderr
 
 
 def test_local_processes_are_at_least_one() -> None:
@@ -201,12 +202,12 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(root, t
     assert workers[0].wait(10) == -signal.SIGKILL
     assert result.failures == ()
     assert summary(tmp_path / "out") == expected
-    assert result.manifest["study"]["executor"].startswith("Dask")
+    assert result.manifest["units"]["executor"].startswith("Dask")
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr("semstab.study.executors.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 0.5)
     with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
         DaskCluster("tcp://127.0.0.1:9")
 

@@ -11,9 +11,9 @@ import pytest
 import tiny_study
 from tiny_study import Counting, configure, summary
 
+from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
 from semstab.metrics import matched_region_flicker
-from semstab.study import load_study_result, run_study
 
 FRAMES = 4
 
@@ -34,7 +34,7 @@ def regions() -> list[np.ndarray]:
 
 
 def test_regions_are_matched_by_where_they_are(root, tmp_path) -> None:
-    config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[])
+    config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"])
     result = run_study(config, tmp_path / "out")
     (found,) = result.regions
     pairs = [matched_region_flicker(*pair).flicker_percent for pair in itertools.pairwise(regions())]
@@ -43,12 +43,12 @@ def test_regions_are_matched_by_where_they_are(root, tmp_path) -> None:
     assert found.compensated_flicker_percent == 0  # the regions are tied to the wall
     assert found.compensated_share == pytest.approx(7 / 8)
     assert [record.unit.backbone for record in result.records] == ["a"]  # by default all but these
-    assert load_study_result(tmp_path / "out").regions == result.regions
+    assert load_result(tmp_path / "out").regions == result.regions
     assert set(result.manifest["inputs"]) == {"wall/a", "wall/regions"}
 
 
 def test_they_are_kept_and_computed_again_like_units(root, tmp_path) -> None:
-    config = configure(root, frames={}, region_maps=["regions"], sweeps={"voxel_size": [0.5]}, backends=[])
+    config = configure(root, frames={}, region_maps=["regions"], sweeps={"voxel_size": [0.5]}, backends=["numpy"])
     run_study(config, tmp_path / "out")
     again = Counting()
     run_study(config, tmp_path / "out", observers=[again])
@@ -63,8 +63,10 @@ def test_they_are_kept_and_computed_again_like_units(root, tmp_path) -> None:
 
 
 def test_settings_of_the_map_do_not_touch_them(root, tmp_path) -> None:
-    run_study(configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[]), tmp_path / "out")
-    other = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[], voxel_size=0.7, strata=[1])
+    run_study(configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"]), tmp_path / "out")
+    other = configure(
+        root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"], voxel_size=0.7, strata=[1]
+    )
     counting = Counting()
     run_study(other, tmp_path / "out", observers=[counting])
     assert counting.computed == ["wall__a__numpy base None"]
@@ -72,7 +74,7 @@ def test_settings_of_the_map_do_not_touch_them(root, tmp_path) -> None:
 
 def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
     (root / "labels/regions/0002.png").write_bytes(b"no image")
-    config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=[])
+    config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"])
     result = run_study(config, tmp_path / "out")
     assert result.regions == ()
     assert [failure.unit.backbone for failure in result.failures] == ["regions"]
@@ -80,11 +82,11 @@ def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
 
 
 def test_one_frame_has_no_flicker(root, tmp_path) -> None:
-    config = configure(root, frames={"count": 1}, region_maps=["regions"], sweeps={}, backends=[])
+    config = configure(root, frames={"count": 1}, region_maps=["regions"], sweeps={}, backends=["numpy"])
     (found,) = run_study(config, tmp_path / "out").regions
     assert math.isnan(found.flicker_percent)
 
 
 def test_a_source_that_is_not_there_is_refused(root, tmp_path) -> None:
     with pytest.raises(ConfigError, match="wall: no region map 'region'; did you mean 'regions'"):
-        run_study(configure(root, frames={}, region_maps=["region"], sweeps={}, backends=[]), tmp_path / "out")
+        run_study(configure(root, frames={}, region_maps=["region"], sweeps={}, backends=["numpy"]), tmp_path / "out")

@@ -23,8 +23,8 @@ from wall_study import BACKBONES, STEPS, wall_study
 from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.files import write_text
 from semstab.metrics import entropy, op, sbd, vss
+from semstab.records import BACKENDS, SHARED, ImageSpace, RegionFlicker, Result
 from semstab.statistics import Estimate
-from semstab.study.results import BACKENDS, SHARED, ImageSpace, RegionFlicker, StudyResult
 from semstab.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
 from semstab.testing import checks
 
@@ -34,16 +34,16 @@ WRITERS = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
 
 
 @pytest.fixture(scope="module")
-def walls(tmp_path_factory) -> StudyResult:
+def walls(tmp_path_factory) -> Result:
     return wall_study(tmp_path_factory.getbasetemp())[0]
 
 
-def table_of(result: StudyResult, name: str) -> Table:
+def table_of(result: Result, name: str) -> Table:
     (found,) = (table for table in tables(result) if table.name == name)
     return found
 
 
-def rows_of(result: StudyResult, name: str) -> list[dict]:
+def rows_of(result: Result, name: str) -> list[dict]:
     return to_json(table_of(result, name))["rows"]
 
 

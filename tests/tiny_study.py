@@ -8,7 +8,8 @@ from typing import Any
 
 import tiny_scene
 
-from semstab.study import StudyConfig, StudyObserver
+from semstab.config import Config
+from semstab.engine import Observer
 
 FRAMES = 10
 TIMES = ("fuse_ms_per_frame", "stages_ms")
@@ -31,17 +32,17 @@ def content(root: Path, **settings: Any) -> dict[str, Any]:
     return {
         "name": "tiny",
         "dataset": {"name": "posed_folder", "options": {"root": str(root)}},
-        "backend": "numpy",
         "voxel_size": 0.25,
         "frames": {"spacing": "even", "count": 5},
         "sweeps": SWEEPS,
-        "backends": ["numba"],
+        "backends": ["numpy", "numba"],
+        "check": None,
         **settings,
     }
 
 
-def configure(root: Path, **settings: Any) -> StudyConfig:
-    return StudyConfig.build(content(root, **settings))
+def configure(root: Path, **settings: Any) -> Config:
+    return Config.build(content(root, **settings))
 
 
 def summary(out: Path) -> dict[str, Any]:
@@ -51,7 +52,7 @@ def summary(out: Path) -> dict[str, Any]:
     return {**found, "runs": runs}
 
 
-class Counting(StudyObserver):
+class Counting(Observer):
     """What was wanted, kept and computed."""
 
     def __init__(self) -> None:
@@ -59,10 +60,10 @@ class Counting(StudyObserver):
         self.computed: list[str] = []
         self.failed: list[str] = []
 
-    def study_started(self, units, kept) -> None:
-        self.units, self.kept = units, kept
+    def run_started(self, plan, kept) -> None:
+        self.units, self.kept = len(plan.distinct()), len(kept)
 
-    def unit_finished(self, cell, error) -> None:
+    def unit_done(self, cell, error) -> None:
         what = f"{cell.unit.slug} {cell.variation.sweep} {cell.variation.value}"
         (self.computed if error is None else self.failed).append(what)
 
@@ -74,7 +75,7 @@ class Interrupting(Counting):
         super().__init__()
         self.after = after
 
-    def unit_finished(self, cell, error) -> None:
-        super().unit_finished(cell, error)
+    def unit_done(self, cell, error) -> None:
+        super().unit_done(cell, error)
         if len(self.computed) == self.after:
             raise KeyboardInterrupt

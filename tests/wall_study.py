@@ -9,9 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from semstab.config import Config
+from semstab.engine import run_study
 from semstab.plots import write_figures
-from semstab.study import StudyConfig, run_study
-from semstab.study.results import StudyResult
+from semstab.records import Result
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
 STEPS = {"often": 0.25, "rarely": 1.0}
@@ -44,11 +45,11 @@ def write_wall(folder: Path, step: float) -> None:
 
 
 @functools.cache
-def wall_study(base: Path) -> tuple[StudyResult, Path]:
+def wall_study(base: Path) -> tuple[Result, Path]:
     """What the study found, and its folder, made once in `base`; times are set to 12.5 ms a frame."""
     for scene, step in STEPS.items():
         write_wall(base / "walls" / scene, step)
-    config = StudyConfig.build(
+    config = Config.build(
         {
             "name": "wall & <door>",
             "dataset": {"name": "posed_folder", "options": {"root": str(base / "walls")}},
@@ -73,7 +74,7 @@ def wall_study(base: Path) -> tuple[StudyResult, Path]:
 
 
 @functools.cache
-def drawn_walls(base: Path) -> tuple[StudyResult, Path, list[Path]]:
+def drawn_walls(base: Path) -> tuple[Result, Path, list[Path]]:
     """The part of one backbone, with a saved frame of one scene; a folder with its figures, and their paths."""
     result, _ = wall_study(base)
     calm = dataclasses.replace(result, records=tuple(r for r in result.records if r.unit.backbone == "calm"))

@@ -33,8 +33,8 @@ from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.task import selected
 from semstab.prefetch import prefetch
+from semstab.task import selected
 
 SCHEMA = 1
 """Version of the file that --json writes."""

@@ -19,9 +19,9 @@ from semstab.datasets.scene_settings import UP_AXES
 from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame
-from semstab.task import selected
 from semstab.prefetch import prefetch
 from semstab.results import slug
+from semstab.task import selected
 
 __all__ = ["Converted", "convert", "convert_scene"]
 

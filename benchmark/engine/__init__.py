@@ -1,4 +1,4 @@
-"""The one engine behind runs and studies: scenes x backbones x backends x variations, each unit kept when it is done."""
+"""The engine behind runs and studies: scenes x backbones x backends x variations, each unit kept when it is done."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from semstab.engine.execution import run, run_study
     from semstab.engine.executors import DaskCluster, Executor, InProcess, LocalProcesses
     from semstab.engine.folder import load_result
     from semstab.engine.observer import Observer
-    from semstab.engine.execution import run, run_study
 
 __all__ = [
     "DaskCluster",

@@ -8,9 +8,9 @@ from typing import Any
 
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
-from semstab.task import Task
 from semstab.errors import ConfigError
 from semstab.statistics import Analysis, analyse, compare_backbones, nulls
+from semstab.task import Task
 from semstab.voxels import Events, VoxelTable
 
 

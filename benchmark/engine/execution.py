@@ -23,13 +23,13 @@ from semstab.engine.jobs import Job, Request, split
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.passes import lend
-from semstab.settings import resolve
-from semstab.stopwatch import Stopwatch
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
 from semstab.results import Agreement
+from semstab.settings import resolve
+from semstab.stopwatch import Stopwatch
 from semstab.voxels import VoxelTable
 
 GB = 1e9
@@ -55,7 +55,7 @@ def run(
         first = result.failures[0]
         raise causes.get(first.message) or DataError(first.message)
     if out is None:
-        records = tuple(dataclasses.replace(record, voxels=None, truth=None) for record in result.records)
+        records = tuple(dataclasses.replace(record, voxels_file=None, truth_file=None) for record in result.records)
         return dataclasses.replace(result, records=records)
     return result
 
@@ -288,7 +288,7 @@ def _comparisons(records: Sequence[Record], tables: _Tables) -> Iterator[Mapping
     base = [record for record in records if record.variation.sweep == BASE]
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
-        truths = [record.truth for record in there if record.truth is not None]
+        truths = [record.truth_file for record in there if record.truth_file is not None]
         truth = VoxelTable.load(truths[0]) if truths and len(there) > 1 else None
         found = comparison(scene, {record.unit.backbone: tables.of(record) for record in there}, truth)
         if found is not None:

@@ -15,13 +15,13 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
-from semstab.errors import ConfigError, MissingDependencyError
-from semstab.engine.memory import available_bytes
-from semstab.prefetch import default_threads
-from semstab.process import settle
 from semstab.engine.jobs import Job, Outcome, failed
+from semstab.engine.memory import available_bytes
 from semstab.engine.observer import Observers
 from semstab.engine.passes import run_job
+from semstab.errors import ConfigError, MissingDependencyError
+from semstab.prefetch import default_threads
+from semstab.process import settle
 
 CONNECT_SECONDS = 10
 

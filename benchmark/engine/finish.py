@@ -20,15 +20,15 @@ from semstab.engine.evaluation import analyse_map
 from semstab.engine.jobs import Job, Outcome, shared_marker
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
-from semstab.stopwatch import Stopwatch
 from semstab.engine.stream import Stream, UnitMap
-from semstab.task import Task, read
 from semstab.errors import DataError
 from semstab.files import atomic_path, write_text
 from semstab.metrics import dominant, entropy, macro_mean, sbd, summarise, vss
 from semstab.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
 from semstab.results import STAGES, UnitSummary, slug
 from semstab.statistics import Analysis, nulls
+from semstab.stopwatch import Stopwatch
+from semstab.task import Task, read
 from semstab.up_axis import estimate_up
 from semstab.voxels import VoxelTable
 
@@ -96,9 +96,7 @@ def _summary(task: Task, config: Config, table: VoxelTable, rows: Sequence[Frame
     )
 
 
-def _savers(
-    stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis
-) -> Savers:
+def _savers(stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis) -> Savers:
     """What is to be written of a unit beside its summary."""
     config, unit = one.request.config, one.task.units[0]
     savers: Savers = {}

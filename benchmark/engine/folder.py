@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fcntl
 import hashlib
 import logging
 import os
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from semstab.engine.jobs import Outcome, shared_marker
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.json_form import from_json, to_json
 from semstab.records import EVENTS, FRAMES, OVERVIEW, TRUTH, UNITS, VOXELS, ImageSpace, Record, Result, UnitContent
-from semstab.results import Unit, slug
+from semstab.results import SCHEMA, Unit, slug
 
 logger = logging.getLogger("semstab")
 
@@ -81,7 +83,7 @@ class Folder:
             with atomic_path(self.path / name) as temporary:
                 temporary.write_bytes(file)
         key = unit_key(outcome.identity, outcome.content.input)
-        write_json(self.path / UNITS / f"{key}.json", outcome.content.to_dict())
+        write_json(self.path / UNITS / f"{key}.json", outcome.content)
 
     def save_trace(self, outcome: Outcome) -> None:
         """Keep where a unit's error was raised, for who mends it: failures.log of this start."""
@@ -98,13 +100,16 @@ class Folder:
             variation=planned.variation,
             summary=content.summary,
             image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
-            voxels=self.path / VOXELS / f"{planned.unit.slug}.parquet" if planned.kept else None,
-            truth=truth if planned.image_space and f"{TRUTH}/{truth.name}" in content.files else None,
+            voxels_file=self.path / VOXELS / f"{planned.unit.slug}.parquet" if planned.kept else None,
+            truth_file=truth if planned.image_space and f"{TRUTH}/{truth.name}" in content.files else None,
         )
 
     def save_result(self, result: Result) -> None:
         """Write summary.json and manifest.json."""
-        write_json(self.path / "summary.json", result.to_dict())
+        content = to_json(dataclasses.replace(result, records=_in(self.path, result.records), manifest={}))
+        runs = content.pop("records")
+        del content["manifest"]
+        write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
         write_json(self.path / "manifest.json", result.manifest)
 
     @contextlib.contextmanager
@@ -149,17 +154,38 @@ def unit_key(identity: str, digest: str) -> str:
 def load_result(folder: str | Path) -> Result:
     """What a finished run or study found, from its folder. Raises DataError where it is not there or damaged."""
     folder = Path(folder)
-    content = read_json(folder / "summary.json")
-    try:
-        return Result.from_dict(content, folder, read_json(folder / "manifest.json"))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{folder / 'summary.json'}: not the summary of a run or a study ({error!r})") from error
+    path = folder / "summary.json"
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        raise DataError(f"{path}: not a summary of this version of semstab; run it again, into another folder")
+    result = from_json(Result, {**content, "records": content.get("runs")}, path)
+    records = tuple(
+        dataclasses.replace(
+            record,
+            voxels_file=record.voxels_file and folder / record.voxels_file,
+            truth_file=record.truth_file and folder / record.truth_file,
+        )
+        for record in result.records
+    )
+    return dataclasses.replace(result, records=records, manifest=read_json(folder / "manifest.json"))
+
+
+def _in(folder: Path, records: Sequence[Record]) -> tuple[Record, ...]:
+    """The records with their files as they are called in the folder, which may be moved."""
+    return tuple(
+        dataclasses.replace(
+            record,
+            voxels_file=record.voxels_file and record.voxels_file.relative_to(folder),
+            truth_file=record.truth_file and record.truth_file.relative_to(folder),
+        )
+        for record in records
+    )
 
 
 def _read_unit(file: Path) -> UnitContent | None:
     try:
-        return UnitContent.from_dict(read_json(file))
-    except (DataError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
+        return from_json(UnitContent, read_json(file), file)
+    except DataError:
         logger.warning("%s: damaged; the unit is computed again", file)
         return None
 

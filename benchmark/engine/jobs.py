@@ -95,12 +95,12 @@ def split(jobs: Sequence[Job], width: int) -> list[Job]:
     What is kept of one sequence stays together, for it is watched together.
     """
     jobs = list(jobs)
-    while 0 < len(jobs) < width:
-        k = max(range(len(jobs)), key=lambda k: len(jobs[k].requests))
-        first, second = _halves(jobs[k].requests)
-        if not second:
+    while len(jobs) < width:
+        divisible = [k for k, job in enumerate(jobs) if all(_halves(job.requests))]
+        if not divisible:
             break
-        jobs[k : k + 1] = [replace(jobs[k], requests=first), replace(jobs[k], requests=second)]
+        k = max(divisible, key=lambda k: len(jobs[k].requests))
+        jobs[k : k + 1] = [replace(jobs[k], requests=half) for half in _halves(jobs[k].requests)]
     return jobs
 
 

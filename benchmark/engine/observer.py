@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from semstab.backends import FusionBackend
     from semstab.check import Verdict
     from semstab.engine.series import FrameRow
-    from semstab.task import Task
     from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
     from semstab.frames import Frame
     from semstab.records import Result
     from semstab.results import Unit, UnitSummary
+    from semstab.task import Task
     from semstab.voxels import VoxelTable
 
 

@@ -17,14 +17,14 @@ from semstab.engine.finish import finish
 from semstab.engine.jobs import Job, Outcome, Request, failed, message
 from semstab.engine.memory import available_bytes, require_memory
 from semstab.engine.observer import Observers
-from semstab.prefetch import Fetched, prefetch
 from semstab.engine.regions import measure_regions
 from semstab.engine.series import FrameRow
-from semstab.stopwatch import Stopwatch
 from semstab.engine.stream import Decoded, Prepared, Stream, UnitMap, streams_of
-from semstab.task import Task, tasks_of
 from semstab.errors import DataError
 from semstab.frames import Frame
+from semstab.prefetch import Fetched, prefetch
+from semstab.stopwatch import Stopwatch
+from semstab.task import Task, tasks_of
 
 logger = logging.getLogger("semstab")
 

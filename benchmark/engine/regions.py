@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from semstab.datasets import Scene
+from semstab.engine.jobs import Job, Outcome, Request
 from semstab.errors import DataError
 from semstab.exclusion import leave_out
 from semstab.frames import Frame
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.perturbation import perturb
-from semstab.task import frame_indices
 from semstab.prefetch import prefetch
-from semstab.engine.jobs import Job, Outcome, Request
 from semstab.records import RegionFlicker, UnitContent
+from semstab.task import frame_indices
 from semstab.warp import correspond
 
 

@@ -15,13 +15,14 @@ from semstab.engine.evaluation import truth_task
 from semstab.engine.image_space import ImageSpaceMeter
 from semstab.engine.jobs import Request
 from semstab.engine.series import FrameRow
-from semstab.stopwatch import Stopwatch
-from semstab.task import Task, prepare
 from semstab.frames import Frame
 from semstab.metrics import flicker_percent
+from semstab.stopwatch import Stopwatch
+from semstab.task import Task, prepare
 
 SHOWN_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
+
 
 @dataclass(eq=False)
 class UnitMap:

@@ -11,13 +11,24 @@ from functools import cached_property, partial
 from typing import Any
 
 from semstab.backends import create, keeps_log
-from semstab.config import BACKENDS, BASE, SHARED, BackendConfig, Config, FrameSelection, Noise, Part, Perturbation, Sweeps
+from semstab.config import (
+    BACKENDS,
+    BASE,
+    SHARED,
+    BackendConfig,
+    Config,
+    FrameSelection,
+    Noise,
+    Part,
+    Perturbation,
+    Sweeps,
+)
 from semstab.datasets import Regional, Scene, Tracked, open_dataset
 from semstab.engine.jobs import Request
-from semstab.task import Task, applies, frame_indices, selected, tasks_of
 from semstab.errors import ConfigError
 from semstab.records import REGIONS, Variation
 from semstab.results import Unit
+from semstab.task import Task, applies, frame_indices, selected, tasks_of
 
 FORMAT = 2
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""

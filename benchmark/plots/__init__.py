@@ -16,8 +16,8 @@ from semstab.plots.judgement import statistics_figures
 from semstab.plots.maps import Overview, draw_overview, draw_stability
 from semstab.plots.style import Figure
 from semstab.plots.sweeps import draw_sweep
-from semstab.results import slug
 from semstab.records import OVERVIEW, Record, Result
+from semstab.results import slug
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -41,7 +41,7 @@ def write_figures(result: Result, folder: str | Path) -> list[Path]:
 
 def figures(result: Result, folder: str | Path) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
-    kept = [record for record in result.select() if record.voxels is not None]
+    kept = [record for record in result.select() if record.voxels_file is not None]
     return [
         *_overviews(result, kept, Path(folder) / OVERVIEW),
         *_distributions(kept),

@@ -13,10 +13,10 @@ from semstab.averages import by_backbone, levels, swept
 from semstab.plots.maps import draw_uncertainty, right_or_wrong
 from semstab.plots.statistics import DriftByOP, Rows, draw_agreement, draw_drift, draw_intervals, draw_reliability
 from semstab.plots.style import Figure
+from semstab.records import Record, Result
 from semstab.results import slug
 from semstab.statistics import estimate_at, expected_sbd
 from semstab.statistics.verdict import RELIABLE, TENTATIVE
-from semstab.records import Record, Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -146,9 +146,9 @@ def _column(record: Record, name: str) -> npt.NDArray[Any] | None:
     """A column that was written beside the voxels; None where it was not."""
     import pyarrow.parquet as pq
 
-    if name not in pq.read_schema(record.voxels).names:
+    if name not in pq.read_schema(record.voxels_file).names:
         return None
-    values: npt.NDArray[Any] = pq.read_table(record.voxels, columns=[name]).column(name).to_numpy()
+    values: npt.NDArray[Any] = pq.read_table(record.voxels_file, columns=[name]).column(name).to_numpy()
     return values
 
 

@@ -13,11 +13,11 @@ from rich.console import Console
 
 from semstab.config import FrameSelection, explain
 from semstab.errors import ConfigError
-from semstab.settings import load_config, resolve
 from semstab.predict.jobs import Job, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor
 from semstab.predict.sequence import SequenceOptions, SequenceReport, predict_sequence
 from semstab.predict.terminal import PredictionBar, print_report
+from semstab.settings import load_config, resolve
 
 
 def run(

@@ -20,9 +20,9 @@ from semstab.datasets import GROUND_TRUTH, Timed, Tracked
 from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.settings import load_config, resolve
 from semstab.predict.predictor import PredictorConfig, load_predictor
 from semstab.predict.sources import ImageScene, open_images
+from semstab.settings import load_config, resolve
 
 NAME = "predicted"
 

@@ -14,13 +14,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
-from semstab.task import Task
 from semstab.engine.units import Plan
 from semstab.recording import legend
 from semstab.recording.entities import path
 from semstab.recording.series import SERIES, entity
 from semstab.recording.voxel_maps import TABS, TITLES, chunk, defaults, visualizer
 from semstab.results import RECURRENT, Unit
+from semstab.task import Task
 
 FIELD_OF_VIEW = math.radians(55)
 """Of the viewer's eyes, from bottom to top."""

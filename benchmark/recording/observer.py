@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
+from semstab.engine.observer import Observer
+from semstab.engine.series import FrameRow
+from semstab.engine.units import Plan, Planned
 from semstab.frames import Frame
 from semstab.metrics import compensated_flicker
-from semstab.engine.observer import Observer
-from semstab.task import Task
-from semstab.engine.units import Plan, Planned
 from semstab.recording import legend, series
 from semstab.recording.background import Background
 from semstab.recording.camera import (
@@ -40,7 +40,7 @@ from semstab.recording.tracker import FrameDrift, Tracker
 from semstab.recording.voxel_maps import CHUNKS, GrowingMap, chunks_of
 from semstab.records import Result
 from semstab.results import Unit, UnitSummary
-from semstab.engine.series import FrameRow
+from semstab.task import Task
 from semstab.voxels import VoxelTable
 
 SAMPLING = 2

@@ -9,11 +9,11 @@ from typing import Any
 
 import rerun as rr
 
-from semstab.errors import DataError
-from semstab.task import Task
 from semstab.engine.units import Plan
+from semstab.errors import DataError
 from semstab.recording.entities import Clock, path
 from semstab.results import RECURRENT, Unit
+from semstab.task import Task
 
 SERIES = {
     "drift": "Mean drift of updates (bits)",

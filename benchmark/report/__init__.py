@@ -18,9 +18,9 @@ from semstab.engine.observer import Observer
 from semstab.files import write_text
 from semstab.findings import Finding, findings
 from semstab.plots.style import COLUMN, DPI, Figure
+from semstab.records import Failure, Result
 from semstab.report.reading import reading
 from semstab.results import slug
-from semstab.records import Failure, Result
 from semstab.tables import Table, tables, write_tables
 from semstab.tables.writers import ARROWS, relations, sections
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from semstab.statistics import estimate_at, number_at
 from semstab.records import Result
+from semstab.statistics import estimate_at, number_at
 from semstab.tables.table import Column, Group, Row, Table
 
 MEASURES = {

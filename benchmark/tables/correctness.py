@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from semstab.statistics import number_at
 from semstab.records import Record, Result
+from semstab.statistics import number_at
 from semstab.tables.stability import settings
 from semstab.tables.statistics import (
     INTERVALS,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from semstab.averages import Pooled, pooled
-from semstab.results import Agreement
 from semstab.config import BACKENDS
 from semstab.records import Record, Result
+from semstab.results import Agreement
 from semstab.tables.stability import SBD_OVER, settings
 from semstab.tables.table import Column, Group, Row, Table
 

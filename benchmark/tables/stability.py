@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from semstab.averages import ENOUGH, by_backbone, pooled
-from semstab.metrics import macro_mean
-from semstab.results import Means
 from semstab.config import SHARED
+from semstab.metrics import macro_mean
 from semstab.records import Record, Result
+from semstab.results import Means
 from semstab.tables.table import Column, Group, Row, Table
 
 VOXELS = Column("voxels", "Voxels", 0)

@@ -8,9 +8,9 @@ from typing import Any
 
 from semstab.averages import by_backbone
 from semstab.metrics import macro_mean
+from semstab.records import Record, Result
 from semstab.statistics import Estimate, estimate_at, number_at
 from semstab.statistics.verdict import ADVICE
-from semstab.records import Record, Result
 from semstab.tables.table import Column, Group, Row, Table
 
 SCENE = Column("scene", "Scene")
