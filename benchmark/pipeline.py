@@ -46,6 +46,9 @@ class Observer:
     def geometry_checked(self, task: Task, verdict: Verdict) -> None:
         """Depth and poses of the task's scene were compared, and do not contradict each other."""
 
+    def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
+        """A unit's map is made, and empty; every frame goes into it next."""
+
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """A frame went into a unit's map; `frame` holds labels in the run's label space."""
 
@@ -188,6 +191,9 @@ def _fuse_frames(
     """Every frame into every map, while worker threads decode the next ones."""
     rows: dict[Unit, list[FrameRow]] = {unit: [] for unit in maps}
     previous: Frame | None = None
+    for unit, backend in maps.items():
+        for observer in observers:
+            observer.unit_started(unit, backend)
     with contextlib.closing(_decoded(task, config, observers)) as frames:
         for fetched in frames:
             frame = fetched.item

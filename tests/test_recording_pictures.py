@@ -136,7 +136,7 @@ def test_colour_that_is_not_a_small_jpeg_is_encoded_anew(tmp_path, kind) -> None
     view = frame(0, np.zeros((6, 8)), {"color": str(file)})
     scene = make_plan(config_of(tiny_scene.write(tmp_path / "wall"))).tasks[0].scene
     frames = camera.COLOR_BYTES // (len(data) - 1) if kind == "large" else 1
-    seen = camera.Camera(scene, np.zeros(3), frames)
+    seen = camera.CameraLog(scene, np.zeros(3), frames)
     color = seen._color(view)
     if kind in ("cut off", "not an image"):
         assert color is None
@@ -242,7 +242,7 @@ def test_what_numba_says_of_a_frame_is_what_happened(evidence) -> None:
         view = frame(index, rng.integers(0, 4, (10, 14)))
         old = {tuple(i): (d, k) for i, d, k in described(reference.table())}
         reference.integrate(view)
-        assert fused.integrate(view).fused_into is fused
+        fused.integrate(view)
         new = {tuple(i): (d, k) for i, d, k in described(reference.table())}
         changes = fused.changes
         assert len(changes.row) == len(new)
@@ -267,9 +267,9 @@ def test_the_voxel_behind_every_pixel_is_found_whatever_becomes_of_the_map() -> 
     labels = np.random.default_rng(1).integers(0, 4, (9, 12))
     labels[0, :3] = 255
     view = frame(0, labels)
-    tracker.integrate(view)
+    tracker.follow(view)
     caused, changes, table = tracker.drift_of(view), tracker.map.changes, tracker.map.table()
-    tracker.integrate(frame(1, np.zeros((9, 12))))
+    tracker.follow(frame(1, np.zeros((9, 12))))
     found = caused.voxels_at(1)
     np.testing.assert_array_equal(found == -1, ~view.valid)
     np.testing.assert_array_equal(caused.voxels_at(3), found[::3, ::3])
@@ -296,7 +296,7 @@ def alternating(count: int) -> list[Frame]:
 def tracked(views: list[Frame]) -> tuple[Tracker, FlipLog]:
     tracker, log = Tracker(1.0, 3), FlipLog()
     for view in views:
-        tracker.integrate(view)
+        tracker.follow(view)
         log.update(tracker, view)
     return tracker, log
 
@@ -348,7 +348,7 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(voxel_maps, "BUDGET", 600)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 2000)
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
+    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     rng = np.random.default_rng(0)
@@ -372,7 +372,7 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
 
 def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -> None:
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
+    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     for index in range(4):
@@ -393,7 +393,7 @@ def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -
 def test_what_is_not_drawn_yet_comes_before_what_changed(tmp_path) -> None:
     """A large map that is seen all over, and grows at its end."""
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
+    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     growing._allowed = 1e6
