@@ -6,10 +6,8 @@ import io
 import itertools
 import re
 import signal
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +22,12 @@ from test_recording import config_of, grid, notes, read, read_blueprints, series
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
-from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.metrics import compensated_flicker
 from semstab.plan import load_config, make_plan
 from semstab.plan import read as read_frame
-from semstab.recording import Recording, Target, camera, flips, voxel_maps
+from semstab.recording import Recording, camera, flips, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
@@ -455,70 +452,3 @@ semstab.run(config, observers=[Recording({str(path)!r}), Killing()])
     subprocess.run([rerun, "rrd", "optimize", path, "-o", whole], capture_output=True, check=True)
     verify(whole)
     assert set(series(read(whole), "/wall/series/map_vss/a/numba")) == {0, 1, 2}
-
-
-# Where a recording goes.
-
-
-def test_what_rerun_may_say() -> None:
-    default = Path("run/recording.rrd")
-    assert Target.parse(None, default) == Target(default)
-    assert Target.parse("here.rrd", default) == Target(Path("here.rrd"))
-    assert Target.parse("spawn", default) == Target(default, "spawn")
-    assert Target.parse("serve", default) == Target(default, "serve")
-    url = "rerun+http://10.0.0.7:9876/proxy"
-    assert Target.parse(url, default) == Target.parse(f"connect {url}", default) == Target(default, url)
-    assert Target.parse("connect", default).viewer == "rerun+http://127.0.0.1:9876/proxy"
-    for wrong in ("spwan", "folder", "connect http://10.0.0.7", "rerun+http://10.0.0.7:9876"):
-        with pytest.raises(ConfigError, match="--rerun"):
-            Target.parse(wrong, default)
-
-
-def test_a_viewer_that_is_not_there_is_said_at_once(tmp_path) -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        port = unused.getsockname()[1]
-    target = Target(tmp_path / "x.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
-    with pytest.raises(ConfigError, match="no rerun viewer listens there"):
-        target.open()
-
-
-def test_spawn_starts_the_viewer(tmp_path, monkeypatch) -> None:
-    started: list[str] = []
-    monkeypatch.setattr("rerun.sinks._spawn_viewer", lambda **options: started.append(options["executable_path"]))
-    monkeypatch.setattr(rr, "GrpcSink", lambda url: rr.FileSink(tmp_path / "sent.rrd"))
-    stream = Target(tmp_path / "own.rrd", "spawn").open()
-    stream.log("/x", rr.Scalars(1.0))
-    stream.flush()
-    stream.disconnect()
-    assert [Path(program).name for program in started] == ["rerun"]
-    assert set(read(tmp_path / "own.rrd")) == set(read(tmp_path / "sent.rrd")) >= {"/x"}
-
-
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    saved = tmp_path / "received.rrd"
-    command = [Path(sys.executable).with_name("rerun"), "--port", str(port), "--save", saved]
-    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        deadline = time.monotonic() + 20
-        while not listens(port) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        target = Target(tmp_path / "own.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
-        root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
-        semstab.run(config_with(root, "numba"), observers=[Recording(target)])
-        time.sleep(1)
-    finally:
-        viewer.send_signal(signal.SIGINT)
-        viewer.wait(20)
-    verify(tmp_path / "own.rrd")
-    expected = series(read(tmp_path / "own.rrd"), "/wall/series/map_vss/a/numba")
-    assert len(expected) == 3
-    assert saved.stat().st_size > 10_000
