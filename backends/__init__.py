@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any, Protocol, cast
+from dataclasses import dataclass
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.frames import Frame
@@ -75,6 +79,68 @@ class FusionBackend(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """What one frame did to each of the n voxels that it saw.
+
+    row            (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation
+    key            (n,) int64 its index, packed, relative to the map's origin; overwritten by the next frame
+    drift          (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before
+    before, after  (n,) uint16 its dominant class; where it was not seen before, both are the one after
+    """
+
+    row: npt.NDArray[np.int64]
+    key: npt.NDArray[np.int64]
+    drift: npt.NDArray[np.float32]
+    before: npt.NDArray[np.uint16]
+    after: npt.NDArray[np.uint16]
+
+    @classmethod
+    def room(cls, row: npt.NDArray[np.int64], key: npt.NDArray[np.int64]) -> Changes:
+        """To be filled, for the voxels of these rows and keys."""
+        n = len(row)
+        return cls(row, key, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
+
+
+@runtime_checkable
+class GrowingMap(FusionBackend, Protocol):
+    """A backend whose map can be followed voxel by voxel while it grows: what the recording asks for.
+
+    A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.keys`.
+    """
+
+    @property
+    def voxel_size(self) -> float:
+        """Edge of a voxel, metres."""
+        ...
+
+    @property
+    def origin(self) -> npt.NDArray[np.int64]:
+        """(3,) voxel index that packed keys count from; of an empty map 0."""
+        ...
+
+    @property
+    def changes(self) -> Changes:
+        """What the last frame did to each voxel."""
+        ...
+
+    def __len__(self) -> int:
+        """The number of voxels."""
+        ...
+
+    def column(self, name: str, rows: npt.NDArray[np.int64] | slice = ...) -> npt.NDArray[Any]:
+        """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""
+        ...
+
+    def evidence_of(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        """Evidence (n, K) of the voxels of those rows."""
+        ...
+
+    def index_of(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Voxel indices (n, 3) of the voxels of those rows."""
+        ...
+
+
 def create(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> FusionBackend:
     """A new, empty map.
 
@@ -92,6 +158,7 @@ def create(name: str, *, voxel_size: float, num_classes: int, **options: Any) ->
 def takes_option(name: str, option: str) -> bool:
     """Whether the backend of that name has such an option, for example 'device'."""
     return option in _options(REGISTRY.load(name))
+
 
 def keeps_log(name: str) -> bool:
     """Whether the backend of that name can give the log of its observations: with option `history`, or always."""

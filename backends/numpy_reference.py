@@ -6,19 +6,8 @@ import time
 
 import numpy as np
 
-from semstab.backends.association import (
-    Int64,
-    Observations,
-    back_project,
-    check_frame,
-    check_settings,
-    evidence_of,
-    no_observations,
-    pack,
-    unpack,
-    voxel_index,
-)
-from semstab.backends.means import MapMeans
+from semstab.backends.shared.association import Int64, Observations, check_frame, check_settings, observe
+from semstab.backends.shared.total import Change, MapTotal
 from semstab.frames import Frame
 from semstab.results import FrameReport
 from semstab.voxels import Events, VoxelTable, index_columns
@@ -37,7 +26,7 @@ class NumpyReference:
         self._history: list[tuple[Int64, int, Observations]] = []  # (rows, frame, observations), frame after frame
         self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
         self._op = np.zeros(0, dtype=np.int64)
-        self._means = MapMeans()
+        self._total = MapTotal(num_classes)
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
@@ -55,9 +44,8 @@ class NumpyReference:
         self._evidence[rows] = after
         self._op[rows] += 1
         self._history.append((rows, frame.index, seen))
-        op = self._op[rows]
-        drift = self._means.update(before, after, op)
-        return self._means.report(frame, seen.pixels, op, drift, time.perf_counter() - started)
+        change = Change.between(before, after, self._op[rows], seen.pixels)
+        return self._total.add(frame.index, change, started)
 
     def table(self) -> VoxelTable:
         """The map so far, from the history."""
@@ -92,15 +80,3 @@ class NumpyReference:
             self._evidence = np.pad(self._evidence, ((0, room), (0, 0)))
             self._op = np.pad(self._op, (0, room))
         return rows
-
-
-def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:
-    """The frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q."""
-    points = back_project(frame)
-    if not points.shape[1]:
-        return no_observations(num_classes)
-    key, low, size = pack(voxel_index(points, voxel_size, frame), frame)
-    voxels, inverse, pixels = np.unique(key, return_inverse=True, return_counts=True)
-    s_sum = np.zeros((len(voxels), num_classes))
-    np.add.at(s_sum, inverse, evidence_of(frame, num_classes))
-    return Observations(unpack(voxels, low, size), s_sum / pixels[:, None], pixels)

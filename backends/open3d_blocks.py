@@ -7,7 +7,6 @@ to the host and takes them back, because Open3D tensors have no logarithm.
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any
 
@@ -16,9 +15,10 @@ import numpy.typing as npt
 import open3d.core as o3c
 from open3d.t.geometry import VoxelBlockGrid
 
-from semstab.backends.aggregator import Aggregator, Observed
-from semstab.backends.association import Int64, check_frame, check_settings
-from semstab.backends.updates import update_rows
+from semstab.backends.shared.aggregator import Aggregator, Observed
+from semstab.backends.shared.association import Int64, check_frame, check_settings
+from semstab.backends.shared.columns import update_rows
+from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.results import FrameReport
@@ -50,8 +50,7 @@ class Open3DBlocks:
         self.device = _device(device)
         self._in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
         self._pixels = Aggregator(voxel_size, num_classes)
-        self._sums = np.zeros(2)  # of VSS and of entropy in bits, over the map
-        self._voxels = self._recurrent = 0
+        self._total = MapTotal(num_classes)
         self._attributes = {
             "op": (o3c.int32, 1),
             "evidence": (o3c.float64, num_classes),
@@ -78,23 +77,8 @@ class Open3DBlocks:
         seen = self._pixels.observe(frame)
         observed = time.perf_counter()
         rows = self._activate(self._pixels.index_of(seen.key)) if len(seen.key) else seen.key
-        new, drift = self._update(rows, seen, frame.index)
-        finished = time.perf_counter()
-        n = max(self._voxels, 1)
-        return FrameReport(
-            frame=frame.index,
-            points=int(seen.pixels.sum()),
-            voxels=len(rows),
-            new_voxels=new,
-            drift_sum=drift,
-            seconds=finished - started,
-            map_voxels=self._voxels,
-            map_vss=float(self._sums[0]) / n if self._voxels else math.nan,
-            map_entropy=float(self._sums[1]) / math.log2(self.num_classes) / n if self._voxels else math.nan,
-            map_recurrent=self._recurrent / n if self._voxels else math.nan,
-            association_seconds=observed - started,
-            update_seconds=finished - observed,
-        )
+        change = self._update(rows, seen, frame.index)
+        return self._total.add(frame.index, change, started, observed)
 
     def table(self) -> VoxelTable:
         """The map so far: the voxels of all active blocks that a frame has seen."""
@@ -170,19 +154,16 @@ class Open3DBlocks:
         index: Int64 = keys[block] * r + local
         return index
 
-    def _update(self, rows: Int64, seen: Observed, frame: int) -> tuple[int, float]:
-        """Add one observation to each row; return the number of new voxels, and the drift caused, bits."""
+    def _update(self, rows: Int64, seen: Observed, frame: int) -> Change:
+        """Add one observation to each row."""
         names = tuple(self._attributes)
         values = {name: self._attribute(name).numpy() if self._in_place else self._read(name, rows) for name in names}
         columns = {name: value if name == "evidence" else value.reshape(-1) for name, value in values.items()}
-        sums = update_rows(rows if self._in_place else np.arange(len(rows)), seen, frame, **columns)
+        change = update_rows(rows if self._in_place else np.arange(len(rows)), seen, frame, **columns)
         if not self._in_place:
             for name in names:
                 self._write(name, rows, values[name])
-        self._sums += sums[:2]
-        self._voxels += int(sums[3])
-        self._recurrent += int(sums[4])
-        return int(sums[3]), float(sums[2])
+        return change
 
     def _attribute(self, name: str) -> Any:
         """The attribute, flattened to (voxels, channels); taken anew each time, because a rehash moves the buffers."""

@@ -17,10 +17,10 @@ import numpy.typing as npt
 import open3d.core as o3c
 from open3d.t.geometry import PointCloud, VoxelBlockGrid
 
-from semstab.backends.aggregator import Aggregator, Observed
-from semstab.backends.association import Float64, Int64, check_frame
-from semstab.backends.kernels import PARTITIONS
 from semstab.backends.open3d_blocks import Open3DBlocks
+from semstab.backends.shared.aggregator import Aggregator, Observed
+from semstab.backends.shared.association import Float64, Int64, check_frame
+from semstab.backends.shared.hashing import PARTITIONS
 from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.labels import IGNORE_8BIT

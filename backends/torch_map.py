@@ -1,45 +1,22 @@
 """Backend `torch`: the whole of fusion on an accelerator, or on a CPU, and several backbones over the same depth.
 
 Frames may be tensors that are on the device already: the logits of a model go into the map without a copy to memory.
-On a CUDA device Triton kernels do the work (`torch_triton`), elsewhere plain tensor operations (`torch_eager`).
+On a CUDA device Triton kernels do the work (`triton_launch`), elsewhere plain tensor operations (`eager`).
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 import torch
 
-from semstab.backends import torch_eager
-from semstab.backends.association import INDEX_LIMIT, back_project, check_settings, voxel_index
-from semstab.backends.torch_devices import device_of, kernels_for
-from semstab.backends.torch_eager import LOST, Association, Evidence
-from semstab.backends.torch_storage import EMPTY, HALF, SLOT_BYTES, Columns, Grid, Storage
-from semstab.backends.torch_views import (
-    Image,
-    Labels,
-    Prediction,
-    Scores,
-    View,
-    evidence_of,
-    evidence_of_frame,
-)
-from semstab.errors import ConfigError, DataError
+from semstab.backends.torch_parts.maps import TorchMaps
+from semstab.backends.torch_parts.storage import SLOT_BYTES
+from semstab.backends.torch_parts.views import DepthView, Image, TensorPrediction, evidence_of_frame
 from semstab.frames import Frame, Intrinsics
 from semstab.results import FrameReport
-from semstab.voxels import VoxelTable, index_columns
-
-FIRST_ROWS = 1 << 12
-"""Voxels that a new map has room for."""
-
-COPIED_ROWS = 1 << 20
-"""Rows that go to memory at a time."""
+from semstab.voxels import VoxelTable
 
 
 class TorchMap:
@@ -86,7 +63,7 @@ class TorchMap:
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame, copied to the device."""
         started = time.perf_counter()
-        view, said = View.of_frame(frame, self.device), evidence_of_frame(frame, self.device)
+        view, said = DepthView.of_frame(frame, self.device), evidence_of_frame(frame, self.device)
         return self._maps.fuse(view, {"": said}, started)[""]
 
     def integrate_tensors(
@@ -103,11 +80,11 @@ class TorchMap:
         """Fuse one frame of tensors on any device, or arrays; those that are on the map's device are not copied.
 
         depth                   (H, W) float metres, intrinsics and T_wc (4, 4) as a `Frame` has them
-        labels, scores, logits  one of them, as a `Prediction` has them: scores and logits are (K, H, W)
+        labels, scores, logits  one of them, as a `TensorPrediction` has them: scores and logits are (K, H, W)
 
         Raises DataError, with the map unchanged, where the frame cannot be fused.
         """
-        said = Prediction(labels=labels, scores=scores, logits=logits)
+        said = TensorPrediction(labels=labels, scores=scores, logits=logits)
         return self._maps.integrate_tensors(depth, intrinsics, T_wc, {"": said}, index=index)[""]
 
     def table(self) -> VoxelTable:
@@ -116,232 +93,3 @@ class TorchMap:
 
     def events(self) -> None:
         """None: the map keeps sums, not the history."""
-
-
-class TorchMaps:
-    """Maps of several backbones over the same depth: one association and one hash, and evidence of each backbone.
-
-    num_classes has K of each backbone by its name; the other settings are those of `TorchMap`.
-    """
-
-    def __init__(
-        self,
-        voxel_size: float,
-        num_classes: Mapping[str, int],
-        device: str | None = None,
-        precision: str = "float64",
-        kernels: str = "auto",
-        memory_gb: float | None = None,
-        reserve: int = 0,
-    ) -> None:
-        if not num_classes:
-            raise ConfigError("num_classes names no backbone; give K of each by its name")
-        for K in num_classes.values():
-            check_settings(voxel_size, K)
-        if precision not in ("float64", "float32"):
-            raise ConfigError(f"precision = '{precision}': use float64 or float32")
-        if memory_gb is not None and not memory_gb > 0:
-            raise ConfigError(f"memory_gb = {memory_gb:g}: it must be positive")
-        if reserve < 0:
-            raise ConfigError(f"reserve = {reserve}: it is a number of voxels")
-        self.voxel_size = voxel_size
-        self.device = device_of(device)
-        self._dtype = torch.float64 if precision == "float64" else torch.float32
-        self._kernels: Any = kernels_for(kernels, self.device)
-        self._associate = self._kernels.Associator()
-        self._grid: Grid | None = None
-        with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
-            self._map = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
-            self._map.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or FIRST_ROWS)
-        self._totals = {name: _Totals() for name in num_classes}
-
-    @property
-    def bytes(self) -> int:
-        """Memory that the maps take on the device."""
-        return self._map.bytes
-
-    def integrate_tensors(
-        self,
-        depth: Image,
-        intrinsics: Intrinsics,
-        T_wc: npt.ArrayLike,
-        predictions: Mapping[str, Prediction],
-        *,
-        index: int,
-    ) -> dict[str, FrameReport]:
-        """Fuse what some of the backbones say of one view; a report for each.
-
-        Raises DataError, with all maps unchanged, where one of them cannot be fused, ConfigError for an unknown name.
-        """
-        started = time.perf_counter()
-        view = View.of(depth, intrinsics, T_wc, index, self.device)
-        said = {
-            name: evidence_of(of_name, view, self._columns_of(name).num_classes, _where(view, of_name.kind, name))
-            for name, of_name in predictions.items()
-        }
-        return self.fuse(view, said, started)
-
-    def fuse(self, view: View, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
-        """Fuse a view that is on the device, with what some backbones say of its pixels; timed from `started`."""
-        on_device = torch.cuda.device(-1 if self.device.index is None else self.device.index)  # for Triton's launches
-        with torch.inference_mode(False), torch.no_grad(), on_device:
-            return self._fuse(view, said, started)
-
-    def _fuse(self, view: View, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
-        grid = self._grid or self._first_grid(view)
-        seen = self._associate(view, grid)
-        evidence = {name: self._evidence(seen, image, name, view) for name, image in said.items()}
-        rows, voxels = self._look_up(seen, evidence, view, grid)
-        associated = time.perf_counter()
-        self._map.make_room(voxels, f"frame {view.camera.index}")
-        self._map.add(seen.keys, rows, voxels)
-        self._grid = grid
-        changes = [
-            self._kernels.update(self._map.columns[name], rows, of_name, view.camera.index)
-            for name, of_name in evidence.items()
-        ]
-        sums = dict(zip(said, torch.stack(changes).tolist() if changes else [], strict=True))
-        finished = time.perf_counter()
-        times = (finished - started, associated - started, finished - associated)
-        return {name: self._report(name, sums[name], view.camera.index, times) for name in said}
-
-    def table(self, name: str) -> VoxelTable:
-        """The map of a backbone so far, brought to memory. Raises ConfigError for an unknown name."""
-        columns = self._columns_of(name)
-        used = torch.nonzero(self._map.hash.keys != EMPTY)[:, 0]
-        keys, order = torch.sort(self._map.hash.keys[used])  # packed keys sort like (ix, iy, iz)
-        rows = self._map.hash.rows[used[order]].to(torch.int64)
-        seen = columns.op[rows] > 0
-        keys, rows = keys[seen].cpu(), rows[seen]
-        values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES}
-        values["evidence"] = values["evidence"].astype(np.float64, copy=False)
-        return VoxelTable(**index_columns(self._index_of(keys.numpy())), **values, voxel_size=self.voxel_size)
-
-    def _columns_of(self, name: str) -> Columns:
-        if name not in self._map.columns:
-            raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self._map.columns)}")
-        return self._map.columns[name]
-
-    def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: View) -> Evidence:
-        K = self._map.columns[name].num_classes
-        evidence: Evidence
-        if isinstance(said, Labels):
-            evidence = self._kernels.count_labels(seen, said, K)
-        else:
-            if len(said.values) != K:
-                kind = "logits" if said.softmax else "scores"
-                raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(said.values)} classes, the map {K}")
-            evidence = self._kernels.sum_scores(seen, said, K)
-        return evidence
-
-    def _look_up(
-        self, seen: Association, evidence: Mapping[str, Evidence], view: View, grid: Grid
-    ) -> tuple[torch.Tensor, int]:
-        """Rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
-        rows = self._kernels.find(self._map.hash, seen.keys)
-        observed = torch.zeros_like(rows, dtype=torch.bool)
-        for of_name in evidence.values():
-            observed |= of_name.pixels > 0
-        new = observed & (rows == EMPTY)
-        row_of_new = torch.cumsum(new, dim=0) + (self._map.voxels - 1)
-        wrong = [of_name.flags for of_name in evidence.values()]
-        added, *flags = torch.cat([new.sum()[None], *wrong]).tolist()  # the one wait for the device before the update
-        for n, name in enumerate(evidence):
-            highest, lost, negative = flags[3 * n : 3 * n + 3]
-            self._check(name, highest, bool(lost), bool(negative), view, grid, seen)
-        return torch.where(new, row_of_new, rows), self._map.voxels + int(added)
-
-    def _check(
-        self, name: str, highest: int, lost: bool, negative: bool, view: View, grid: Grid, seen: Association
-    ) -> None:
-        """Raise DataError where a label, score or point is none that the map can hold."""
-        K = self._map.columns[name].num_classes
-        if highest >= K:
-            where = _where(view, "labels", name)
-            raise DataError(f"{where}: label id {highest} is outside 0 to {K - 1}; map it or ignore it")
-        if negative:
-            where = _where(view, "scores", name)
-            raise DataError(f"{where}: scores are negative; give logits as logits, or apply a softmax first")
-        if lost:
-            raise DataError(_out_of_reach(view.frame(seen.voxel == LOST), grid))
-
-    def _first_grid(self, view: View) -> Grid:
-        """Keys that count from the camera's voxel. Raises DataError where the camera is out of reach."""
-        camera = view.camera.T_wc[:3, 3]
-        origin = np.floor(camera / self.voxel_size)
-        if np.abs(origin).max() > INDEX_LIMIT - 2 * HALF:
-            frame = view.camera
-            raise DataError(
-                f"{frame.where('pose')}: frame {frame.index} has its camera at {camera.round(1).tolist()} m,"
-                f" beyond 2^31 voxels of {self.voxel_size:g} m; check pose units, or use larger voxels"
-            )
-        x, y, z = origin.astype(np.int64).tolist()
-        return Grid(self.voxel_size, (x, y, z), self._dtype)
-
-    def _index_of(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Voxel indices (n, 3) of packed keys."""
-        origin = self._grid.origin if self._grid else (0, 0, 0)
-        mask = 2 * HALF - 1
-        packed = np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1)
-        index: npt.NDArray[np.int64] = packed - HALF + np.array(origin)
-        return index
-
-    def _report(self, name: str, sums: list[float], frame: int, times: tuple[float, float, float]) -> FrameReport:
-        changes = dict(zip(torch_eager.SUMS, sums, strict=True))
-        total = self._totals[name]
-        total.voxels += int(changes["new"])
-        total.recurrent += int(changes["recurrent"])
-        total.vss += changes["vss"]
-        total.entropy += changes["entropy"]
-        n = total.voxels or math.nan
-        return FrameReport(
-            frame=frame,
-            points=int(changes["points"]),
-            voxels=int(changes["voxels"]),
-            new_voxels=int(changes["new"]),
-            drift_sum=changes["drift"],
-            seconds=times[0],
-            map_voxels=total.voxels,
-            map_vss=total.vss / n,
-            map_entropy=total.entropy / math.log2(self._map.columns[name].num_classes) / n,
-            map_recurrent=total.recurrent / n,
-            association_seconds=times[1],
-            update_seconds=times[2],
-        )
-
-
-@dataclass
-class _Totals:
-    """Sums over a backbone's map: its voxels, those with OP >= 3, VSS, and entropy in bits."""
-
-    voxels: int = 0
-    recurrent: int = 0
-    vss: float = 0.0
-    entropy: float = 0.0
-
-
-def _where(view: View, kind: str, name: str) -> str:
-    """What an error calls the labels, scores or logits of a backbone."""
-    return view.camera.where(kind) + (f" of '{name}'" if name else "")
-
-
-def _at_home(column: torch.Tensor, rows: torch.Tensor) -> npt.NDArray[Any]:
-    """Rows of a column in memory; they are gathered a part at a time, so that the device needs no second column."""
-    home = torch.empty((len(rows), *column.shape[1:]), dtype=column.dtype)
-    for part in torch_eager.parts(len(rows), COPIED_ROWS):
-        home[part] = column[rows[part]].cpu()
-    values: npt.NDArray[Any] = home.numpy()
-    return values
-
-
-def _out_of_reach(frame: Frame, grid: Grid) -> str:
-    """Where the frame's points are: too far for 32-bit indices, which raises, or for keys that count from origin."""
-    points = back_project(frame)
-    voxel_index(points, grid.voxel_size, frame)
-    low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))
-    origin = (np.array(grid.origin) * grid.voxel_size).round(1).tolist()
-    return (
-        f"{frame.where('depth')}: frame {frame.index} has points from {low} to {high} m, more than 2^20 voxels of"
-        f" {grid.voxel_size:g} m from the map's origin {origin};"
-        " leave out far depth (sky?), check depth and pose units, or use larger voxels"
-    )

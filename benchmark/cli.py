@@ -312,10 +312,12 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     """Open a run's recording in the rerun viewer."""
     import subprocess
 
+    from semstab.recording.target import viewer_command
+
     recording = run / "recording.rrd" if run.is_dir() else run
     if not recording.exists():
         raise ConfigError(f"{recording}: there is no recording; run again without --rerun off")
-    raise typer.Exit(subprocess.run([sys.executable, "-m", "rerun", str(recording)], check=False).returncode)
+    raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
 
 
 @app.command("list")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
+from semstab.compiled import serial
 
-@nb.njit(cache=True, nogil=True)
+
+@serial
 def mark_valid(depth: Any, labels: Any, ignore: int, out: Any) -> None:
     """Mark the pixels with a valid depth and a label; all arrays are (n,)."""
     ignored = labels.dtype.type(ignore)
@@ -17,7 +18,7 @@ def mark_valid(depth: Any, labels: Any, ignore: int, out: Any) -> None:
         out[i] = (depth[i] > np.float32(0)) & (depth[i] < np.float32(math.inf)) & (labels[i] != ignored)
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
     """The number of pixels that are valid in both frames, and of those among them whose labels differ."""
     both = changed = 0
@@ -28,7 +29,7 @@ def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) 
     return both, changed
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def has_other(labels: Any, count: int, ignore: int) -> bool:
     """Whether a map of ids (n,) holds one that is neither below `count` nor the ignore id."""
     first, ignored = labels.dtype.type(count), labels.dtype.type(ignore)

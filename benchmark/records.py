@@ -198,7 +198,7 @@ class Result:
 
     @property
     def runs(self) -> tuple[UnitSummary, ...]:
-        """The summaries of the units at the base settings, by whatever backend, those of a scene and backbone together."""
+        """The summaries of the units at the base settings by every backend, a scene and backbone after the other."""
         units = (*self.select(), *self.select(BACKENDS))
         groups = dict.fromkeys((record.unit.scene, record.unit.backbone) for record in units)
         return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.backbone) == group)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
+from semstab.compiled import serial
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, tolerance: float, out: Any) -> None:
     """For each pixel of a view the flat index of the other view's pixel that sees the same surface, or -1.
 

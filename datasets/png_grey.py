@@ -12,9 +12,10 @@ from collections.abc import Iterable
 from typing import Any
 
 import deflate
-import numba as nb
 import numpy as np
 import numpy.typing as npt
+
+from semstab.compiled import serial
 
 LARGEST_RATIO = 1032
 """A byte of a deflate stream becomes at most that many: what claims more is not worth the memory."""
@@ -54,7 +55,7 @@ def _inflated(size: int, parts: Iterable[memoryview]) -> npt.NDArray[np.uint8] |
     return raw if raw.size == size else None
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def _unfilter(raw: Any, out: Any) -> bool:
     """Undo the filters of each row of `raw` into out (H, W, B), the lowest byte of a sample first."""
     H, W, B = out.shape
@@ -66,7 +67,7 @@ def _unfilter(raw: Any, out: Any) -> bool:
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def _unfilter_metres(raw: Any, scale: Any, out: Any) -> bool:
     """Undo the filters of each row of 16-bit samples, and divide by the scale into out (H, W)."""
     H, W = out.shape
@@ -80,7 +81,7 @@ def _unfilter_metres(raw: Any, scale: Any, out: Any) -> bool:
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def _unfilter_samples(raw: Any, above: Any, out: Any) -> bool:
     """Undo the filter of a row, whose kind is its first byte, into out (W, B); False for a kind that is none."""
     B = out.shape[1]
@@ -91,7 +92,7 @@ def _unfilter_samples(raw: Any, above: Any, out: Any) -> bool:
     return True
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def _unfilter_row(kind: int, row: Any, above: Any, out: Any) -> None:
     """One byte of each sample of a row: a is the byte to the left, b the one above, c the one above left."""
     a, c = np.uint8(0), np.uint8(0)
@@ -117,7 +118,7 @@ def _unfilter_row(kind: int, row: Any, above: Any, out: Any) -> None:
             out[x] = a
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def _paeth(a: Any, b: Any, c: Any) -> Any:
     """Of left, above and above left the one nearest to a + b - c; in that order on ties."""
     to_a, to_b, to_c = abs(b - c), abs(a - c), abs(a + b - 2 * c)

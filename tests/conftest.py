@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+import semstab
 from semstab.process import settle
 
 pytest.register_assert_rewrite("semstab.testing")
@@ -11,3 +12,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it
 settle()  # threads that spin would take the time of the other workers' tests
 if not Path("/dev/nvidiactl").exists():
     os.environ["TRITON_INTERPRET"] = "1"  # before any test imports Triton: its kernels then run without a GPU
+
+
+def pytest_configure() -> None:
+    """Folders are linked into the environment as such, but benchmark/ child by child: a new child is not found yet."""
+    source, found = Path(__file__).parents[1] / "benchmark", Path(semstab.__file__).parent
+    known = {path.name for path in found.iterdir()}
+    new = [path.name for path in source.iterdir() if path.name not in {*known, "__pycache__"}]
+    if (found / "__init__.py").is_symlink() and new:
+        raise pytest.UsageError(f"benchmark/{new[0]} is new, and not linked into the environment: run make setup")

@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as hnp
 from oracle import Oracle
 
 from semstab import backends
-from semstab.backends import aggregator
 from semstab.backends.numpy_reference import NumpyReference
+from semstab.backends.shared import aggregator
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json
 from semstab.frames import Frame, Intrinsics

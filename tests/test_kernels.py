@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semstab.backends import kernels
+from semstab.backends.shared import pixel_keys
+from semstab.backends.shared.keys import HALF
 from semstab.labels import IGNORE_8BIT
 
 W = 300
@@ -37,9 +38,9 @@ def test_keys_equal_the_protocols_expression(t, size, aligned, far, seed) -> Non
     ray_x, ray_y = (np.arange(W) - 150) / 300, 0.25
     origin = np.floor(T[:3, 3] / size)
     exact, quick = np.empty(W, dtype=np.int64), np.empty(W, dtype=np.int64)
-    terms = kernels.frame_terms(ray_x, T, size)
-    lost = kernels.exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, exact)
-    assert kernels.keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, *terms, quick) == lost
+    terms = pixel_keys.frame_terms(ray_x, T, size)
+    lost = pixel_keys.exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, exact)
+    assert pixel_keys.keys_of_row(depth, labels, ray_x, ray_y, T, size, *origin, IGNORE_8BIT, *terms, quick) == lost
     np.testing.assert_array_equal(quick, exact)
 
 
@@ -48,13 +49,13 @@ def test_most_pixels_take_the_quick_way() -> None:
     rng = np.random.default_rng(1)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.random(random_state=3).as_matrix(), [3.1, -7.7, 5.6e6]
-    ray_x = (np.arange(kernels.BLOCK) - 128.3) / 300
-    rays, margin = kernels.frame_terms(ray_x, T, 0.2)
-    offset = T[:3, 3] / 0.2 - np.floor(T[:3, 3] / 0.2) + kernels.HALF
+    ray_x = (np.arange(pixel_keys.BLOCK) - 128.3) / 300
+    rays, margin = pixel_keys.frame_terms(ray_x, T, 0.2)
+    offset = T[:3, 3] / 0.2 - np.floor(T[:3, 3] / 0.2) + HALF
     start = T[:3, 2] / 0.2
-    out, labels = np.empty(kernels.BLOCK, dtype=np.int64), np.zeros(kernels.BLOCK, dtype=np.uint8)
+    out, labels = np.empty(pixel_keys.BLOCK, dtype=np.int64), np.zeros(pixel_keys.BLOCK, dtype=np.uint8)
     doubts = 0
     for _ in range(200):
-        depth = rng.uniform(1, 50, kernels.BLOCK).astype(np.float32)
-        doubts += bool(kernels._keys_fused(depth, labels, IGNORE_8BIT, *rays, *start, *offset, margin, out))
+        depth = rng.uniform(1, 50, pixel_keys.BLOCK).astype(np.float32)
+        doubts += bool(pixel_keys.keys_fused(depth, labels, IGNORE_8BIT, *rays, *start, *offset, margin, out))
     assert doubts <= 2

@@ -18,13 +18,14 @@ import tiny_scene
 
 import semstab
 from semstab import backends, metrics
+from semstab.backends.numba_hash import NumbaHash
 from semstab.config import Config
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
-from semstab.recording import MEASURES, SERIES, Recording, background, observer, voxel_maps
+from semstab.recording import MEASURES, SERIES, Recording, background, observer, tracker, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
@@ -36,9 +37,9 @@ from semstab.voxels import VoxelTable
 NANOSECONDS = 1_000_000_000
 
 
-def config_of(root: Path) -> Config:
+def config_of(root: Path, backend: str = "numpy") -> Config:
     dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25})
+    return load_config(overrides={"dataset": dataset, "backends": [backend], "voxel_size": 0.25})
 
 
 @pytest.fixture(scope="module")
@@ -331,6 +332,23 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     assert not [row for row in rows["/wall/camera/a/labels"] if "SegmentationImage:buffer" in row]
 
 
+@pytest.mark.parametrize(("fused_by", "own"), [("numba", 0), ("numpy", 2)])
+def test_a_map_of_the_run_is_followed_where_that_is_possible(tmp_path, monkeypatch, fused_by, own) -> None:
+    """Else each backbone is fused a second time. The recorded drift is the same."""
+    made = []
+    monkeypatch.setattr(tracker, "NumbaHash", lambda *settings: made.append(settings) or NumbaHash(*settings))
+    config = config_of(tiny_scene.write(tmp_path / "wall"), fused_by)
+    semstab.run(config, observers=[Recording(tmp_path / "x.rrd")])
+    assert len(made) == own
+    drift = [
+        row["SegmentationImage:buffer"]
+        for row in read(tmp_path / "x.rrd")["/wall/camera/a/drift"]
+        if "SegmentationImage:buffer" in row
+    ]
+    assert len(drift) == 3
+    assert drift[0] != drift[1]
+
+
 def test_a_path_that_cannot_be_written_is_named(run, tmp_path) -> None:
     config = config_of(run.parent / "data" / "wall")
     with pytest.raises(ConfigError, match=r"recording cannot be written"):
@@ -430,7 +448,7 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
     def fail(*_: object) -> str:
         raise RuntimeError("no room")
 
-    monkeypatch.setattr(voxel_maps.GrowingMap, "finish", fail)
+    monkeypatch.setattr(voxel_maps.MapLog, "finish", fail)
     watching.unit_fused(UNIT, table)
     with pytest.raises(RuntimeError, match="no room"):
         watching.unit_finished(UNIT, table, summary_of(table))

@@ -6,10 +6,8 @@ import io
 import itertools
 import re
 import signal
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +22,10 @@ from test_recording import config_of, grid, notes, read, read_blueprints, series
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
-from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.metrics import compensated_flicker
-from semstab.recording import Recording, Target, camera, flips, voxel_maps
+from semstab.recording import Recording, camera, flips, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
@@ -136,7 +133,7 @@ def test_colour_that_is_not_a_small_jpeg_is_encoded_anew(tmp_path, kind) -> None
     view = frame(0, np.zeros((6, 8)), {"color": str(file)})
     scene = make_plan(config_of(tiny_scene.write(tmp_path / "wall"))).tasks[0].scene
     frames = camera.COLOR_BYTES // (len(data) - 1) if kind == "large" else 1
-    seen = camera.Camera(scene, np.zeros(3), frames)
+    seen = camera.CameraLog(scene, np.zeros(3), frames)
     color = seen._color(view)
     if kind in ("cut off", "not an image"):
         assert color is None
@@ -242,7 +239,7 @@ def test_what_numba_says_of_a_frame_is_what_happened(evidence) -> None:
         view = frame(index, rng.integers(0, 4, (10, 14)))
         old = {tuple(i): (d, k) for i, d, k in described(reference.table())}
         reference.integrate(view)
-        assert fused.integrate(view).fused_into is fused
+        fused.integrate(view)
         new = {tuple(i): (d, k) for i, d, k in described(reference.table())}
         changes = fused.changes
         assert len(changes.row) == len(new)
@@ -267,9 +264,9 @@ def test_the_voxel_behind_every_pixel_is_found_whatever_becomes_of_the_map() -> 
     labels = np.random.default_rng(1).integers(0, 4, (9, 12))
     labels[0, :3] = 255
     view = frame(0, labels)
-    tracker.integrate(view)
+    tracker.follow(view)
     caused, changes, table = tracker.drift_of(view), tracker.map.changes, tracker.map.table()
-    tracker.integrate(frame(1, np.zeros((9, 12))))
+    tracker.follow(frame(1, np.zeros((9, 12))))
     found = caused.voxels_at(1)
     np.testing.assert_array_equal(found == -1, ~view.valid)
     np.testing.assert_array_equal(caused.voxels_at(3), found[::3, ::3])
@@ -296,7 +293,7 @@ def alternating(count: int) -> list[Frame]:
 def tracked(views: list[Frame]) -> tuple[Tracker, FlipLog]:
     tracker, log = Tracker(1.0, 3), FlipLog()
     for view in views:
-        tracker.integrate(view)
+        tracker.follow(view)
         log.update(tracker, view)
     return tracker, log
 
@@ -348,7 +345,7 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(voxel_maps, "BUDGET", 600)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 2000)
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
+    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     rng = np.random.default_rng(0)
@@ -372,7 +369,7 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
 
 def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -> None:
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
+    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     for index in range(4):
@@ -393,7 +390,7 @@ def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -
 def test_what_is_not_drawn_yet_comes_before_what_changed(tmp_path) -> None:
     """A large map that is seen all over, and grows at its end."""
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.GrowingMap("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
+    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     growing._allowed = 1e6
@@ -455,70 +452,3 @@ semstab.engine.run(config, observers=[Recording({str(path)!r}), Killing()])
     subprocess.run([rerun, "rrd", "optimize", path, "-o", whole], capture_output=True, check=True)
     verify(whole)
     assert set(series(read(whole), "/wall/series/map_vss/a/numba")) == {0, 1, 2}
-
-
-# Where a recording goes.
-
-
-def test_what_rerun_may_say() -> None:
-    default = Path("run/recording.rrd")
-    assert Target.parse(None, default) == Target(default)
-    assert Target.parse("here.rrd", default) == Target(Path("here.rrd"))
-    assert Target.parse("spawn", default) == Target(default, "spawn")
-    assert Target.parse("serve", default) == Target(default, "serve")
-    url = "rerun+http://10.0.0.7:9876/proxy"
-    assert Target.parse(url, default) == Target.parse(f"connect {url}", default) == Target(default, url)
-    assert Target.parse("connect", default).viewer == "rerun+http://127.0.0.1:9876/proxy"
-    for wrong in ("spwan", "folder", "connect http://10.0.0.7", "rerun+http://10.0.0.7:9876"):
-        with pytest.raises(ConfigError, match="--rerun"):
-            Target.parse(wrong, default)
-
-
-def test_a_viewer_that_is_not_there_is_said_at_once(tmp_path) -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        port = unused.getsockname()[1]
-    target = Target(tmp_path / "x.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
-    with pytest.raises(ConfigError, match="no rerun viewer listens there"):
-        target.open()
-
-
-def test_spawn_starts_the_viewer(tmp_path, monkeypatch) -> None:
-    started: list[str] = []
-    monkeypatch.setattr("rerun.sinks._spawn_viewer", lambda **options: started.append(options["executable_path"]))
-    monkeypatch.setattr(rr, "GrpcSink", lambda url: rr.FileSink(tmp_path / "sent.rrd"))
-    stream = Target(tmp_path / "own.rrd", "spawn").open()
-    stream.log("/x", rr.Scalars(1.0))
-    stream.flush()
-    stream.disconnect()
-    assert [Path(program).name for program in started] == ["rerun"]
-    assert set(read(tmp_path / "own.rrd")) == set(read(tmp_path / "sent.rrd")) >= {"/x"}
-
-
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    saved = tmp_path / "received.rrd"
-    command = [Path(sys.executable).with_name("rerun"), "--port", str(port), "--save", saved]
-    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        deadline = time.monotonic() + 20
-        while not listens(port) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        target = Target(tmp_path / "own.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
-        root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
-        semstab.engine.run(config_with(root, "numba"), observers=[Recording(target)])
-        time.sleep(1)
-    finally:
-        viewer.send_signal(signal.SIGINT)
-        viewer.wait(20)
-    verify(tmp_path / "own.rrd")
-    expected = series(read(tmp_path / "own.rrd"), "/wall/series/map_vss/a/numba")
-    assert len(expected) == 3
-    assert saved.stat().st_size > 10_000

@@ -22,11 +22,12 @@ RUNS_TRITON = importlib.util.find_spec("triton") is not None and (
 )
 
 from semstab import backends  # noqa: E402
-from semstab.backends import torch_devices, torch_eager, torch_map, torch_storage, torch_views  # noqa: E402
-from semstab.backends.association import back_project  # noqa: E402
-from semstab.backends.torch_map import TorchMap, TorchMaps  # noqa: E402
-from semstab.backends.torch_storage import EMPTY, Grid, VoxelHash, slots_for  # noqa: E402
-from semstab.backends.torch_views import Prediction, View  # noqa: E402
+from semstab.backends.shared.association import back_project  # noqa: E402
+from semstab.backends.torch_map import TorchMap  # noqa: E402
+from semstab.backends.torch_parts import devices, eager, maps, storage, views  # noqa: E402
+from semstab.backends.torch_parts.maps import TorchMaps  # noqa: E402
+from semstab.backends.torch_parts.storage import EMPTY, MapGrid, VoxelHash, slots_for  # noqa: E402
+from semstab.backends.torch_parts.views import DepthView, TensorPrediction  # noqa: E402
 from semstab.errors import ConfigError, DataError, MissingDependencyError  # noqa: E402
 from semstab.frames import Frame, Intrinsics  # noqa: E402
 from semstab.testing import (  # noqa: E402
@@ -115,7 +116,7 @@ def survey(seed, camera=(4.5e5, 5.5e6, 80.0), shape=(90, 160)):
 def voxel_of_pixels(frame, dtype):
     """(H, W, 3) voxel indices from the map's origin, as the kernels find them."""
     origin = tuple(int(x) for x in np.floor(frame.T_wc[:3, 3] / 0.2))
-    seen = torch_eager.Associator()(View.of_frame(frame, CPU), Grid(0.2, origin, dtype))
+    seen = eager.Associator()(DepthView.of_frame(frame, CPU), MapGrid(0.2, origin, dtype))
     key = seen.keys[seen.voxel.to(torch.int64)].numpy()
     return np.stack([key >> 42, (key >> 21) & (2**21 - 1), key & (2**21 - 1)], axis=-1) - 2**20 + origin
 
@@ -153,7 +154,7 @@ def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
     frames = [*random_frames(3, count=4), survey(0, camera=(0, 0, 80), shape=(20, 30))]
     whole = fused(frames)
     for size in (50, 333):
-        monkeypatch.setattr(torch_eager, "chunk_of", lambda device, size=size: size)
+        monkeypatch.setattr(eager, "chunk_of", lambda device, size=size: size)
         assert_equal(fused(frames), whole)
 
 
@@ -164,9 +165,9 @@ def test_the_same_frames_give_the_same_bits():
 
 def test_sums_of_scores_are_as_fine_as_they_say():
     """10^5 pixels of share 1/3 in one voxel, in units of 2^-45 (17 bits count the pixels), each rounded to nearest."""
-    seen = torch_eager.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
+    seen = eager.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
     values = torch.tensor([[1.0], [2.0]]).expand(2, 10**5)
-    evidence = torch_eager.sum_scores(seen, torch_views.Scores(values, softmax=False), 2)
+    evidence = eager.sum_scores(seen, views.Scores(values, softmax=False), 2)
     assert evidence.scale == 2.0**45
     s_bar = evidence.sums[:, 0].to(torch.float64) / (evidence.scale * evidence.pixels)
     assert s_bar.tolist() == pytest.approx([1 / 3, 2 / 3], abs=2.0**-46)
@@ -297,7 +298,7 @@ LABELS = torch.zeros((1, 3), dtype=torch.uint8)
         ({"scores": torch.full((3, 1, 3), -1.0)}, "frame 7, scores: scores are negative; give logits as logits"),
         ({"labels": LABELS, "depth": torch.ones(2, 1, 3)}, r"depth must be \(H, W\), got shape \(2, 1, 3\)"),
         ({"labels": LABELS, "depth": torch.ones((1, 3), dtype=torch.int16)}, "depth is int16; convert it to metres"),
-        ({"labels": LABELS, "depth": torch.full((1, 3), 3e6)}, r"frame 7 has points from .* more than 2\^20 voxels"),
+        ({"labels": LABELS, "depth": torch.full((1, 3), 3e6)}, r"frame 7 spans .* more than 2\^20 voxels"),
         ({"labels": LABELS, "depth": torch.full((1, 3), 3e9)}, r"frame 7 spans .* beyond 2\^31 voxels"),
         ({"labels": LABELS, "T_wc": 2 * np.eye(4)}, "frame 7, pose"),
     ],
@@ -339,7 +340,7 @@ def test_maps_of_several_backbones_are_as_if_made_alone():
         }
         if frame.index == 3:
             del labels["c"]
-        said = {name: Prediction(labels=image) for name, image in labels.items()}
+        said = {name: TensorPrediction(labels=image) for name, image in labels.items()}
         reports = maps.integrate_tensors(frame.depth, frame.intrinsics, frame.T_wc, said, index=frame.index)
         assert list(reports) == list(labels)
         for name, report in reports.items():
@@ -355,7 +356,7 @@ def test_one_backbone_that_cannot_be_fused_leaves_all_maps_as_they_were():
     frame = random_frames(9, count=1)[0]
     maps = TorchMaps(0.4, {"good": K, "bad": 2}, device="CPU:0")
     view = (frame.depth, frame.intrinsics, frame.T_wc)
-    said = {name: Prediction(labels=frame.labels) for name in ("good", "bad")}
+    said = {name: TensorPrediction(labels=frame.labels) for name in ("good", "bad")}
     with pytest.raises(DataError, match="frame 0, labels of 'bad': label id 3 is outside 0 to 1"):
         maps.integrate_tensors(*view, said, index=0)
     assert len(maps.table("good")) == len(maps.table("bad")) == 0
@@ -378,7 +379,7 @@ def column_of(count, index=0, along="z"):
 @pytest.fixture
 def small(monkeypatch):
     """New maps have room for 8 voxels."""
-    monkeypatch.setattr(torch_map, "FIRST_ROWS", 8)
+    monkeypatch.setattr(maps, "FIRST_ROWS", 8)
 
 
 @pytest.mark.usefixtures("small")
@@ -419,7 +420,7 @@ def test_a_device_that_is_full_says_so(monkeypatch):
     def full(*arguments, **options):
         raise RuntimeError("out of memory\nand advice")
 
-    monkeypatch.setattr(torch_storage.Columns, "grow", full)
+    monkeypatch.setattr(storage.Columns, "grow", full)
     with pytest.raises(DataError, match=r"frame 1: the device cpu has no room for \d+ voxels \(out of memory") as error:
         backend.integrate(column_of(100, index=1))
     assert "\n" not in str(error.value)
@@ -451,7 +452,7 @@ KEYS = st.sets(st.integers(0, 2**63 - 1) | st.integers(0, 40), max_size=300)
 @checks
 @given(KEYS)
 def test_keys_are_mixed_as_splitmix64_does(keys):
-    mixed = torch_eager.mix(torch.tensor(sorted(keys), dtype=torch.int64))
+    mixed = eager.mix(torch.tensor(sorted(keys), dtype=torch.int64))
     assert [m % 2**64 for m in mixed.tolist()] == [splitmix64(key) for key in sorted(keys)]
 
 
@@ -461,11 +462,11 @@ def test_the_hash_finds_what_was_put_in(known, asked):
     table = VoxelHash(slots_for(300), CPU)
     keys = torch.tensor(list(known), dtype=torch.int64)
     rows = torch.arange(len(known))
-    torch_eager.insert(table, keys[:100], rows[:100])
-    torch_eager.insert(table, keys, rows, first=100)
+    eager.insert(table, keys[:100], rows[:100])
+    eager.insert(table, keys, rows, first=100)
     row_of = dict(zip(known, range(len(known)), strict=True))
     wanted = [*known, *asked]
-    found = torch_eager.find(table, torch.tensor(wanted, dtype=torch.int64)).tolist()
+    found = eager.find(table, torch.tensor(wanted, dtype=torch.int64)).tolist()
     assert found == [row_of.get(key, EMPTY) for key in wanted]
     assert int((table.keys != EMPTY).sum()) == len(known)
 
@@ -491,14 +492,14 @@ def test_options_that_cannot_be_used_are_refused(options, message):
 
 
 def test_triton_that_is_not_installed_is_left_out_or_asked_for(monkeypatch):
-    monkeypatch.setitem(sys.modules, "semstab.backends.torch_triton", None)
-    assert torch_devices.kernels_for("auto", torch.device("cuda", 0)) is torch_eager
+    monkeypatch.setitem(sys.modules, "semstab.backends.torch_parts.triton_launch", None)
+    assert devices.kernels_for("auto", torch.device("cuda", 0)) is eager
     with pytest.raises(MissingDependencyError, match="pip install triton"):
         new_map(kernels="triton")
 
 
 def test_a_map_on_a_cpu_takes_plain_torch():
-    assert torch_devices.kernels_for("auto", CPU) is torch_eager
+    assert devices.kernels_for("auto", CPU) is eager
     assert backends.takes_option("torch", "device")
 
 
@@ -517,10 +518,10 @@ DEVICE = "CUDA:0" if HAS_CUDA else "CPU:0"
 @pytest.fixture
 def triton_kernels(monkeypatch):
     """The module, with a hash so small that it overflows."""
-    from semstab.backends import torch_triton
+    from semstab.backends.torch_parts import triton_launch
 
-    monkeypatch.setattr(torch_triton, "FIRST_SLOTS", 1 << 8)
-    return torch_triton
+    monkeypatch.setattr(triton_launch, "FIRST_SLOTS", 1 << 8)
+    return triton_launch
 
 
 @needs_triton
@@ -556,7 +557,7 @@ def test_triton_refuses_what_plain_torch_refuses(triton_kernels):
     backend.integrate(sight_line(0, [(0.5, 0)]))
     with pytest.raises(DataError, match="label id 5 is outside 0 to 2"):
         backend.integrate(sight_line(1, [(0.5, 0), (1.5, 5)]))
-    with pytest.raises(DataError, match="frame 2 has points from"):
+    with pytest.raises(DataError, match="frame 2 spans"):
         backend.integrate(sight_line(2, [(0.5, 0), (3e6, 1)]))
     with pytest.raises(DataError, match="scores are negative"):
         fuse_tensors(backend, sight_line(3, [(0.5, 0)]), scores=torch.tensor([[[2.0]], [[-1.0]], [[0.0]]]))
@@ -571,8 +572,8 @@ def test_a_view_outgrows_its_hash(triton_kernels):
     orders = []
     for line in (hits, shuffled):
         associator = triton_kernels.Associator()
-        view = View.of_frame(sight_line(0, line), torch.device(DEVICE.lower()))
-        seen = associator(view, Grid(1.0, (0, 0, 0), torch.float64))
+        view = DepthView.of_frame(sight_line(0, line), torch.device(DEVICE.lower()))
+        seen = associator(view, MapGrid(1.0, (0, 0, 0), torch.float64))
         z = (seen.keys[seen.voxel.to(torch.int64)] & (2**21 - 1)) - 2**20
         assert z[0].tolist() == [int(depth) for depth, _ in line]
         assert associator.slots == 4096
@@ -595,8 +596,8 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from semstab.backends.torch_triton import SEPARATE
-from semstab.backends.torch_triton_kernels import insert_pixels as kernel
+from semstab.backends.torch_parts.triton_launch import SEPARATE
+from semstab.backends.torch_parts.triton_kernels import insert_pixels as kernel
 
 types = dict.fromkeys(kernel.arg_names, "i32")
 types |= {"depth": "*fp32", "overflow": "*i32", "PROBES": "constexpr", "BLOCK": "constexpr"}

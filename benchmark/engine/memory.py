@@ -16,7 +16,7 @@ from semstab.frames import Frame
 from semstab.task import Task, read
 
 if TYPE_CHECKING:
-    from semstab.backends.aggregator import Aggregator
+    from semstab.backends.shared.aggregator import Aggregator
 
 GB = 1e9
 DOUBT = 10
@@ -70,7 +70,7 @@ def estimate(task: Task, config: Config) -> Expected:
 
 
 def _pixels(task: Task, config: Config) -> Aggregator:
-    from semstab.backends.aggregator import Aggregator
+    from semstab.backends.shared.aggregator import Aggregator
 
     return Aggregator(config.voxel_size, len(task.mapping.target))
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
+from semstab.compiled import serial
 
 
-@nb.njit(cache=True, nogil=True)
+@serial
 def read_off(evidence: Any, label: Any, vss: Any, bits: Any) -> None:
     """Dominant class, VSS and entropy in bits of evidence (n, K), as `semstab.metrics` defines them, in one pass.
 

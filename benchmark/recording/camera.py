@@ -96,7 +96,7 @@ def label_context(classes: LabelSpace) -> rr.AnnotationContext:
     return rr.AnnotationContext(infos + [info for info in ignored if info.id >= len(classes)])
 
 
-class Camera:
+class CameraLog:
     """The camera of a scene: its pictures are logged once a frame, whichever backbones and backends fuse it."""
 
     def __init__(self, scene: Scene, translation: npt.NDArray[np.floating[Any]], frames: int) -> None:

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from semstab.backends.kernels import exact_keys_of_row, mix, serial
+from semstab.backends.shared.hashing import mix
+from semstab.backends.shared.pixel_keys import exact_keys_of_row
+from semstab.compiled import serial
 from semstab.labels import IGNORE_8BIT
 
 

@@ -13,7 +13,7 @@ import rerun as rr
 
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.metrics import sbd
+from semstab.metrics.voxelwise import mean_drift
 from semstab.recording.entities import Clock, path
 from semstab.recording.tracker import Tracker
 
@@ -83,15 +83,17 @@ class FlipLog:
         most = np.partition(total, -SHOWN)[-SHOWN] if len(total) > SHOWN else 0.0
         rows = np.flatnonzero((total >= most) & (total > 0))
         rows = rows[np.argsort(-total[rows], kind="stable")][:SHOWN]
+        fused = tracker.map
+        first_frame, op = (fused.column(name, rows) for name in ("first_frame", "op"))
+        centers = (fused.index_of(rows) + 0.5) * fused.voxel_size
+        dominant, sbd = fused.evidence_of(rows).argmax(axis=1), mean_drift(total[rows], op)
         moves = np.concatenate([np.zeros(0, dtype=MOVE), *self._parts])
-        for number, row in enumerate(rows, start=1):
-            table = tracker.map.table_of(np.array([row]))
+        for i, row in enumerate(rows):
             own = moves[moves["row"] == row]
-            first = int(own["before"][0]) if len(own) else int(table.evidence[0].argmax())
+            first = int(own["before"][0]) if len(own) else int(dominant[i])
             yield Suspect(
-                number, table.centers[0], int(table.first_frame[0]), first, int(table.op[0]), float(sbd(table)[0]),
-                float(total[row]), own,
-            )  # fmt: skip
+                i + 1, centers[i], int(first_frame[i]), first, int(op[i]), float(sbd[i]), float(total[row]), own
+            )
 
     def log(
         self,

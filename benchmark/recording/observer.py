@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
+from semstab.backends import FusionBackend, GrowingMap
 from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned
@@ -24,7 +25,7 @@ from semstab.recording import legend, series
 from semstab.recording.background import Background
 from semstab.recording.camera import (
     IMAGE_SIDE,
-    Camera,
+    CameraLog,
     Overlay,
     drift_context,
     drift_levels,
@@ -37,7 +38,7 @@ from semstab.recording.flips import FlipLog
 from semstab.recording.layout import Known, Scenery, blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target
 from semstab.recording.tracker import FrameDrift, Tracker
-from semstab.recording.voxel_maps import CHUNKS, GrowingMap, chunks_of
+from semstab.recording.voxel_maps import CHUNKS, MapLog, chunks_of
 from semstab.records import Result
 from semstab.results import Unit, UnitSummary
 from semstab.task import Task
@@ -75,9 +76,10 @@ class Recording(Observer):
         self._clock = Clock()
         self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
-        self._cameras: dict[str, Camera] = {}
+        self._cameras: dict[str, CameraLog] = {}
         self._known = Known()
         self._sent = 0  # layouts
+        self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
         self._group: _Group | None = None  # the backbone on a scene that is being fused
         self._background: Background | None = None
 
@@ -88,6 +90,11 @@ class Recording(Observer):
         first = CHUNKS if self.target.live else FIRST_CHUNKS  # a live viewer keeps the layout that it got first
         self._known.chunks = {task.scene.name: first for task in plan.tasks}
 
+    def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
+        """Keep the map, where it can be followed: the first one of a backbone on a scene will be."""
+        if isinstance(backend, GrowingMap):
+            self._growing.setdefault((unit.scene, unit.backbone), backend)
+
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """Log the unit's row of the time series."""
         stream = self._opened()
@@ -95,11 +102,11 @@ class Recording(Observer):
         self._clock.set(stream, frame.index, frame.timestamp)
         origin = self._origin(stream, task, frame.T_wc[:3, 3])
         if self._group is None or self._group.task is not task:
-            self._group = _Group(task, self._plan.config.voxel_size, origin)
+            growing = self._growing.pop((unit.scene, unit.backbone), None)
+            self._group = _Group(task, self._plan.config.voxel_size, origin, growing)
         values = series.values(row.cells())
         series.log_row(stream, unit, task, values)
         self._group.span(values)
-        self._group.follow(row)
 
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """Log what the camera and the map show."""
@@ -250,7 +257,7 @@ class Recording(Observer):
             return self._origins[scene]
         steps = np.round(position / ORIGIN_STEP).astype(np.int64)
         self._origins[scene] = origin = steps * round(ORIGIN_STEP / voxel_size)
-        self._cameras[scene] = Camera(task.scene, origin * voxel_size, len(task.indices))
+        self._cameras[scene] = CameraLog(task.scene, origin * voxel_size, len(task.indices))
         if steps.any():
             where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", origin * voxel_size, strict=True))
             stream.log(path(scene, "log"), rr.TextLog(f"map coordinates are relative to {where} of the scene's world"))
@@ -260,15 +267,16 @@ class Recording(Observer):
 class _Group:
     """What is recorded of one backbone on a scene."""
 
-    def __init__(self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64]) -> None:
+    def __init__(
+        self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64], growing: GrowingMap | None = None
+    ) -> None:
         self.task = task
         self.origin = origin
         self._classes = task.mapping.target
         self._translation = origin * voxel_size
-        self._tracker = Tracker(voxel_size, len(self._classes))
-        self._followed = False  # the frame went into a map of the run that the tracker follows
+        self._tracker = Tracker(voxel_size, len(self._classes), growing)
         self._flips = FlipLog()
-        self._maps: dict[str, GrowingMap] = {}
+        self._maps: dict[str, MapLog] = {}
         self.tables: dict[str, VoxelTable] = {}
         """By backend, as they are finished."""
         self._previous: Frame | None = None
@@ -289,15 +297,9 @@ class _Group:
             low, high = self.spans.get(name, (value, value))
             self.spans[name] = min(low, value), max(high, value)
 
-    def follow(self, row: FrameRow) -> None:
-        """A unit of the group fused the frame."""
-        self._followed = self._tracker.follow(row.report) or self._followed
-
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
         """All units of the group fused the frame: log what it shows and what it changed."""
-        if not self._followed:
-            self._tracker.integrate(frame)
-        self._followed = False
+        self._tracker.follow(frame)
         self.last = frame.index, frame.timestamp
         self._flips.update(self._tracker, frame)
         grown = self._map(drawn(self.task)).update(stream, self._tracker.map) if is_pointwise(drawn(self.task)) else []
@@ -364,10 +366,10 @@ class _Group:
         if math.isfinite(flicker):
             stream.log(series.entity("compensated_flicker", self.task.units[0]), rr.Scalars(flicker))
 
-    def _map(self, backend: str) -> GrowingMap:
+    def _map(self, backend: str) -> MapLog:
         if backend not in self._maps:
             entity = path(self.task.scene.name, "map", self.task.backbone, backend)
-            self._maps[backend] = GrowingMap(entity, self._classes, self.origin, len(self.task.indices))
+            self._maps[backend] = MapLog(entity, self._classes, self.origin, len(self.task.indices))
         return self._maps[backend]
 
 

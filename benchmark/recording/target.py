@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import shutil
 import socket
+import ssl
+import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -17,6 +21,13 @@ from semstab.errors import ConfigError
 
 DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 CHOICES = "FILE.rrd, spawn, connect, rerun+http://HOST:PORT/proxy, serve, or off"
+
+ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
+"""How long a viewer may take to answer, and one that is started to listen."""
+
+HTTP2_SETTINGS = b"\x04"
+HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + HTTP2_SETTINGS + bytes(5)
+"""What a client begins with, an empty frame of settings included; a server answers with such a frame (RFC 9113)."""
 
 
 @dataclass(frozen=True)
@@ -58,39 +69,83 @@ class Target:
                 stream.save(self.file)
             else:
                 self.file.touch()
-                stream.set_sinks(self._viewer(stream), rr.FileSink(self.file))
+                stream.set_sinks(self._viewer(), rr.FileSink(self.file))
         except (OSError, RuntimeError) as error:
             raise ConfigError(f"{self.file}: the recording cannot be written ({error})") from error
         stream.set_log_tick_enabled(False)
         stream.set_log_time_enabled(False)
         return stream
 
-    def _viewer(self, stream: rr.RecordingStream) -> rr.GrpcSink | rr.GrpcServerSink:
+    def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
         if self.viewer == "serve":
-            return rr.GrpcServerSink("127.0.0.1")
+            address = _address(DEFAULT_URL)
+            if not _is_free(address):
+                raise ConfigError(f"--rerun serve: port {address[1]} is taken; end what listens there, or use connect")
+            return rr.GrpcServerSink(*address)
         if self.viewer == "spawn":
-            # Without a stream it would look for a global one, find none, and start nothing.
-            rr.spawn(connect=False, executable_path=viewer_program(), recording=stream)
-            return rr.GrpcSink(DEFAULT_URL)
-        assert self.viewer is not None
-        _require_listener(self.viewer)
-        return rr.GrpcSink(self.viewer)
+            if _is_free(_address(DEFAULT_URL)):
+                _spawn(DEFAULT_URL)
+            url = DEFAULT_URL
+        else:
+            url = str(self.viewer)
+        if (reason := _why_no_viewer(url)) is not None:
+            raise ConfigError(f"{url}: no rerun viewer listens there ({reason}); start one with: rerun")
+        return rr.GrpcSink(url)
 
 
-def viewer_program() -> str:
-    """The viewer that came with the SDK. Raises ConfigError where it is missing."""
+def viewer_command() -> list[str]:
+    """What starts the viewer that came with the SDK, for this machine only. Raises ConfigError where it is missing."""
     beside = Path(sys.executable).with_name("rerun")
     found = str(beside) if beside.exists() else shutil.which("rerun")
     if found is None:
         raise ConfigError("the rerun viewer is not installed; pip install rerun-sdk, or record into a file")
-    return found
+    return [found, "--bind", "127.0.0.1"]
 
 
-def _require_listener(url: str) -> None:
-    """Raise ConfigError where nothing listens: the SDK would wait for it at the end of the run."""
+def _spawn(url: str) -> None:
+    """Start a viewer that outlives this process, and wait until it answers. Raises ConfigError where it ends before."""
+    command = [*viewer_command(), "--port", str(_address(url)[1])]
+    environment = os.environ | {"RERUN_APP_ONLY": "true"}
+    viewer = subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    deadline = time.monotonic() + SPAWN_SECONDS
+    while _is_free(_address(url)) and time.monotonic() < deadline:
+        if viewer.poll() is not None:
+            raise ConfigError(
+                f"--rerun spawn: the viewer ended at once (exit code {viewer.returncode}); without a display use serve,"
+                " or record into a file"
+            )
+        time.sleep(0.05)
+    viewer.returncode = 0  # it outlives this process: no warning that nobody waited for its end
+
+
+def _address(url: str) -> tuple[str, int]:
     parts = urlsplit(url)
+    return parts.hostname or "", parts.port or 9876
+
+
+def _is_free(address: tuple[str, int]) -> bool:
+    with contextlib.closing(socket.socket()) as probe:
+        return probe.connect_ex(address) != 0
+
+
+def _why_no_viewer(url: str) -> str | None:
+    """None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
     try:
-        with contextlib.closing(socket.create_connection((parts.hostname or "", parts.port or 9876), timeout=5)):
-            pass
+        host, port = _address(url)
+        with contextlib.closing(socket.create_connection((host, port), timeout=ANSWER_SECONDS)) as plain:
+            connection = plain if url.startswith("rerun+http:") else _encrypted(plain, host)
+            connection.sendall(HTTP2_PREFACE)
+            answer = connection.recv(9)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{url}: no rerun viewer listens there ({error}); start one with: rerun") from error
+        return str(error)
+    return None if answer[3:4] == HTTP2_SETTINGS else "something else does"
+
+
+def _encrypted(connection: socket.socket, host: str) -> ssl.SSLSocket:
+    """Only to ask who is there: the SDK checks the certificate."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    context.set_alpn_protocols(["h2"])
+    return context.wrap_socket(connection, server_hostname=host)

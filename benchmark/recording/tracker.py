@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.numba_hash import NumbaHash, NumbaReport
+from semstab.backends import GrowingMap
+from semstab.backends.numba_hash import NumbaHash
 from semstab.frames import Frame
 from semstab.recording.drift_kernel import find_voxels
-from semstab.results import FrameReport
 
 
 class Tracker:
-    """Follows a map voxel by voxel: the run's own, where backend `numba` is in it, else one of its own."""
+    """Follows a map voxel by voxel: one of the run, which fuses each frame anyway, or else one of its own."""
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
-        self._new_map = functools.partial(NumbaHash, voxel_size, num_classes)
-        self._map: NumbaHash | None = None
-
-    @property
-    def map(self) -> NumbaHash:
+    def __init__(self, voxel_size: float, num_classes: int, of_the_run: GrowingMap | None = None) -> None:
+        self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if of_the_run is None else of_the_run
         """The map that is followed."""
-        if self._map is None:
-            self._map = self._new_map()
-        return self._map
+        self._is_own = of_the_run is None
 
-    def follow(self, report: FrameReport) -> bool:
-        """Follow the map that the report's frame went into, where that is possible; from the first frame or never."""
-        if self._map is None and isinstance(report, NumbaReport):
-            self._map = report.fused_into
-        return isinstance(report, NumbaReport) and report.fused_into is self._map
-
-    def integrate(self, frame: Frame) -> None:
-        """Fuse the frame into the map of its own."""
-        self.map.integrate(frame)
+    def follow(self, frame: Frame) -> None:
+        """All units have fused the frame: from here on it is in the map that is followed, too."""
+        if self._is_own:
+            self.map.integrate(frame)
 
     def drift_of(self, frame: Frame) -> FrameDrift:
         """What that frame, which went into the map last, did to the voxels that it saw."""

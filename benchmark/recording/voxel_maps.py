@@ -17,7 +17,7 @@ import numpy.typing as npt
 import rerun as rr
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from semstab.backends.numba_hash import NumbaHash
+from semstab.backends import GrowingMap
 from semstab.labels import LabelSpace
 from semstab.metrics import CATEGORY_COLORS
 from semstab.metrics.category import categorise
@@ -179,7 +179,7 @@ def thinned(index: npt.NDArray[np.int64]) -> tuple[int, npt.NDArray[np.int64]]:
     return factor, np.sort(rows) if factor > 1 else rows
 
 
-class GrowingMap:
+class MapLog:
     """Logs what changes in a map, within the budget: of `frames` frames each one may log its share, and what is saved.
 
     Where there is more to log, chunks come first in which the most voxels are new or were observed again since they
@@ -199,7 +199,7 @@ class GrowingMap:
         self._changed = np.zeros(CHUNKS, dtype=np.int64)  # observations in each chunk since it was logged
         self._drawn = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
 
-    def update(self, stream: rr.RecordingStream, fused: NumbaHash) -> list[Callable[[], None]]:
+    def update(self, stream: rr.RecordingStream, fused: GrowingMap) -> list[Callable[[], None]]:
         """A frame went into the map: what logs as much of it as the budget allows, whatever becomes of the map."""
         rows = fused.changes.row
         self._changed += np.bincount(self._chunk_of[rows[rows < MAX_VOXELS]], minlength=CHUNKS)
@@ -231,7 +231,7 @@ class GrowingMap:
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         return thin if factor > 1 else ""
 
-    def _job(self, stream: rr.RecordingStream, fused: NumbaHash, c: int, size: int) -> Callable[[], None]:
+    def _job(self, stream: rr.RecordingStream, fused: GrowingMap, c: int, size: int) -> Callable[[], None]:
         """What logs a chunk as it is now."""
         stretch = np.s_[self._edges[c] : self._edges[c] + size]
         rows = np.arange(stretch.start, stretch.stop)

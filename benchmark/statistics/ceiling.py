@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import FusionBackend
-from semstab.backends.association import back_project, voxel_index
+from semstab.backends.shared.association import back_project, voxel_index
 from semstab.errors import DataError
 from semstab.frames import Frame
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT

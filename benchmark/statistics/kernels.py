@@ -12,8 +12,9 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.backends.kernels import mix, serial
-from semstab.backends.updates import js_term
+from semstab.backends.shared.beliefs import js_term
+from semstab.backends.shared.hashing import mix
+from semstab.compiled import serial
 
 CHUNKS = 64
 ENUMERATED = 5

@@ -25,9 +25,10 @@ import torch
 
 import semstab
 from semstab import backends
-from semstab.backends.torch_map import TorchMap, TorchMaps
-from semstab.backends.torch_storage import Columns
-from semstab.backends.torch_views import Prediction
+from semstab.backends.torch_map import TorchMap
+from semstab.backends.torch_parts.maps import TorchMaps
+from semstab.backends.torch_parts.storage import Columns
+from semstab.backends.torch_parts.views import TensorPrediction
 from semstab.files import write_json
 from semstab.metrics import compare
 from semstab.results import Unit
@@ -103,7 +104,7 @@ def measure(case: Case, K: int, voxels: int, kernels: str, arguments: argparse.N
     several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:BACKBONES], K), device=arguments.device, kernels=kernels)
 
     def fuse_several(place: int) -> None:
-        said = {name: Prediction(labels=case.ids) for name in "abc"[:BACKBONES]}
+        said = {name: TensorPrediction(labels=case.ids) for name in "abc"[:BACKBONES]}
         several.integrate_tensors(*case.view(place % 4), said, index=place)
 
     works: dict[str, tuple[Callable[[int], None], int]] = {

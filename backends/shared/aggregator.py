@@ -9,20 +9,12 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.association import INDEX_LIMIT, back_project, check_frame, voxel_index
-from semstab.backends.kernels import (
-    HALF,
-    PARTITIONS,
-    compact,
-    find_entries,
-    frame_terms,
-    group,
-    merge_scores,
-    scatter,
-    sort_labels,
-    sum_scores,
-)
-from semstab.errors import DataError
+from semstab.backends.shared.association import INDEX_LIMIT, check_frame, voxel_index
+from semstab.backends.shared.entries import find_entries
+from semstab.backends.shared.hashing import PARTITIONS
+from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
+from semstab.backends.shared.merging import compact, group, merge_scores, scatter, sort_labels, sum_scores
+from semstab.backends.shared.pixel_keys import frame_terms
 from semstab.frames import Frame
 from semstab.labels import IGNORE_8BIT
 
@@ -127,7 +119,7 @@ class Aggregator:
             if highest.max() >= self.num_classes:
                 check_frame(frame, self.num_classes)
             if lost.any():
-                self._refuse(frame, origin)
+                raise out_of_reach(frame, origin, self.voxel_size)
             if entries.min() >= 0:
                 return _Found(rows, room, key, label, count, where, entries, spread)
             self._band_room *= 4
@@ -175,27 +167,15 @@ class Aggregator:
     def index_of(self, key: Int64) -> Int64:
         """Voxel indices (n, 3) of packed keys."""
         assert self.origin is not None
-        mask = (1 << 21) - 1
-        return np.stack([key >> 42, (key >> 21) & mask, key & mask], axis=1) - HALF + self.origin
+        return index_of_keys(key, self.origin)
 
     def _origin_at(self, frame: Frame) -> Int64:
         """The camera's voxel, from which the packed keys count."""
         origin = np.floor(frame.T_wc[:3, 3] / self.voxel_size)
         if np.abs(origin).max() > INDEX_LIMIT - 2 * HALF:
             voxel_index(frame.T_wc[:3, 3:], self.voxel_size, frame)
-            self._refuse(frame, origin)
+            raise out_of_reach(frame, origin, self.voxel_size)
         return origin.astype(np.int64)
-
-    def _refuse(self, frame: Frame, origin: npt.NDArray[Any]) -> None:
-        """Say where the frame's points are: too far for 32-bit indices, or for keys that count from the origin."""
-        points = back_project(frame)
-        voxel_index(points, self.voxel_size, frame)
-        low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))
-        raise DataError(
-            f"{frame.where('depth')}: frame {frame.index} spans {low} to {high} m, more than 2^20 voxels of"
-            f" {self.voxel_size:g} m from the map's origin {(origin * self.voxel_size).round(1).tolist()};"
-            " leave out far depth (sky?), check depth and pose units, or use larger voxels"
-        )
 
     def _room(self, name: str, size: int, dtype: Any) -> npt.NDArray[Any]:
         if name not in self._space or len(self._space[name]) < size:

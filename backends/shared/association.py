@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +57,19 @@ def check_frame(frame: Frame, num_classes: int) -> None:
             raise DataError(
                 f"{frame.where('labels')}: label id {highest} is outside 0 to {num_classes - 1}; map it or ignore it"
             )
+
+
+def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:
+    """The frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q."""
+    points = back_project(frame)
+    if not points.shape[1]:
+        nothing = np.zeros((0, 3), dtype=np.int64), np.zeros((0, num_classes)), np.zeros(0, dtype=np.int64)
+        return Observations(*nothing)
+    key, low, size = pack(voxel_index(points, voxel_size, frame), frame)
+    voxels, inverse, pixels = np.unique(key, return_inverse=True, return_counts=True)
+    s_sum = np.zeros((len(voxels), num_classes))
+    np.add.at(s_sum, inverse, evidence_of(frame, num_classes))
+    return Observations(unpack(voxels, low, size), s_sum / pixels[:, None], pixels)
 
 
 def back_project(frame: Frame) -> Float64:
@@ -123,9 +135,3 @@ def evidence_of(frame: Frame, num_classes: int) -> Float64:
     assert frame.labels is not None
     one_hot: Float64 = np.eye(num_classes)[frame.labels[frame.valid]]
     return one_hot
-
-
-def no_observations(num_classes: int) -> Observations:
-    """What a frame without a valid pixel says."""
-    empty: npt.NDArray[Any] = np.zeros((0, 3), dtype=np.int64)
-    return Observations(empty, np.zeros((0, num_classes)), np.zeros(0, dtype=np.int64))

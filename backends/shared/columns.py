@@ -8,19 +8,20 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.aggregator import Observed
-from semstab.backends.kernels import PARTITIONS, parallel, serial
+from semstab.backends.shared.aggregator import Observed
+from semstab.backends.shared.beliefs import js_term, plogp
+from semstab.backends.shared.hashing import PARTITIONS
+from semstab.backends.shared.total import Change
+from semstab.compiled import parallel
 from semstab.results import RECURRENT
 
 Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
 
 
-def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> Float64:
+def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> Change:
     """Add a frame's observations to rows of dense columns, in place.
 
-    columns are evidence (N, K) and the others of VoxelTable (N,), all 0 in rows not seen before. Returns the changes of
-    the sums over the map: of VSS, of entropy in bits, drift in bits, voxels, recurrent voxels.
+    columns are evidence (N, K) and the others of VoxelTable (N,), all 0 in rows not seen before.
     """
     chunks = np.linspace(0, len(rows), PARTITIONS + 1).astype(np.int64)
     sums = np.zeros((PARTITIONS, 5))
@@ -29,26 +30,8 @@ def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> Floa
         columns["drift_sum"], columns["pixels"], columns["first_frame"], columns["last_frame"], columns["self_sum"],
         columns["frame_entropy_sum"],
     )  # fmt: skip
-    total: Float64 = sums.sum(axis=0)
-    return total
-
-
-@serial
-def plogp(p):
-    """p log2 p, 0 for 0."""
-    return p * np.log2(p) if p > 0.0 else 0.0
-
-
-@serial
-def js_term(p, q):
-    """One class's part of the Jensen-Shannon divergence, bits."""
-    m = 0.5 * (p + q)
-    term = 0.0
-    if p > 0.0 and m > 0.0:
-        term += p * np.log2(p / m)
-    if q > 0.0 and m > 0.0:
-        term += q * np.log2(q / m)
-    return 0.5 * term
+    vss, entropy, drift, new, recurrent = sums.sum(axis=0)
+    return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent))
 
 
 @parallel

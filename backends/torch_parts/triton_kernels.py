@@ -1,4 +1,4 @@
-"""The Triton kernels behind `torch_triton`, which says what their arguments are.
+"""The Triton kernels behind `triton_launch`, which says what their arguments are.
 
 Pixels enter a hash of the view's own by atomic maxima: a key takes a slot from a smaller one, which moves on to the
 next. Where all have settled, each key lies in a slot that depends on the set of keys only (Shun and Blelloch 2014,
@@ -11,20 +11,21 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from semstab.backends import torch_eager, torch_storage
+from semstab.backends.shared import keys
+from semstab.backends.torch_parts import eager, storage
 from semstab.results import RECURRENT
 
-NONE = tl.constexpr(torch_eager.NONE)
-LOST = tl.constexpr(torch_eager.LOST)
-EMPTY = tl.constexpr(torch_storage.EMPTY)
-HALF = tl.constexpr(torch_storage.HALF)
+NONE = tl.constexpr(eager.NONE)
+LOST = tl.constexpr(eager.LOST)
+EMPTY = tl.constexpr(storage.EMPTY)
+HALF = tl.constexpr(keys.HALF)
 NEVER = tl.constexpr(-3)
 THIRD_OBSERVATION = tl.constexpr(RECURRENT)
 
 
 @triton.jit
 def _mix(key):
-    """The finaliser of splitmix64, as `torch_eager.mix`."""
+    """The finaliser of splitmix64, as `eager.mix`."""
     x = key.to(tl.uint64)
     x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9
     x = (x ^ (x >> 27)) * 0x94D049BB133111EB
@@ -282,7 +283,7 @@ def observe(
     rows, counts, seen_pixels, scale, evidence, ops, pixels, drift_sum, self_sum, frame_entropy_sum, first_frame,
     last_frame, sums, frame, n, K: tl.constexpr, BLOCK: tl.constexpr, CLASSES: tl.constexpr, SUMS: tl.constexpr,
 ):  # fmt: skip
-    """Add one observation to a block of voxels, CLASSES at a time; sums (programs, SUMS) are those of `torch_eager`."""
+    """Add one observation to a block of voxels, CLASSES at a time; sums (programs, SUMS) are those of `eager`."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(seen_pixels + i, mask=i < n, other=0)
     seen = count > 0

@@ -15,9 +15,6 @@ from semstab.errors import DataError, one_line
 
 GB = 1e9
 
-HALF = 1 << 20
-"""A map reaches that many voxels to either side of its origin."""
-
 EMPTY = -1
 """The key of a free slot."""
 
@@ -31,7 +28,7 @@ MOVED_SLOTS = 1 << 20
 
 
 @dataclass(frozen=True)
-class Grid:
+class MapGrid:
     """The voxels of a map: edge in metres, the voxel index from which keys count, and the type that points are in."""
 
     voxel_size: float

@@ -1,4 +1,4 @@
-"""What `torch_eager` does, with the same results, in fewer passes: by Triton kernels on a CUDA device.
+"""What `eager` does, with the same results, in fewer passes: by Triton kernels on a CUDA device.
 
 Multiplications and additions stay apart (`enable_fp_fusion=False`): fused, they would round otherwise at voxel faces.
 """
@@ -10,11 +10,18 @@ import os
 import torch
 import triton
 
-from semstab.backends import torch_eager
-from semstab.backends import torch_triton_kernels as kernels
-from semstab.backends.torch_eager import SUMS, Association, Evidence, camera_terms, camera_terms_single, score_scale
-from semstab.backends.torch_storage import EMPTY, Columns, Grid, VoxelHash
-from semstab.backends.torch_views import Labels, Scores, View
+from semstab.backends.torch_parts import eager
+from semstab.backends.torch_parts import triton_kernels as kernels
+from semstab.backends.torch_parts.eager import (
+    SUMS,
+    Association,
+    ViewEvidence,
+    camera_terms,
+    camera_terms_single,
+    score_scale,
+)
+from semstab.backends.torch_parts.storage import EMPTY, Columns, MapGrid, VoxelHash
+from semstab.backends.torch_parts.views import DepthView, Labels, Scores
 
 FIRST_SLOTS = 1 << 19
 """Slots of a view's hash at first: a quarter of them in use with 131,072 voxels."""
@@ -45,7 +52,7 @@ class Associator:
     def __init__(self) -> None:
         self.slots = FIRST_SLOTS
 
-    def __call__(self, view: View, grid: Grid) -> Association:
+    def __call__(self, view: DepthView, grid: MapGrid) -> Association:
         """The voxels of a view, in the order of the hash's slots, and the one of each pixel."""
         while True:
             key, table, overflow = self._insert(view, grid)
@@ -57,7 +64,7 @@ class Associator:
         self.slots = max(FIRST_SLOTS, 1 << (4 * voxels - 1).bit_length())
         return self._numbered(key, table, place, voxels)
 
-    def _insert(self, view: View, grid: Grid) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _insert(self, view: DepthView, grid: MapGrid) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Each pixel's key, the hash of all keys, and whether that was too small."""
         H, W = view.depth.shape
         device = view.depth.device
@@ -86,20 +93,20 @@ class Associator:
 # --- Evidence ---------------------------------------------------------------------------------------------------------
 
 
-def count_labels(seen: Association, said: Labels, num_classes: int) -> Evidence:
+def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvidence:
     """Pixels of each class in each voxel."""
     n, P, block = len(seen.keys), seen.voxel.numel(), 512
     sums, flags = seen.voxel.new_zeros((num_classes, n)), seen.keys.new_zeros(3)
     kernels.add_labels[(triton.cdiv(P, block),)](
         seen.voxel, said.ids, sums, flags, P, n, said.ignore, num_classes, block, **SEPARATE
     )
-    return Evidence(sums, sums.sum(dim=0), 1.0, flags)
+    return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
 
 
-def sum_scores(seen: Association, said: Scores, num_classes: int) -> Evidence:
+def sum_scores(seen: Association, said: Scores, num_classes: int) -> ViewEvidence:
     """Sums of the normalised scores in each voxel."""
     if num_classes > MOST_CLASSES:
-        return torch_eager.sum_scores(seen, said, num_classes)
+        return eager.sum_scores(seen, said, num_classes)
     n, (H, W) = len(seen.keys), seen.voxel.shape
     double = said.values.dtype == torch.float64 or not said.softmax
     scale = score_scale(H * W, double)
@@ -112,7 +119,7 @@ def sum_scores(seen: Association, said: Scores, num_classes: int) -> Evidence:
         seen.voxel, said.values, said.values.stride(0), said.values.stride(1), sums, pixels, flags, H, W,
         n, scale, num_classes, said.softmax, double, ROWS, columns, classes, num_warps=warps, **SEPARATE,
     )  # fmt: skip
-    return Evidence(sums, pixels, scale, flags)
+    return ViewEvidence(sums, pixels, scale, flags)
 
 
 # --- The map ----------------------------------------------------------------------------------------------------------
@@ -141,17 +148,17 @@ def insert(table: VoxelHash, keys: torch.Tensor, rows: torch.Tensor, first: int 
         )
 
 
-def update(columns: Columns, rows: torch.Tensor, evidence: Evidence, frame: int) -> torch.Tensor:
-    """Add one observation to the rows (n,) of the voxels that the evidence sees; returns SUMS in float64."""
+def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: int) -> torch.Tensor:
+    """Add one observation to the rows (n,) of the voxels that the evidence sees; returns a `Change` in float64."""
     n, K = len(rows), columns.num_classes
     classes = min(triton.next_power_of_2(K), 256)
     block = max(1, 256 // classes)
     programs = triton.cdiv(n, block)
-    sums = torch.zeros((programs, len(SUMS)), dtype=torch.float64, device=rows.device)
+    sums = torch.zeros((programs, SUMS), dtype=torch.float64, device=rows.device)
     if n:
         kernels.observe[(programs,)](
             rows, evidence.sums, evidence.pixels, evidence.scale, columns.evidence, columns.op, columns.pixels,
             columns.drift_sum, columns.self_sum, columns.frame_entropy_sum, columns.first_frame, columns.last_frame,
-            sums, frame, n, K, block, classes, len(SUMS), **SEPARATE,
+            sums, frame, n, K, block, classes, SUMS, **SEPARATE,
         )  # fmt: skip
     return sums.sum(dim=0)

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from semstab.backends.torch_storage import EMPTY, HALF, Columns, Grid, VoxelHash
-from semstab.backends.torch_views import Labels, Scores, View
+from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.total import Change
+from semstab.backends.torch_parts.storage import EMPTY, Columns, MapGrid, VoxelHash
+from semstab.backends.torch_parts.views import DepthView, Labels, Scores
 from semstab.results import RECURRENT
 
 NONE, LOST = -1, -2
@@ -26,9 +28,8 @@ SCORE_BITS, SCORE_BITS_SINGLE = 48, 25
 """Scores are summed in units of 2^-48, or of 2^-(62 - b) in images of 2^b > 2^14 pixels (2^-39 at 3840x2160); shares
 that were computed in float32 in units of 2^-25, half the distance of the float32 numbers below 1."""
 
-SUMS = ("points", "voxels", "new", "drift", "vss", "entropy", "recurrent")
-"""What `update` returns: the frame's pixels and voxels, its new voxels, drift in bits, and the changes over the map of
-the sums of VSS, of entropy in bits, and of the number of recurrent voxels."""
+SUMS = len(fields(Change))
+"""How many numbers `update` returns: those of a `Change`, in its order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class Association:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class ViewEvidence:
     """What one backbone says of the n voxels of a view: s_bar = sums / (scale * pixels).
 
     sums    (K, n) integer
@@ -80,7 +81,7 @@ def parts(total: int, size: int) -> Iterator[slice]:
 class Associator:
     """Finds the voxels of views."""
 
-    def __call__(self, view: View, grid: Grid) -> Association:
+    def __call__(self, view: DepthView, grid: MapGrid) -> Association:
         """The voxels of a view, ascending by key, and the one of each pixel."""
         H, W = view.depth.shape
         keys_of = _Keys(view, grid)
@@ -97,7 +98,7 @@ class Associator:
 class _Keys:
     """Packed keys of the pixels of a view, NONE without depth, LOST out of reach."""
 
-    def __init__(self, view: View, grid: Grid) -> None:
+    def __init__(self, view: DepthView, grid: MapGrid) -> None:
         self.depth = view.depth
         self.grid = grid
         self.terms = (camera_terms if grid.dtype == torch.float64 else camera_terms_single)(view, grid)
@@ -130,7 +131,7 @@ class _Keys:
         return torch.floor(d * (a + b[:, rows]) + start) + origin
 
 
-def camera_terms(view: View, grid: Grid) -> list[torch.Tensor]:
+def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
     """Rays (W,), (H, 1), the pose (3, 4, 1, 1), voxel size (1,) and origin (3, 1, 1), in float64."""
     ray_x, ray_y = view.rays
     T = view.camera.T_wc[:3, :, None, None]
@@ -138,7 +139,7 @@ def camera_terms(view: View, grid: Grid) -> list[torch.Tensor]:
     return _uploaded([ray_x, ray_y[:, None], T, np.array([grid.voxel_size]), origin], grid.dtype, view.depth.device)
 
 
-def camera_terms_single(view: View, grid: Grid) -> list[torch.Tensor]:
+def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
     """a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1) in float32: x_w / r = d (a + b) + start, from the camera.
 
     In units of voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
@@ -163,7 +164,7 @@ def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.d
 # --- Evidence ---------------------------------------------------------------------------------------------------------
 
 
-def count_labels(seen: Association, said: Labels, num_classes: int) -> Evidence:
+def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvidence:
     """Pixels of each class in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     sums = voxels.new_zeros(K * n)
@@ -176,10 +177,10 @@ def count_labels(seen: Association, said: Labels, num_classes: int) -> Evidence:
         cells = (label * n + voxel)[given & (voxel >= 0) & (label < K)]
         sums.index_add_(0, cells, sums.new_ones(()).expand(len(cells)))
     sums = sums.reshape(K, n)
-    return Evidence(sums, sums.sum(dim=0), 1.0, flags)
+    return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
 
 
-def sum_scores(seen: Association, said: Scores, num_classes: int) -> Evidence:
+def sum_scores(seen: Association, said: Scores, num_classes: int) -> ViewEvidence:
     """Sums of the normalised scores in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     scale = score_scale(len(voxels), double=said.values.dtype == torch.float64 or not said.softmax)
@@ -197,7 +198,7 @@ def sum_scores(seen: Association, said: Scores, num_classes: int) -> Evidence:
         at, units = voxel[usable].to(torch.int64), torch.floor(s[:, usable] * scale + 0.5).to(torch.int64)
         sums.index_add_(0, (classes * n + at).reshape(-1), units.reshape(-1))
         pixels.index_add_(0, at, torch.ones_like(at))
-    return Evidence(sums.reshape(K, n), pixels, scale, flags)
+    return ViewEvidence(sums.reshape(K, n), pixels, scale, flags)
 
 
 def shares(values: torch.Tensor, softmax: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -255,10 +256,10 @@ def insert(table: VoxelHash, keys: torch.Tensor, rows: torch.Tensor, first: int 
         at, keys, rows = (at[~placed] + 1) & mask, keys[~placed], rows[~placed]
 
 
-def update(columns: Columns, rows: torch.Tensor, evidence: Evidence, frame: int) -> torch.Tensor:
-    """Add one observation to the rows (n,) of the voxels that the evidence sees; returns SUMS in float64."""
+def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: int) -> torch.Tensor:
+    """Add one observation to the rows (n,) of the voxels that the evidence sees; returns a `Change` in float64."""
     observed = torch.nonzero(evidence.pixels)[:, 0]
-    sums = torch.zeros(len(SUMS), dtype=torch.float64, device=observed.device)
+    sums = torch.zeros(SUMS, dtype=torch.float64, device=observed.device)
     for part in parts(len(observed), 4 * chunk_of(observed.device) // columns.num_classes):
         voxels = observed[part]
         pixels = evidence.pixels[voxels]

@@ -6,7 +6,7 @@ from types import ModuleType
 
 import torch
 
-from semstab.backends import torch_eager
+from semstab.backends.torch_parts import eager
 from semstab.errors import ConfigError, MissingDependencyError, one_line
 
 
@@ -30,15 +30,15 @@ def kernels_for(name: str, device: torch.device) -> ModuleType:
     if name not in ("auto", "torch", "triton"):
         raise ConfigError(f"kernels = '{name}': use auto, torch or triton")
     if name == "torch" or (name == "auto" and device.type == "cpu"):
-        return torch_eager
+        return eager
     try:
-        from semstab.backends import torch_triton
+        from semstab.backends.torch_parts import triton_launch
     except ImportError as error:
         if name == "auto":
-            return torch_eager
+            return eager
         raise MissingDependencyError(
             f"kernels = 'triton' cannot be used ({one_line(error)}); pip install triton"
         ) from error
-    if not torch_triton.runs_on(device):
+    if not triton_launch.runs_on(device):
         raise ConfigError(f"kernels = 'triton': they run on a CUDA device, not on {device}; use torch, or auto")
-    return torch_triton
+    return triton_launch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ Image = torch.Tensor | npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class TensorPrediction:
     """What a backbone says of each pixel of a view: one of the three. A batch dimension of 1 is left away.
 
     labels  (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative id,
@@ -59,7 +59,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DepthView:
     """A depth image on the device, with its camera.
 
     depth   (H, W) float32, contiguous, metres along the optical axis
@@ -70,7 +70,9 @@ class View:
     camera: Frame
 
     @classmethod
-    def of(cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device) -> View:
+    def of(
+        cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device
+    ) -> DepthView:
         """A view of a depth image on any device, copied where it is elsewhere. Raises DataError as Frame does."""
         if isinstance(T_wc, torch.Tensor):
             T_wc = T_wc.detach().cpu().numpy()
@@ -87,7 +89,7 @@ class View:
         return cls(image.to(torch.float32).contiguous(), camera)
 
     @classmethod
-    def of_frame(cls, frame: Frame, device: torch.device) -> View:
+    def of_frame(cls, frame: Frame, device: torch.device) -> Self:
         """The view of a frame, which is valid already."""
         return cls(on_device(frame.depth, device), frame)
 
@@ -122,7 +124,7 @@ class Scores:
     softmax: bool
 
 
-def evidence_of(prediction: Prediction, view: View, num_classes: int, where: str) -> Labels | Scores:
+def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> Labels | Scores:
     """What a backbone says of the view's pixels, on the view's device; `where` is what an error calls it.
 
     Raises DataError where the image does not fit the depth image, or is of a wrong type.

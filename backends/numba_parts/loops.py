@@ -1,0 +1,208 @@
+"""Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from semstab.backends.shared.beliefs import js_term, plogp
+from semstab.backends.shared.hashing import PARTITIONS, mix
+from semstab.compiled import parallel, serial
+from semstab.results import RECURRENT
+
+SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
+
+
+def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
+    """The types of a voxel's record and of a node of its chain, for evidence of that float type."""
+    record = [
+        ("key", np.int64), ("pixels", np.int64), ("drift_sum", np.float64), ("self_sum", np.float64),
+        ("frame_entropy_sum", np.float64), ("value", evidence), ("next", np.int32), ("op", np.int32),
+        ("first_frame", np.int32), ("last_frame", np.int32), ("label", np.uint16),
+    ]  # fmt: skip
+    node = [("value", evidence), ("next", np.int32), ("label", np.uint16)]
+    return np.dtype(record, align=True), np.dtype(node, align=True)
+
+
+@parallel
+def look_up(key, bounds, slots, row, slot, new):
+    """The row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition."""
+    mask = np.uint64(slots.shape[1] - 1)
+    for p in nb.prange(PARTITIONS):
+        n = 0
+        for v in range(bounds[p], bounds[p + 1]):
+            at = np.int64(mix(key[v]) & mask)
+            while slots[p, at].row != -1 and slots[p, at].key != key[v]:
+                at = (at + 1) & np.int64(mask)
+            slot[v] = at
+            if slots[p, at].row == -1:
+                n += 1
+                slots[p, at].key = key[v]
+                slots[p, at].row = -1 - n
+                row[v] = -n
+            else:
+                row[v] = slots[p, at].row
+        new[p] = n
+
+
+@parallel
+def rehash(old, new):
+    """Enter the voxels of the slots into new ones, of which there are more."""
+    mask = np.uint64(new.shape[1] - 1)
+    for p in nb.prange(PARTITIONS):
+        for at in range(new.shape[1]):
+            new[p, at].row = -1
+        for i in range(old.shape[1]):
+            if old[p, i].row >= 0:
+                at = np.int64(mix(old[p, i].key) & mask)
+                while new[p, at].row != -1:
+                    at = (at + 1) & np.int64(mask)
+                new[p, at].key = old[p, i].key
+                new[p, at].row = old[p, i].row
+
+
+@serial
+def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
+    """Add one observation to a voxel that disagrees with itself, or with the frame.
+
+    s is work space (K,), all 0. Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, and
+    the dominant class before and after.
+    """
+    for e in range(first, last):
+        s[label[e]] = weight[e] / pixels
+    before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
+    top_before = top_after = plogp_before = plogp_after = drift = 0.0
+    most_before = most_after = -1.0
+    dominant_before = dominant_after = np.int64(0)
+    at = np.int64(-2)  # the record itself
+    while True:
+        lab = np.int64(record.label if at == -2 else nodes[at].label)
+        value = np.float64(record.value) if at == -2 else np.float64(nodes[at].value)
+        if value > most_before or (value == most_before and lab < dominant_before):
+            most_before, dominant_before = value, lab
+        p = value * before
+        value += s[lab]
+        s[lab] = 0.0
+        if value > most_after or (value == most_after and lab < dominant_after):
+            most_after, dominant_after = value, lab
+        q = value * after
+        if at == -2:
+            record.value = value
+            following = np.int64(record.next)
+        else:
+            nodes[at].value = value
+            following = np.int64(nodes[at].next)
+        top_before, top_after = max(top_before, p), max(top_after, q)
+        plogp_before += plogp(p)
+        plogp_after += plogp(q)
+        drift += js_term(p, q)
+        if following < 0:
+            break
+        at = following
+    for e in range(first, last):
+        share = s[label[e]]
+        if share > 0.0:
+            s[label[e]] = 0.0
+            if ranges[0] == ranges[1]:
+                ranges[0], ranges[1] = ranges[2], ranges[3]
+                ranges[2] = ranges[3]
+            node = ranges[0]
+            ranges[0] += 1
+            nodes[node].label = label[e]
+            nodes[node].value = share
+            nodes[node].next = -1
+            if at == -2:
+                record.next = node
+            else:
+                nodes[at].next = node
+            at = node
+            lab = np.int64(label[e])
+            if share > most_after or (share == most_after and lab < dominant_after):
+                most_after, dominant_after = share, lab
+            q = share * after
+            top_after = max(top_after, q)
+            plogp_after += plogp(q)
+            drift += js_term(0.0, q)
+    out[0] = top_after - top_before
+    out[1] = plogp_before - plogp_after
+    out[2] = min(max(drift, 0.0), 1.0) if op > 0 else 0.0
+    out[3], out[4] = dominant_before, dominant_after
+
+
+@parallel
+def update(
+    key, pixels, start, label, weight, bounds, frame, K, row, slot, base, slots, records, nodes, ranges, sums,
+    drift_of, dominant_before, dominant_after,
+):  # fmt: skip
+    """Add the frame's observations; sums (PARTITIONS, 4): changes of VSS and entropy, drift, recurrent voxels.
+
+    row, the last three: see `Changes`.
+    """
+    for p in nb.prange(PARTITIONS):
+        s = np.zeros(K)
+        out = np.zeros(5)
+        own = ranges[p]
+        vss = entropy = drift = 0.0
+        reached = 0
+        for v in range(bounds[p], bounds[p + 1]):
+            first, last = start[v], start[v + 1]
+            r = row[v]
+            if r < 0:
+                r = base[p] - r - 1
+                row[v] = r
+                slots[p, slot[v]].row = r
+                new = records[r]
+                new.key = key[v]
+                new.pixels = 0
+                new.drift_sum = 0.0
+                new.self_sum = 0.0
+                new.frame_entropy_sum = 0.0
+                new.value = 0.0
+                new.next = -1
+                new.op = 0
+                new.first_frame = frame
+                new.last_frame = frame
+                new.label = label[first]
+            record = records[r]
+            op = record.op
+            if last - first == 1 and record.next < 0 and record.label == label[first]:
+                record.value += 1.0
+                record.self_sum += 1.0
+                vss += 1.0 if op == 0 else 0.0
+                drift_of[v] = 0.0
+                dominant_before[v] = dominant_after[v] = record.label
+            else:
+                _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
+                vss += out[0]
+                entropy += out[1]
+                drift += out[2]
+                record.drift_sum += out[2]
+                drift_of[v] = out[2]
+                dominant_before[v], dominant_after[v] = np.uint16(out[3]), np.uint16(out[4])
+                for e in range(first, last):
+                    share = weight[e] / pixels[v]
+                    record.self_sum += share * share
+                    record.frame_entropy_sum -= plogp(share)
+            if op == 0:
+                drift_of[v] = np.nan
+                dominant_before[v] = dominant_after[v]
+            record.op = op + 1
+            record.pixels += pixels[v]
+            record.first_frame = min(record.first_frame, frame)
+            record.last_frame = max(record.last_frame, frame)
+            reached += 1 if op + 1 == RECURRENT else 0
+        sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3] = vss, entropy, drift, reached
+
+
+@parallel
+def unchain(records, nodes, order, evidence):
+    """Evidence (n, K) of the records in that order."""
+    for i in nb.prange(order.shape[0]):
+        record = records[order[i]]
+        evidence[i, record.label] = record.value
+        at = np.int64(record.next)
+        while at >= 0:
+            evidence[i, nodes[at].label] = nodes[at].value
+            at = np.int64(nodes[at].next)

@@ -1,0 +1,131 @@
+"""The compiled loop that finds the entries of an image: distinct pairs of voxel and label, with their pixels.
+
+The image is cut into bands of rows. How many there are depends on the image only, never on the number of threads.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from semstab.backends.shared.hashing import mix, partition_of
+from semstab.backends.shared.pixel_keys import keys_of_row
+from semstab.compiled import parallel, serial
+
+
+@serial
+def _runs(keys, labels, soft, changes, starts):
+    """First pixels of the runs of equal key and label in a row, closed by the row's length; returns how many runs.
+
+    Two loops without branches, of which the first one vectorises: a run ends where nobody can predict it.
+    """
+    W = keys.shape[0]
+    changes[0] = 1
+    for u in range(1, W):
+        changes[u] = (keys[u] != keys[u - 1]) | ((labels[u] != labels[u - 1]) & (not soft))
+    n = 0
+    for u in range(W):
+        starts[n] = u
+        n += changes[u]
+    starts[n] = W
+    return n
+
+
+@parallel
+def find_entries(
+    depth, labels, ray_x, ray_y, T, size, origin, rays, margin, ignore, soft, rows, room, row_keys,
+    row_changes, row_runs, slots, key, label, count, where, entries, lost, highest, spread,
+):  # fmt: skip
+    """Distinct (voxel, label) pairs of each band with their pixel counts, in order of appearance.
+
+    Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
+    """
+    H, W = depth.shape
+    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+    for band in nb.prange(entries.shape[0]):
+        thread = nb.get_thread_id()
+        slot, changes = slots[thread], row_changes[thread]
+        keys, keys_above = row_keys[thread, 0], row_keys[thread, 1]
+        starts, above = row_runs[thread, 0], row_runs[thread, 1]
+        found, found_above = row_runs[thread, 2], row_runs[thread, 3]
+        own = slice(band * room, (band + 1) * room)
+        key_of, label_of, count_of = key[own], label[own], count[own]
+        mask = 1023
+        slot[: mask + 1] = -1
+        n = runs = 0
+        for v in range(band * rows, min(H, (band + 1) * rows)):
+            runs_above = runs
+            lost[band] += keys_of_row(
+                depth[v], labels[v], ray_x, ray_y[v], T, size, ox, oy, oz, ignore, rays, margin, keys
+            )
+            runs = _runs(keys, labels[v], soft, changes, starts)
+            n, mask = _enter_row(
+                labels[v], labels[v - 1], soft, keys, keys_above, runs, starts, runs_above, above, found, found_above,
+                slot, mask, key_of, label_of, count_of, n, where[v * W : (v + 1) * W],
+            )  # fmt: skip
+            if n < 0:
+                break
+            keys, keys_above = keys_above, keys
+            starts, above = above, starts
+            found, found_above = found_above, found
+        entries[band] = n
+        for e in range(n):
+            highest[band] = max(highest[band], label_of[e])
+            spread[band, partition_of(key_of[e])] += 1
+
+
+@serial
+def _enter_row(
+    labels, labels_above, soft, keys, keys_above, runs, starts, runs_above, above, found, found_above,
+    slot, mask, key, label, count, n, where,
+):  # fmt: skip
+    """Enter the runs of a row; returns the band's entries then, -1 where it has no room, and the mask of its table.
+
+    A run's entry is looked for among those of the row above before it is looked up in the table.
+    """
+    j = 0
+    for i in range(runs):
+        u, end = starts[i], starts[i + 1]
+        k = keys[u]
+        e = np.int64(-1)
+        if k >= 0:
+            lab = np.int64(0) if soft else np.int64(labels[u])
+            if runs_above > 0:
+                while above[j + 1] <= u:
+                    j += 1
+                if keys_above[u] == k and (soft or labels_above[u] == labels[u]):
+                    e = np.int64(found_above[j])
+                elif keys_above[end - 1] == k and (soft or labels_above[end - 1] == labels[u]):
+                    while above[j + 1] < end:
+                        j += 1
+                    e = np.int64(found_above[j])
+            if e < 0:
+                at = np.int64(mix(k + (lab << 44)) & np.uint64(mask))
+                while slot[at] >= 0 and not (key[slot[at]] == k and label[slot[at]] == lab):
+                    at = (at + 1) & mask
+                e = np.int64(slot[at])
+            if e < 0:
+                if n == key.shape[0]:
+                    return np.int64(-1), mask
+                e = np.int64(n)
+                slot[at] = e
+                key[e], label[e], count[e] = k, lab, 0
+                n += 1
+                if 2 * n > mask:
+                    mask = 2 * mask + 1
+                    _refill(slot, mask, key, label, n)
+            count[e] += end - u
+        found[i] = e
+        if soft:
+            where[u:end] = e
+    return n, mask
+
+
+@serial
+def _refill(slot, mask, key, label, n):
+    slot[: mask + 1] = -1
+    for e in range(n):
+        at = np.int64(mix(key[e] + (np.int64(label[e]) << 44)) & np.uint64(mask))
+        while slot[at] >= 0:
+            at = (at + 1) & mask
+        slot[at] = e

@@ -1,0 +1,34 @@
+"""Voxel indices packed into one int64, 21 bits an axis, as they count from the origin of a map."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.shared.association import back_project, voxel_index
+from semstab.errors import DataError
+from semstab.frames import Frame
+
+HALF = 1 << 20
+"""A map reaches that many voxels to either side of its origin."""
+
+Int64 = npt.NDArray[np.int64]
+
+
+def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
+    """Voxel indices (n, 3) of packed keys (n,), which sort like (ix, iy, iz)."""
+    mask = 2 * HALF - 1
+    index: Int64 = np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - HALF + np.asarray(origin)
+    return index
+
+
+def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:
+    """What to raise where a frame has points too far from the origin, or too far for 32-bit indices altogether."""
+    points = back_project(frame)
+    voxel_index(points, voxel_size, frame)
+    low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))
+    return DataError(
+        f"{frame.where('depth')}: frame {frame.index} spans {low} to {high} m, more than 2^20 voxels of"
+        f" {voxel_size:g} m from the map's origin {(np.asarray(origin) * voxel_size).round(1).tolist()};"
+        " leave out far depth (sky?), check depth and pose units, or use larger voxels"
+    )

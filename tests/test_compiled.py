@@ -1,0 +1,84 @@
+"""Compiled code is kept where that is possible, and compiled anew where it is not; nothing fails for it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import tiny_scene
+
+import semstab
+
+IMPORT = """
+import semstab.recording, semstab.statistics.kernels  # whatever is compiled is imported without an error
+from semstab.backends.numba_hash import NumbaHash
+from semstab.compiled import serial
+
+@serial
+def twice(x):
+    return 2 * x
+
+assert twice(4) == 8
+"""
+
+RUN = """
+from semstab.cli import main
+
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """A copy of the package beside whose files nothing can be kept: not even root makes a folder of a file."""
+    site = tmp_path_factory.mktemp("site")
+    shutil.copytree(Path(semstab.__file__).parent, site / "semstab", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in [site, *(path for path in site.rglob("*") if path.is_dir())]:
+        (folder / "__pycache__").write_text("")
+    (site / "program.py").write_text(IMPORT)
+    (site / "program_that_runs.py").write_text(IMPORT + RUN)
+    return site
+
+
+def run(
+    program: Path, arguments: Sequence[str | Path], tmp_path: Path, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    home = tmp_path / "home"
+    home.write_text("a file, so that nothing can be written below it")
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "XDG", "PYTHON", "TMP"))}
+    settings = {"HOME": str(home), "PYTHONPATH": str(program.parent), "MPLCONFIGDIR": str(tmp_path), **environment}
+    return subprocess.run(
+        [sys.executable, program, *arguments], env=kept | settings, capture_output=True, text=True, check=False
+    )
+
+
+def test_a_read_only_install_without_a_home_keeps_its_code_in_the_temporary_folder(installed, tmp_path) -> None:
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    arguments = ["--data", tiny_scene.write(tmp_path / "wall"), "--out", tmp_path / "run", "--backend", "numpy"]
+    arguments += ["--check", "none", "--set", "check_geometry=false", "--rerun", "off"]
+    elsewhere = {"TMPDIR": str(temporary), "NUMBA_CACHE_DIR": str(tmp_path / "home" / "cache")}
+    done = run(installed / "program_that_runs.py", arguments, tmp_path, **elsewhere)
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    assert (tmp_path / "run" / "summary.json").is_file()
+    (folder,) = temporary.glob("semstab-compiled-*")
+    assert folder.stat().st_mode & 0o077 == 0
+    assert list(folder.rglob("program_that_runs.twice*.nbi"))
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_anew(installed, tmp_path) -> None:
+    """A folder of that name that others can write to is not trusted: code is loaded from it."""
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    theirs = temporary / f"semstab-compiled-{os.getuid()}"
+    theirs.mkdir()
+    theirs.chmod(0o777)
+    done = run(installed / "program.py", (), tmp_path, TMPDIR=str(temporary))
+    assert done.returncode == 0, done.stderr
+    assert not list(theirs.iterdir())
