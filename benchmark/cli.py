@@ -242,6 +242,7 @@ def predict(
     quiet: Quiet = False,
 ) -> None:
     """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
+    from semstab.plan import load_config, resolve
     from semstab.predict import command
 
     named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
@@ -249,12 +250,15 @@ def predict(
     options = _overrides({**named, "image_size": size}, settings or [])
     chosen: dict[str, Any] = {}
     _select_dataset(chosen, dataset, data, None)
+    of_dataset = options.pop("dataset", {})
+    if chosen:
+        chosen["dataset"].setdefault("options", {}).update(of_dataset)
     said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
     command.run(
         predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
         options=options,
         images=images,
-        dataset=chosen.get("dataset"),
+        dataset=resolve(load_config(None, chosen)).dataset if chosen else None,
         scenes=None if scene == ["all"] else scene,
         frames={} if frames is None else _slice(frames),
         out=out,
@@ -438,7 +442,8 @@ def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> C
         from semstab.plan import load_config
 
         return load_config(path, overrides)
-    from semstab.predict import parse_predictor, predicted_config
+    from semstab.plan import predicted_config
+    from semstab.predict import parse_predictor
 
     return predicted_config([parse_predictor(text) for text in predict], path, overrides)
 

@@ -118,7 +118,7 @@ def _run_task(
         return kept
     if config.check_geometry and task.scene.name not in geometry:
         with watch("check"):
-            verdict = require_sound(task.scene, task.indices, task.backbone, config.dataset.options)
+            verdict = require_sound(task.scene, task.indices, config.dataset.options)
         geometry[task.scene.name] = verdict
         for observer in observers:
             observer.geometry_checked(task, verdict)

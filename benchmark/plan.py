@@ -11,23 +11,26 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from semstab.backends import create
-from semstab.config import Config, Exclusion, Perturbation, explain, merge, read_yaml
-from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, options_model
-from semstab.datasets.selection import select_frames
+from semstab.config import Config, Exclusion, Perturbation, merge, read_yaml
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, resolved
+from semstab.datasets.selection import Selected, select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.exclusion import leave_out
 from semstab.frames import Frame
 from semstab.labels import LabelMapping, LabelSpace
 from semstab.perturbation import perturb
+from semstab.predict.live import NAME as PREDICTED
+from semstab.predict.predictor import PredictorConfig
 from semstab.results import Unit
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A backbone on a scene: which frames, and how its labels become rows of evidence."""
+    """A backbone on a scene: which frames, and how its labels become rows of evidence.
+
+    left_out  how many frames were selected but lack a file or a pose
+    """
 
     scene: Scene
     backbone: str
@@ -36,6 +39,7 @@ class Task:
     backends: tuple[str, ...]
     perturbation: Perturbation | None = None
     exclude: Exclusion = dataclasses.field(default_factory=Exclusion)
+    left_out: int = 0
 
     @property
     def units(self) -> list[Unit]:
@@ -66,6 +70,23 @@ def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | N
     return Config.build(merge(dataset_defaults(content), content), str(path or "configuration"))
 
 
+def predicted_config(
+    predictors: Sequence[PredictorConfig], path: str | Path | None, overrides: Mapping[str, Any]
+) -> Config:
+    """The configuration of a file with overrides on top, its dataset's labels replaced by predictions.
+
+    Without a list of backbones in `overrides` all predictors are used.
+    """
+    content = merge(read_yaml(path) if path is not None else {}, overrides)
+    inner = content.pop("dataset", {"name": "city"})
+    content["backbones"] = overrides.get("backbones")
+    content["dataset"] = {
+        "name": PREDICTED,
+        "options": {"dataset": inner, "backbones": [predictor.model_dump(mode="json") for predictor in predictors]},
+    }
+    return load_config(None, content)
+
+
 def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that ship for the dataset which the content names, or for the built-in one."""
     dataset = content.get("dataset")
@@ -76,15 +97,7 @@ def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def resolve(config: Config) -> Config:
     """The configuration with every default of its dataset's options filled in, paths absolute."""
-    name = config.dataset.name
-    model = options_model(name)
-    try:
-        options = model.model_validate(config.dataset.options)
-    except ValidationError as error:
-        raise ConfigError(f"dataset '{name}', options: {explain(error, model)}") from error
-    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
-    content = options.model_copy(update=paths).model_dump(mode="json")
-    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": content})})
+    return config.model_copy(update={"dataset": resolved(config.dataset)})
 
 
 def make_plan(config: Config) -> Plan:
@@ -99,18 +112,20 @@ def make_plan(config: Config) -> Plan:
 
 def tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
     """The configuration's backbones on an open scene, checked; no image is read."""
-    indices = frame_indices(scene, config)
     extra = (GROUND_TRUTH,) if scene.ground_truth else ()
     names = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
     if not names:
         raise DataError(f"{scene.name}: there are no label maps; add them in labels/BACKBONE/, or choose with --scene")
+    frames = chosen_frames(scene, config, names)
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         fused_by = tuple(backend.name for backend in config.fused_by())
         mapping = source.mapping_to(target)
         _require_classes(config.exclude.classes, mapping, scene.name)
-        yield Task(scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude)
+        yield Task(
+            scene, backbone, frames.indices, mapping, fused_by, config.perturbation, config.exclude, frames.left_out
+        )
 
 
 def _require_classes(names: Sequence[str], mapping: LabelMapping, where: str) -> None:
@@ -122,12 +137,20 @@ def _require_classes(names: Sequence[str], mapping: LabelMapping, where: str) ->
             raise ConfigError(f"{where}: exclude.classes: no class '{name}'; {hint}")
 
 
-def frame_indices(scene: Scene, config: Config) -> list[int]:
-    """The frames of a scene that the configuration selects. Raises ConfigError where there is none."""
-    indices = select_frames(scene, config.frames)
-    if not indices:
+def chosen_frames(scene: Scene, config: Config, sources: Sequence[str] = ()) -> Selected:
+    """The frames of a scene that the configuration selects, to be read with the labels of these sources.
+
+    Raises ConfigError where there is none, and what `select_frames` raises.
+    """
+    chosen = select_frames(scene, config.frames, sources)
+    if not chosen.indices:
         raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
-    return indices
+    return chosen
+
+
+def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> list[int]:
+    """The indices of `chosen_frames`."""
+    return chosen_frames(scene, config, sources).indices
 
 
 def selected(

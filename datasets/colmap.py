@@ -73,7 +73,7 @@ class Colmap(FileDataset[ColmapOptions]):
                     pose_file=path,
                     camera=image.camera,
                     color=color if folders.has(color) else None,
-                    depth_scale=1 / options.metres_per_unit if depth.suffix == ".bin" else None,
+                    depth_scale=1 / (options.metres_per_unit or 1.0) if depth.suffix == ".bin" else None,
                 )
             )
         return frames

@@ -12,7 +12,7 @@ from typing import Any
 
 from semstab.backends import create
 from semstab.config import BackendConfig, Config, FrameSelection, Perturbation, merge
-from semstab.datasets import Regional, Scene, Tracked, open_dataset
+from semstab.datasets import Scene, open_dataset
 from semstab.errors import ConfigError
 from semstab.plan import Task, frame_indices, selected, tasks_of
 from semstab.results import Unit
@@ -102,7 +102,7 @@ class RegionCell:
     @property
     def digest(self) -> str:
         """A hash of its input."""
-        return self.scene.digest(frame_indices(self.scene, self.config), self.backbone)
+        return self.scene.digest(frame_indices(self.scene, self.config, [self.backbone]), self.backbone)
 
     def request(self) -> Request:
         """What a job is told of it."""
@@ -159,10 +159,9 @@ def _base_cells(config: StudyConfig, scenes: Mapping[str, Scene]) -> Iterator[Ce
 
 def _region_cells(config: StudyConfig, scenes: Mapping[str, Scene]) -> Iterator[RegionCell]:
     for name, scene in scenes.items():
-        regions = scene.regions if isinstance(scene, Regional) else ()
-        for backbone in selected(config.region_maps, scene.backbones, regions, "region map", name):
+        for backbone in selected(config.region_maps, scene.backbones, scene.regions, "region map", name):
             settings = config.base(name).model_copy(update={"backbones": [backbone]})
-            unit, frames = [name, backbone], frame_indices(scene, settings)
+            unit, frames = [name, backbone], frame_indices(scene, settings, [backbone])
             fused_only = {"voxel_size", "strata", "statistics"}
             yield RegionCell(
                 settings, scene, backbone, _hash(settings, {"regions": unit, "frames": frames}, fused_only)
@@ -222,8 +221,8 @@ def _evenly_sampled(count: int, base: Config) -> Config:
 
 def _check_count(variation: Variation, task: Task) -> None:
     """Fewer frames than asked for would pass for another sampling density."""
-    tracked = isinstance(task.scene, Tracked)  # frames without a pose are left out, and said so
-    if variation.sweep == "frame_count" and len(task.indices) != variation.value and not tracked:
+    selected = len(task.indices) + task.left_out  # what lacks a pose or a file is left out, and said so
+    if variation.sweep == "frame_count" and selected != variation.value:
         raise ConfigError(
             f"sweeps.frame_count: {task.scene.name} has {len(task.indices)} frames over the extent of the base ones,"
             f" not {variation.value}; leave it out with 'scenes', or widen 'frames'"

@@ -135,7 +135,7 @@ def _checked(config: StudyConfig, missing: Sequence[Cell | RegionCell]) -> dict[
     found: dict[str, Verdict] = {}
     for task in {cell.task.scene.name: cell.task for cell in missing if isinstance(cell, Cell)}.values():
         with contextlib.suppress(DataError):
-            found[task.scene.name] = quick_check(task.scene, task.indices, task.backbone, config.dataset.options)
+            found[task.scene.name] = quick_check(task.scene, task.indices, config.dataset.options)
     for scene, verdict in found.items():
         refuse_unsound(scene, verdict)
     return found
