@@ -443,7 +443,7 @@ def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> C
 
         return load_config(path, overrides)
     from semstab.plan import predicted_config
-    from semstab.predict import parse_predictor
+    from semstab.predict.predictor import parse_predictor
 
     return predicted_config([parse_predictor(text) for text in predict], path, overrides)
 

@@ -7,9 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from semstab.config import explain, read_yaml
-from semstab.datasets.cameras import Camera
-from semstab.datasets.disk import files_by_stem, natural
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     DepthKind,
     FileOptions,
@@ -19,10 +17,12 @@ from semstab.datasets.file_options import (
     PoseConvention,
     ScoresLayout,
 )
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from semstab.datasets.scene_search import FileDataset
-from semstab.datasets.text_files import read_intrinsics
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.formats.disk import files_by_stem, natural
+from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from semstab.datasets.formats.text_files import read_intrinsics
+from semstab.datasets.views.cameras import Camera
 from semstab.errors import ConfigError
 
 SETTINGS_FILE = "scene.yaml"

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
-from semstab.datasets.resampling import Labels, Scores
-from semstab.datasets.same_view import fitted
+from semstab.datasets.views.resampling import Labels, Scores
+from semstab.datasets.views.same_view import fitted
 from semstab.errors import DataError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from semstab.config import FrameSelection
-from semstab.datasets.messages import MAX_LISTED, listed
+from semstab.datasets.files.messages import MAX_LISTED, listed
 from semstab.datasets.scene import Scene
 from semstab.errors import DataError
 

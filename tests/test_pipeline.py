@@ -15,7 +15,7 @@ import yaml
 import semstab
 from semstab import metrics
 from semstab.config import Config
-from semstab.datasets import disk
+from semstab.datasets.formats import disk
 from semstab.errors import ConfigError, DataError
 from semstab.pipeline import Observer
 from semstab.plan import load_config

@@ -21,23 +21,17 @@ from PIL import Image
 from semstab.backbones import Prediction, create
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.datasets import open_dataset
-from semstab.datasets.images import read_labels
+from semstab.datasets.formats.images import read_labels
 from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.labels import LabelSpace
 from semstab.metrics import matched_region_flicker
 from semstab.pipeline import run
 from semstab.plan import predicted_config
-from semstab.predict import (
-    ImageFiles,
-    PredictionObserver,
-    PredictorConfig,
-    SequenceOptions,
-    load_predictor,
-    parse_predictor,
-    predict_sequence,
-)
 from semstab.predict.jobs import file_job, scene_jobs
+from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
+from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
+from semstab.predict.sources import ImageFiles
 from semstab.warp import warp
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))

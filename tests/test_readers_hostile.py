@@ -19,11 +19,11 @@ from posed_scene import fails
 from test_cli import bench, error_of
 
 from semstab.config import FrameSelection
-from semstab.datasets.colmap_depth import read_depth_map
-from semstab.datasets.colmap_model import read_model
+from semstab.datasets.formats.colmap_depth import read_depth_map
+from semstab.datasets.formats.colmap_model import read_model
+from semstab.datasets.formats.text_tables import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.selection import select_frames
-from semstab.datasets.text_tables import read_table, records
 from semstab.datasets.transforms_json import read_transforms
 from semstab.errors import DataError, SemstabError
 from semstab.pipeline import run

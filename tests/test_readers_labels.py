@@ -12,10 +12,10 @@ from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
-from semstab.datasets.file_options import FileOptions
-from semstab.datasets.label_source import ScenePlace, find_sources
-from semstab.datasets.resampling import fit_labels, fit_scores
+from semstab.datasets.files.label_source import ScenePlace, find_sources
+from semstab.datasets.files.options import FileOptions
 from semstab.datasets.scannet import read_class_table
+from semstab.datasets.views.resampling import fit_labels, fit_scores
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Intrinsics
 

@@ -14,7 +14,7 @@ import tiny_study
 from tiny_study import Counting, Interrupting, configure, summary
 
 import semstab
-from semstab.datasets.file_scene import FileScene
+from semstab.datasets.files.scene import FileScene
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.plan import read

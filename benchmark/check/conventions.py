@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from semstab.datasets import Scene
-from semstab.datasets.poses import CAMERA_AXES
+from semstab.datasets.views.poses import CAMERA_AXES
 from semstab.frames import Frame
 
 Size = tuple[int, int]

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from semstab.check.conventions import Convention
 from semstab.datasets import GROUND_TRUTH, Scene
-from semstab.datasets.poses import CAMERA_AXES
-from semstab.datasets.ray_depth import ray_lengths
+from semstab.datasets.views.poses import CAMERA_AXES
+from semstab.datasets.views.ray_depth import ray_lengths
 from semstab.frames import Frame, Intrinsics
 
 MAX_PIXELS = 2**20

@@ -13,8 +13,8 @@ from semstab.check.views import evenly, reader
 from semstab.config import Config
 from semstab.convert.folder import SCORES_SUFFIX, DepthFormat, DepthFormatError, SceneFolder, depth_format
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
-from semstab.datasets.label_source import LABEL_SPACE_FILE
-from semstab.datasets.poses import UP_AXES
+from semstab.datasets.files.label_source import LABEL_SPACE_FILE
+from semstab.datasets.views.poses import UP_AXES
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame
 from semstab.plan import frame_indices, selected

@@ -10,7 +10,8 @@ from semstab.config import DatasetConfig, FrameSelection
 from semstab.datasets import Scene, open_dataset
 from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError
-from semstab.predict.sources import ImageFiles, ImageSequence, chosen
+from semstab.predict.images import ImageSequence
+from semstab.predict.sources import ImageFiles, chosen
 
 
 @dataclass(frozen=True, eq=False)

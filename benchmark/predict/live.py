@@ -16,12 +16,12 @@ from pydantic import BaseModel, Field, field_validator
 from semstab.backbones import Backbone, Prediction
 from semstab.config import DatasetConfig, Settings
 from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset, resolved
-from semstab.datasets.resampling import Labels, Scores
+from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
+from semstab.predict.images import first_images
 from semstab.predict.predictor import PredictorConfig, load_predictor
-from semstab.predict.sources import first_images
 from semstab.registry import Entry
 
 NAME = "predicted"
@@ -228,7 +228,7 @@ def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
 REGISTRY.register(
     NAME,
     Entry(
-        f"{__name__}:{PredictedDataset.__name__}",
+        "semstab.predict.live:PredictedDataset",
         "another dataset with labels that models make while it is fused: `run --predict`",
     ),
 )

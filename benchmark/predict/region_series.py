@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-from semstab.datasets.images import read_labels
+from semstab.datasets.formats.images import read_labels
 from semstab.files import write_text
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
-from semstab.predict.sources import ImageSequence
+from semstab.predict.images import ImageSequence
 from semstab.warp import warp
 
 COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))

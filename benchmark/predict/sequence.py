@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backbones import Backbone, Prediction
-from semstab.datasets.same_view import fitted
+from semstab.datasets.views.same_view import fitted
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType
+from semstab.predict.images import Image, ImageSequence, first_images
 from semstab.predict.region_series import RegionSeries, region_series
-from semstab.predict.sources import Image, ImageSequence, first_images
 from semstab.prefetch import prefetch
 
 REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers", "onnxruntime")

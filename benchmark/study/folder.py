@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from semstab.datasets.disk import file_digest
+from semstab.datasets.formats.disk import file_digest
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path, read_json, write_json, write_text
 from semstab.results import Unit, UnitSummary, slug

@@ -17,7 +17,7 @@ import numpy as np
 from semstab.backends import FusionBackend
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Scene
-from semstab.datasets.disk import file_digest
+from semstab.datasets.formats.disk import file_digest
 from semstab.errors import DataError
 from semstab.evaluation import analyse_map, truth_task
 from semstab.files import atomic_path

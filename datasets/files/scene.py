@@ -13,12 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets import disk
-from semstab.datasets.cameras import Camera
-from semstab.datasets.colmap_depth import read_depth_map
-from semstab.datasets.file_options import FileOptions
-from semstab.datasets.images import MILLIMETRES, read_color, read_depth, read_labels, read_mask, read_scores
-from semstab.datasets.label_source import (
+from semstab.datasets.files.label_source import (
     LABEL_SPACE_FILE,
     LabelSource,
     ScenePlace,
@@ -27,14 +22,19 @@ from semstab.datasets.label_source import (
     find_sources,
     label_space,
 )
-from semstab.datasets.messages import listed, nearest
-from semstab.datasets.poses import UP_AXES, Poses, to_camera_to_world
-from semstab.datasets.ray_depth import planar
-from semstab.datasets.resampling import Labels, Scores, fit_labels, fit_scores
-from semstab.datasets.same_view import fitted
+from semstab.datasets.files.messages import listed, nearest
+from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.templates import Folders
+from semstab.datasets.formats import disk
+from semstab.datasets.formats.colmap_depth import read_depth_map
+from semstab.datasets.formats.images import MILLIMETRES, read_color, read_depth, read_labels, read_mask, read_scores
+from semstab.datasets.formats.text_files import read_pose
 from semstab.datasets.scene import GROUND_TRUTH, Scene
-from semstab.datasets.templates import Folders
-from semstab.datasets.text_files import read_pose
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
+from semstab.datasets.views.ray_depth import planar
+from semstab.datasets.views.resampling import Labels, Scores, fit_labels, fit_scores
+from semstab.datasets.views.same_view import fitted
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace

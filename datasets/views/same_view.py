@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from semstab.datasets.cameras import Camera
-from semstab.datasets.resampling import Labels, Scores, fit_labels, fit_scores
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.resampling import Labels, Scores, fit_labels, fit_scores
 from semstab.errors import DataError
 from semstab.frames import Intrinsics
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Literal
 
 from semstab.datasets import GROUND_TRUTH
-from semstab.datasets.file_options import FileOptions
-from semstab.datasets.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
-from semstab.datasets.templates import Folders, Template, inside, matching_folders
+from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.templates import Folders, Template, inside, matching_folders
+from semstab.datasets.formats.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.labels import LabelSpace
 
