@@ -149,7 +149,7 @@ def label_space(options: FileOptions, folder: Path, name: str, source: LabelSour
         return LabelSpace.load(beside)
     try:
         if options.classes is not None:
-            return LabelSpace(name="classes of the dataset", classes=options.classes)
+            return LabelSpace(name="classes of the scene", classes=options.classes)
         return None if options.taxonomy is None else LabelSpace.load(options.taxonomy)
     except ConfigError as error:
         raise ConfigError(f"{folder}: {error}") from error
