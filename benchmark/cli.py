@@ -241,18 +241,22 @@ def predict(
 ) -> None:
     """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
     from semstab.predict import command
+    from semstab.settings import load_config, resolve
 
     named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
     size = None if image_size is None else _image_size(image_size)
     options = _overrides({**named, "image_size": size}, settings or [])
     chosen: dict[str, Any] = {}
     _select_dataset(chosen, dataset, data, None)
+    of_dataset = options.pop("dataset", {})
+    if chosen:
+        chosen["dataset"].setdefault("options", {}).update(of_dataset)
     said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
     command.run(
         predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
         options=options,
         images=images,
-        dataset=chosen.get("dataset"),
+        dataset=resolve(load_config(None, chosen)).dataset if chosen else None,
         scenes=None if scene == ["all"] else scene,
         frames={} if frames is None else _slice(frames),
         out=out,
@@ -428,7 +432,8 @@ def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> C
         from semstab.settings import load_config
 
         return load_config(path, overrides)
-    from semstab.predict import parse_predictor, predicted_config
+    from semstab.predict.predictor import parse_predictor
+    from semstab.settings import predicted_config
 
     return predicted_config([parse_predictor(text) for text in predict], path, overrides)
 

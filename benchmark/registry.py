@@ -30,7 +30,11 @@ class Registry:
 
     def __init__(self, kind: str, builtin: Mapping[str, Entry]) -> None:
         self.kind = kind
-        self.builtin = builtin
+        self.builtin = dict(builtin)
+
+    def register(self, name: str, entry: Entry) -> None:
+        """Name a class of a layer above, which does so itself when it is imported."""
+        self.builtin[name] = entry
 
     def entries(self) -> dict[str, Entry]:
         """Every known entry by name; a built-in name is not replaced by a plug-in's."""

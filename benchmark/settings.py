@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
-from semstab.config import Config, explain, merge, nearest, read_yaml
-from semstab.datasets import options_model
+from semstab.config import Config, merge, nearest, read_yaml
+from semstab.datasets import resolved
 from semstab.errors import ConfigError
+from semstab.predict.live import NAME as PREDICTED
+from semstab.predict.predictor import PredictorConfig
 
 
 def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
@@ -45,17 +45,26 @@ def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     return read_yaml(shipped) if shipped.is_file() else {}
 
 
+def predicted_config(
+    predictors: Sequence[PredictorConfig], path: str | Path | None, overrides: Mapping[str, Any]
+) -> Config:
+    """The configuration of a file with overrides on top, its dataset's labels replaced by predictions.
+
+    Without a list of backbones in `overrides` all predictors are used.
+    """
+    content = merge(read_yaml(path) if path is not None else {}, overrides)
+    inner = content.pop("dataset", {"name": "city"})
+    content["backbones"] = overrides.get("backbones")
+    content["dataset"] = {
+        "name": PREDICTED,
+        "options": {"dataset": inner, "backbones": [predictor.model_dump(mode="json") for predictor in predictors]},
+    }
+    return load_config(None, content)
+
+
 def resolve(config: Config) -> Config:
     """The configuration with every default of its dataset's options filled in, paths absolute."""
-    name = config.dataset.name
-    model = options_model(name)
-    try:
-        options = model.model_validate(config.dataset.options)
-    except ValidationError as error:
-        raise ConfigError(f"dataset '{name}', options: {explain(error, model)}") from error
-    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
-    content = options.model_copy(update=paths).model_dump(mode="json")
-    return config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": content})})
+    return config.model_copy(update={"dataset": resolved(config.dataset)})
 
 
 def _find(study: str) -> Path:

@@ -10,7 +10,7 @@ from functools import cached_property
 
 from semstab.config import Config, Exclusion, Part, Perturbation
 from semstab.datasets import GROUND_TRUTH, Scene
-from semstab.datasets.selection import select_frames
+from semstab.datasets.selection import Selected, select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.exclusion import leave_out
 from semstab.frames import Frame
@@ -21,7 +21,10 @@ from semstab.results import Unit
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A backbone on a scene: which frames, and how its labels become rows of evidence."""
+    """A backbone on a scene: which frames, and how its labels become rows of evidence.
+
+    left_out  how many frames were selected but lack a file or a pose
+    """
 
     scene: Scene
     backbone: str
@@ -30,6 +33,7 @@ class Task:
     backends: tuple[str, ...]
     perturbation: Perturbation | None = None
     exclude: Exclusion = dataclasses.field(default_factory=Exclusion)
+    left_out: int = 0
 
     @property
     def units(self) -> list[Unit]:
@@ -42,20 +46,26 @@ class Task:
         return self.scene.digest(self.indices, self.backbone)
 
 
-def tasks_of(scene: Scene, config: Config) -> Iterator[Task]:
-    """The configuration's backbones on an open scene, checked; no image is read."""
-    indices = frame_indices(scene, config)
+def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterator[Task]:
+    """The configuration's backbones on an open scene, checked; no image is read.
+
+    Frames are those that have labels of all of them, and of the label sources `beside` them: what is compared is fused
+    from the same frames.
+    """
     extra = (GROUND_TRUTH,) if scene.ground_truth else ()
     names = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
     if not names:
         raise DataError(f"{scene.name}: there are no label maps; add them in labels/BACKBONE/, or choose with --scene")
+    frames = chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         mapping = source.mapping_to(target)
         _require_classes(config.exclude.classes, mapping, scene.name)
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
-        yield Task(scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude)
+        yield Task(
+            scene, backbone, frames.indices, mapping, fused_by, config.perturbation, config.exclude, frames.left_out
+        )
 
 
 def applies(part: Part, scene: str, backbone: str) -> bool:
@@ -72,12 +82,20 @@ def _require_classes(names: Sequence[str], mapping: LabelMapping, where: str) ->
             raise ConfigError(f"{where}: exclude.classes: no class '{name}'; {hint}")
 
 
-def frame_indices(scene: Scene, config: Config) -> list[int]:
-    """The frames of a scene that the configuration selects. Raises ConfigError where there is none."""
-    indices = select_frames(scene, config.frames)
-    if not indices:
+def chosen_frames(scene: Scene, config: Config, sources: Sequence[str] = ()) -> Selected:
+    """The frames of a scene that the configuration selects, to be read with the labels of these sources.
+
+    Raises ConfigError where there is none, and what `select_frames` raises.
+    """
+    chosen = select_frames(scene, config.frames, sources)
+    if not chosen.indices:
         raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
-    return indices
+    return chosen
+
+
+def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> list[int]:
+    """The indices of `chosen_frames`."""
+    return chosen_frames(scene, config, sources).indices
 
 
 def selected(

@@ -1,19 +1,18 @@
-"""Datasets behind one protocol: a dataset has scenes, a scene yields frames with the labels of a backbone."""
+"""Datasets behind one base class: a dataset has scenes, a scene yields frames with the labels of a backbone."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol, cast, runtime_checkable
+from pathlib import Path
+from typing import Any, cast
 
-import numpy as np
-import numpy.typing as npt
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from semstab.frames import Frame
-from semstab.labels import LabelSpace
+from semstab.config import DatasetConfig, explain
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
+from semstab.errors import ConfigError
 from semstab.registry import Entry, Registry
 
-GROUND_TRUTH = "gt"
-"""The name under which a scene's ground truth labels are selected like a backbone's."""
+__all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Scene", "open_dataset", "options_model", "resolved"]
 
 REGISTRY = Registry(
     "dataset",
@@ -25,10 +24,6 @@ REGISTRY = Registry(
         "posed_folder": Entry(
             "semstab.datasets.posed_folder:PosedFolder",
             "folders depth/, pose/, labels/BACKBONE/ and intrinsics.txt, one file a frame",
-        ),
-        "predicted": Entry(
-            "semstab.predict.live:PredictedDataset",
-            "another dataset with labels that models make while it is fused: `run --predict`",
         ),
         "uavid3d": Entry(
             "semstab.datasets.uavid3d:Uavid3d",
@@ -49,90 +44,27 @@ REGISTRY = Registry(
 )
 
 
-class Scene(Protocol):
-    """One sequence. Opening it reads no image; `frame` decodes one, and may be called from several threads at once.
-
-    name          the scene's name, usable in a file name
-    backbones     names of the label sources, without the ground truth
-    ground_truth  whether `frame(i, "gt")` works too
-    up            (3,) unit vector of the world's up axis, or None where it is not known
-    """
-
-    name: str
-    backbones: tuple[str, ...]
-    ground_truth: bool
-    up: npt.NDArray[np.float64] | None
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        ...
-
-    def label_space(self, backbone: str) -> LabelSpace:
-        """The classes of that backbone's label maps or scores."""
-        ...
-
-    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
-        """Frame 0 <= index < len, with that backbone's labels or scores in its own label space.
-
-        Without `color` a scene may leave colour out, where that saves time.
-
-        Raises DataError that names the file.
-        """
-        ...
-
-    def digest(self, indices: list[int], backbone: str) -> str:
-        """A hash of the content behind those frames: the same digest means the same numbers."""
-        ...
-
-
-@runtime_checkable
-class Timed(Protocol):
-    """A scene that knows when its frames were taken, so that they can be chosen by time."""
-
-    @property
-    def timestamps(self) -> npt.NDArray[np.float64] | None:
-        """(len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
-        ...
-
-
-@runtime_checkable
-class Tracked(Protocol):
-    """A scene whose tracking may have been lost in some frames, which are left out then."""
-
-    def tracked(self, index: int) -> bool:
-        """Whether the frame has a pose. Reads no image."""
-        ...
-
-
-@runtime_checkable
-class Regional(Protocol):
-    """A scene that also has maps of regions without classes: `frame` reads them by name, nothing fuses them."""
-
-    regions: tuple[str, ...]
-
-
-class Dataset(Protocol):
-    """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it."""
-
-    Options: type[BaseModel]
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes, in order."""
-        ...
-
-    def scene(self, name: str) -> Scene:
-        """Open one. Raises DataError where its files are missing or contradict each other."""
-        ...
-
-
 def options_model(name: str) -> type[BaseModel]:
     """The pydantic model of a dataset's options."""
     return cast("type[BaseModel]", REGISTRY.load(name).Options)
+
+
+def resolved(config: DatasetConfig) -> DatasetConfig:
+    """The dataset with every default of its options filled in, paths absolute.
+
+    Raises ConfigError for a dataset or an option that cannot be used.
+    """
+    model = options_model(config.name)
+    try:
+        options = model.model_validate(config.options)
+    except ValidationError as error:
+        raise ConfigError(f"dataset '{config.name}', options: {explain(error, model)}") from error
+    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
+    return config.model_copy(update={"options": options.model_copy(update=paths).model_dump(mode="json")})
 
 
 def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
     """Open a dataset by name with its options. Raises ConfigError, DataError or MissingDependencyError."""
     cls = REGISTRY.load(name)
     validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
-    return cast(Dataset, cls(validated))
+    return cast("Dataset", cls(validated))

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.colmap_model import has_model, image_name, read_model
-from semstab.datasets.file_options import CameraAxes, FileOptions, PixelCentre, PoseConvention
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.images import DEPTH_SUFFIXES
-from semstab.datasets.scene_search import FileDataset
-from semstab.datasets.templates import Folders, Template, inside
+from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre, PoseConvention
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import Folders, Template, inside
+from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
+from semstab.datasets.formats.images import DEPTH_SUFFIXES
 
 MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 
@@ -73,7 +73,7 @@ class Colmap(FileDataset[ColmapOptions]):
                     pose_file=path,
                     camera=image.camera,
                     color=color if folders.has(color) else None,
-                    depth_scale=1 / options.metres_per_unit if depth.suffix == ".bin" else None,
+                    depth_scale=1 / (options.metres_per_unit or 1.0) if depth.suffix == ".bin" else None,
                 )
             )
         return frames

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from semstab.datasets.cameras import Camera
-from semstab.datasets.file_options import CameraAxes, DepthScale, FileOptions, PoseConvention
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.scene_search import FileDataset, files_named, require_equal
-from semstab.datasets.text_files import read_intrinsics
-from semstab.datasets.text_tables import read_table
+from semstab.datasets.files.options import CameraAxes, DepthScale, FileOptions, PoseConvention
+from semstab.datasets.files.reader import FileDataset, files_named, require_equal
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.formats.text_files import read_intrinsics
+from semstab.datasets.formats.text_tables import read_table
+from semstab.datasets.views.cameras import Camera
 from semstab.errors import DataError
 
 

@@ -12,8 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.cameras import Camera, camera_of
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
     FourIntrinsics,
@@ -23,11 +22,12 @@ from semstab.datasets.file_options import (
     VoidIds,
     zero_is_void,
 )
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.json_files import number, read_object
-from semstab.datasets.scene_search import FileDataset, files_named, require_equal
-from semstab.datasets.templates import Folders
-from semstab.datasets.text_tables import read_table
+from semstab.datasets.files.reader import FileDataset, files_named, require_equal
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import Folders
+from semstab.datasets.formats.json_files import number, read_object
+from semstab.datasets.formats.text_tables import read_table
+from semstab.datasets.views.cameras import Camera, camera_of
 from semstab.errors import DataError
 
 

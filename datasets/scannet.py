@@ -14,9 +14,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.datasets import GROUND_TRUTH
-from semstab.datasets.cameras import Camera
-from semstab.datasets.disk import read_bytes
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     DepthScale,
     FileOptions,
@@ -27,10 +25,12 @@ from semstab.datasets.file_options import (
     VoidIds,
     zero_is_void,
 )
-from semstab.datasets.file_scene import NO_ID, FrameSource
-from semstab.datasets.scene_search import FileDataset, files_named
-from semstab.datasets.templates import Folders
-from semstab.datasets.text_files import read_intrinsics
+from semstab.datasets.files.reader import FileDataset, files_named
+from semstab.datasets.files.scene import NO_ID, FrameSource
+from semstab.datasets.files.templates import Folders
+from semstab.datasets.formats.disk import read_bytes
+from semstab.datasets.formats.text_files import read_intrinsics
+from semstab.datasets.views.cameras import Camera
 from semstab.errors import DataError
 from semstab.labels import IGNORE_16BIT
 

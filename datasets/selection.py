@@ -1,33 +1,71 @@
-"""The frames of a scene that a selection picks, without those whose pose was lost."""
+"""The frames of a scene that a selection picks, without those that lack a file or whose pose was lost."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from semstab.config import FrameSelection
-from semstab.datasets import Scene, Timed, Tracked
+from semstab.datasets.files.messages import MAX_LISTED, listed
+from semstab.datasets.scene import Scene
+from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")
 
-MAX_LISTED = 5
 
+@dataclass(frozen=True)
+class Selected:
+    """Indices of frames, in order.
 
-def select_frames(scene: Scene, selection: FrameSelection) -> list[int]:
-    """Indices of the selected frames, in order; those without a pose are left out, with a warning that lists them.
-
-    Reads no image. Raises ConfigError for a frame or a range of time that the scene does not have.
+    indices     those to read
+    incomplete  selected ones that were left out because they lack a file
+    lost        selected ones that were left out because tracking was lost
     """
-    times = scene.timestamps if isinstance(scene, Timed) else None
+
+    indices: list[int]
+    incomplete: tuple[int, ...] = ()
+    lost: tuple[int, ...] = ()
+
+    @property
+    def left_out(self) -> int:
+        """How many frames were selected, but left out."""
+        return len(self.incomplete) + len(self.lost)
+
+
+def select_frames(
+    scene: Scene, selection: FrameSelection, sources: Sequence[str] = (), *, color: bool = False
+) -> Selected:
+    """The selected frames of a sequence, to be read with the labels of these sources (or its colour) and no others.
+
+    What is left out is said in a warning. Reads no image. Raises ConfigError for a frame or a range of time that the
+    scene does not have, DataError where selected frames lack files and the scene does not leave such frames out.
+    """
+    times = scene.timestamps
     chosen = selection.indices(len(scene), None if times is None else times.tolist())
-    if not isinstance(scene, Tracked):
-        return chosen
-    lost = [index for index in chosen if not scene.tracked(index)]
+    missing = {index: scene.missing(index, sources, color=color) for index in chosen}
+    complete = [index for index in chosen if not missing[index]]
+    if len(complete) < len(chosen):
+        needs = ("depth", "pose", *(("labels",) if sources else ()), *(("colour",) if color else ()))
+        _tell_missing(scene, [path for paths in missing.values() for path in paths], len(complete), len(chosen), needs)
+    lost = {index for index in complete if not scene.tracked(index)}
     if lost:
         more = ", ..." if len(lost) > MAX_LISTED else ""
-        listed = ", ".join(str(index) for index in lost[:MAX_LISTED])
         logger.warning(
             "%s: %d of %d selected frames have no pose (tracking was lost) and are left out: %s%s",
-            scene.name, len(lost), len(chosen), listed, more,
+            scene.name, len(lost), len(chosen), ", ".join(map(str, sorted(lost)[:MAX_LISTED])), more,
         )  # fmt: skip
-    without = set(lost)
-    return [index for index in chosen if index not in without]
+    return Selected(
+        indices=[index for index in complete if index not in lost],
+        incomplete=tuple(index for index in chosen if missing[index]),
+        lost=tuple(sorted(lost)),
+    )
+
+
+def _tell_missing(scene: Scene, paths: list[str], complete: int, selected: int, needs: Sequence[str]) -> None:
+    where = scene.folder or scene.name
+    if not scene.skips_incomplete:
+        raise DataError(f"{where}: {listed(paths)}; add them, or set incomplete: skip to leave such frames out")
+    if not complete:
+        raise DataError(f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths)})")
+    logger.warning("%s: %d of %d frames left out: %s", where, selected - complete, selected, listed(paths))

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from semstab.datasets.cameras import Camera, camera_of
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     DepthScale,
     FileOptions,
@@ -19,9 +18,10 @@ from semstab.datasets.file_options import (
     PoseConvention,
     Size,
 )
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.scene_search import FileDataset, files_named
-from semstab.datasets.templates import Folders
+from semstab.datasets.files.reader import FileDataset, files_named
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import Folders
+from semstab.datasets.views.cameras import Camera, camera_of
 from semstab.frames import Intrinsics
 
 IMAGE_SIZE = (640, 480)

@@ -10,8 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.cameras import camera_of
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
     FourIntrinsics,
@@ -19,11 +18,12 @@ from semstab.datasets.file_options import (
     PoseConvention,
     UpAxis,
 )
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.poses import from_quaternions
-from semstab.datasets.scene_search import FileDataset, files_named, require_equal
-from semstab.datasets.templates import Folders
-from semstab.datasets.text_tables import read_table
+from semstab.datasets.files.reader import FileDataset, files_named, require_equal
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import Folders
+from semstab.datasets.formats.text_tables import read_table
+from semstab.datasets.views.cameras import camera_of
+from semstab.datasets.views.poses import from_quaternions
 
 IMAGE_SIZE = (640, 480)
 USUAL = (320.0, 320.0, 320.0, 240.0)

@@ -15,14 +15,14 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.cameras import Camera
-from semstab.datasets.disk import natural
-from semstab.datasets.file_options import CameraAxes, FileOptions, PixelCentre, PoseConvention
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
-from semstab.datasets.json_files import matrix, number, read_object
-from semstab.datasets.scene_search import FileDataset
-from semstab.datasets.templates import Folders, Template, inside
+from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre, PoseConvention
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import Folders, Template, inside
+from semstab.datasets.formats.disk import natural
+from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
+from semstab.datasets.formats.json_files import matrix, number, read_object
+from semstab.datasets.views.cameras import Camera
 from semstab.errors import DataError
 from semstab.frames import Intrinsics
 

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from semstab.datasets.cameras import camera_of
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     DepthScale,
     FileOptions,
@@ -23,11 +22,12 @@ from semstab.datasets.file_options import (
     Positive,
     UpAxis,
 )
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.poses import at_times, from_quaternions
-from semstab.datasets.scene_search import FileDataset
-from semstab.datasets.templates import inside
-from semstab.datasets.text_tables import read_table, records, to_number
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import inside
+from semstab.datasets.formats.text_tables import read_table, records, to_number
+from semstab.datasets.views.cameras import camera_of
+from semstab.datasets.views.poses import at_times, from_quaternions
 from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")

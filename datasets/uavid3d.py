@@ -12,9 +12,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.cameras import Camera
-from semstab.datasets.colmap_model import has_model, image_name, read_model
-from semstab.datasets.file_options import (
+from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
     FourIntrinsics,
@@ -22,13 +20,15 @@ from semstab.datasets.file_options import (
     PixelCentre,
     PoseConvention,
 )
-from semstab.datasets.file_scene import FrameSource
-from semstab.datasets.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from semstab.datasets.poses import Poses
-from semstab.datasets.scene_search import FileDataset, files_named
-from semstab.datasets.templates import Folders, Template, inside
-from semstab.datasets.text_files import read_intrinsics
+from semstab.datasets.files.reader import FileDataset, files_named
+from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.files.templates import Folders, Template, inside
+from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
+from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.transforms_json import read_transforms
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError
 from semstab.frames import Intrinsics
 

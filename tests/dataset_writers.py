@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from posed_writer import write_posed
 from scipy.spatial.transform import Rotation
 
 from semstab.backends import create
@@ -116,6 +117,12 @@ def write_labels(folder: Path, names: Sequence[str], frames: Sequence[Frame], te
 
 
 # --- formats --------------------------------------------------------------------------------------------------------
+
+
+def write_posed_folder(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    names = [f"{k:04d}" for k in range(len(frames))]
+    write_posed(folder, names, {"": frames})
+    return names
 
 
 def write_hololens(folder: Path, frames: Sequence[Frame]) -> list[str]:
@@ -295,6 +302,7 @@ def camera_option() -> list[float]:
 
 
 FORMATS = {
+    "posed_folder": Format("posed_folder", write_posed_folder, 1000),
     "hololens": Format("hololens", write_hololens, 1000),
     "seven_scenes": Format("seven_scenes", write_seven_scenes, 1000, {"intrinsics": camera_option}),
     "scannet": Format("scannet", write_scannet, 1000, {"color_size": (2 * W, 2 * H)}),

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from posed_writer import write_posed
 
 from semstab.datasets import open_dataset
+from semstab.frames import Frame, Intrinsics
 
 H, W, K = 6, 8, 3
 SETTINGS = {"classes": ["a", "b", "c"], "up_axis": "z"}
@@ -32,20 +34,21 @@ def save_image(path: Path, array) -> None:
 
 def write_scene(folder: Path, names=("frame1", "frame2", "frame10")) -> Path:
     """A whole scene: depth, pose, colour, labels of 'net', scores of 'net', ground truth."""
-    for part in ("depth", "pose", "color", "labels/net", "labels/gt", "scores/net"):
-        (folder / part).mkdir(parents=True)
-    (folder / "intrinsics.txt").write_text("10 0 3.5\n0 11 2.5\n0 0 1\n")
-    say(folder)
-    for k, name in enumerate(names):
-        rng = np.random.default_rng(k)
-        save_image(folder / f"depth/{name}.png", rng.integers(500, 9000, (H, W)).astype(np.uint16))
-        np.savetxt(folder / f"pose/{name}.txt", pose(k))
-        save_image(folder / f"color/{name}.png", rng.integers(0, 255, (H, W, 3)).astype(np.uint8))
-        save_image(folder / f"labels/net/{name}.png", np.full((H, W), k % K, np.uint8))
-        save_image(folder / f"labels/gt/{name}.png", np.full((H, W), (k + 1) % K, np.uint8))
-        scores = rng.dirichlet(np.ones(K), (H, W)).transpose(2, 0, 1).astype(np.float16)
-        np.savez(folder / f"scores/net/{name}.npz", scores=scores)
-    return folder
+    sources = {name: [frame(k, name) for k in range(len(names))] for name in ("net", "gt", "net-scores")}
+    return write_posed(folder, names, sources, **SETTINGS)
+
+
+def frame(k: int, source: str) -> Frame:
+    rng = np.random.default_rng(k)
+    return Frame(
+        index=k,
+        depth=(rng.integers(500, 9000, (H, W)) / 1000).astype(np.float32),
+        intrinsics=Intrinsics(10, 11, 3.5, 2.5),
+        T_wc=pose(k),
+        color=rng.integers(0, 255, (H, W, 3)).astype(np.uint8),
+        labels=None if source == "net-scores" else np.full((H, W), (k + (source == "gt")) % K, np.uint8),
+        scores=rng.dirichlet(np.ones(K), (H, W)).astype(np.float16) if source == "net-scores" else None,
+    )
 
 
 def say(folder: Path, **settings) -> None:

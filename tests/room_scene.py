@@ -6,10 +6,9 @@ import functools
 from pathlib import Path
 
 import numpy as np
-import yaml
-from PIL import Image
+from posed_writer import write_posed
 
-from semstab.datasets import open_dataset
+from semstab.datasets import Scene, open_dataset
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 
@@ -86,11 +85,10 @@ def _render(pose: bytes) -> tuple[np.ndarray, np.ndarray]:
     return hits.min(axis=0), hits.argmin(axis=0)
 
 
-class Room:
+class Room(Scene):
     """The scene in memory. What is told of poses, depth and camera may be mistaken; `noise` is relative, of depth."""
 
     name = "room"
-    up = None
 
     def __init__(
         self,
@@ -137,17 +135,9 @@ class Room:
 def write(folder: Path, room: Room | None = None, **settings) -> Path:
     """The scene as a posed_folder with float depth; `settings` are those of its scene.yaml."""
     room = room or Room()
-    for part in ("depth", "pose", "labels/net", "labels/gt"):
-        (folder / part).mkdir(parents=True)
-    np.savetxt(folder / "intrinsics.txt", room.camera.matrix, fmt="%.17g")
-    (folder / "scene.yaml").write_text(yaml.safe_dump({"classes": list(CLASSES)} | settings))
-    for i in range(len(room)):
-        net, truth = room.frame(i, "net"), room.frame(i, "gt")
-        np.save(folder / f"depth/{i:03d}.npy", net.depth)
-        np.savetxt(folder / f"pose/{i:03d}.txt", net.T_wc, fmt="%.17g")
-        for name, frame in (("net", net), ("gt", truth)):
-            Image.fromarray(frame.labels).save(folder / f"labels/{name}/{i:03d}.png")
-    return folder
+    sources = {name: [room.frame(i, name) for i in range(len(room))] for name in ("net", "gt")}
+    names = [f"{i:03d}" for i in range(len(room))]
+    return write_posed(folder, names, sources, scale=None, **{"classes": list(CLASSES)} | settings)
 
 
 def opened(folder: Path, **options):

@@ -31,7 +31,7 @@ def stored(pose="camera_to_world", axes="opencv"):
 
 
 def checked(room: Room, **options):
-    return quick_check(room, range(len(room)), "net", options)
+    return quick_check(room, range(len(room)), options)
 
 
 def quicker(settings_):
@@ -81,13 +81,13 @@ def test_a_mistake_is_named_with_the_line_that_mends_it(room, lines):
 def test_a_wrong_depth_scale_is_measured(tmp_path, scale):
     """What is stored are `scale` units a metre; scene.yaml says 1."""
     folder = write(tmp_path / "room", Room(told_depth=lambda z: z * scale))
-    verdict = quick_check(opened(folder), ALL, "net")
+    verdict = quick_check(opened(folder), ALL)
     assert verdict.state == "unsound"
     assert verdict.mend == (f"depth_scale: {scale:.5g}",)
     assert f"set it in {folder}/scene.yaml" in verdict.text
     times = f"{scale:.4g} times too long" if scale > 1 else f"{1 / scale:.4g} times too short"
-    assert f"depth is {times}, or the poses are not in metres" in verdict.text
-    assert quick_check(opened(folder, depth_scale=scale), ALL, "net").state == "sound"
+    assert f"depth is {times}, or metres_per_unit is " in verdict.text
+    assert quick_check(opened(folder, depth_scale=scale), ALL).state == "sound"
 
 
 @pytest.mark.parametrize("size", [(2, 2), (0.5, 0.5), (3, 3), (2, 1)])
@@ -107,23 +107,23 @@ def test_what_mends_it_mends_it(tmp_path):
     ):
         room = Room(walk(6), told_pose=stored(pose, axes), told_depth=lambda z, k=kind: z * RAY_LENGTH ** (k == "ray"))
         folder = write(tmp_path / f"room{k}", room)
-        verdict = quick_check(opened(folder), range(6), "net")
+        verdict = quick_check(opened(folder), range(6))
         assert verdict.state == ("sound" if k == 0 else "unsound")
         with (folder / "scene.yaml").open("a") as file:
             file.write("\n".join(verdict.mend) + "\n")
-        assert quick_check(opened(folder), range(6), "net").state == "sound"
+        assert quick_check(opened(folder), range(6)).state == "sound"
 
 
 @pytest.mark.parametrize("configured", [{"camera_axes": "opengl"}, {"camera_axes": "ned"}, {"depth_kind": "ray"}])
 def test_a_wrong_setting_of_a_right_scene_is_taken_back(tmp_path, configured):
     """Whatever is configured, alternatives are measured against what the files hold."""
     folder = write(tmp_path / "room", Room(walk(9)), **configured)
-    verdict = quick_check(opened(folder), range(9), "net")
+    verdict = quick_check(opened(folder), range(9))
     (name,) = configured
     assert verdict.mend == (f"{name}: {'planar' if name == 'depth_kind' else 'opencv'}",)
     # an option goes before scene.yaml, so the advice is the option
     over = {name: configured[name], "root": str(folder)}
-    verdict = quick_check(opened(folder, **{name: configured[name]}), range(9), "net", over)
+    verdict = quick_check(opened(folder, **{name: configured[name]}), range(9), over)
     assert verdict.mend == (f"dataset.options.{name}: {'planar' if name == 'depth_kind' else 'opencv'}",)
 
 
@@ -157,7 +157,7 @@ def test_a_wrong_option_of_any_dataset_is_taken_back(tmp_path, name):
         (None, None),
     ):
         scene = dataset_writers.opened(form, tmp_path / "data", **({option: wrong} if option else {}))
-        verdict = quick_check(scene, range(4), "net", scene.options.model_dump())
+        verdict = quick_check(scene, range(4), scene.options.model_dump())
         mend = () if option is None else (f"dataset.options.{option}: {getattr(right, option)}",)
         assert (verdict.state, verdict.mend) == ("unsound" if option else "sound", mend)
 
@@ -317,14 +317,14 @@ def test_unsound_data_are_refused_in_one_line():
     with pytest.raises(
         DataError, match=r"^room: depth reprojects with .* --trust-geometry fuses it as it is$"
     ) as caught:
-        require_sound(Room(told_pose=np.linalg.inv), ALL, "net")
+        require_sound(Room(told_pose=np.linalg.inv), ALL)
     assert "\n" not in str(caught.value)
-    assert require_sound(Room(), ALL, "net").state == "sound"
+    assert require_sound(Room(), ALL).state == "sound"
 
 
 def test_the_city_is_sound():
     scene = open_dataset("city", {"width": 96, "height": 54}).scene("scene1")
-    verdict = quick_check(scene, range(20), "sim-steady")
+    verdict = quick_check(scene, range(20))
     assert verdict.state == "sound"
     assert verdict.error < 0.003
 

@@ -141,11 +141,6 @@ def damage_pose_scale(wall: Path) -> str:
     return "pose/0001.txt: the rotation is not orthonormal"
 
 
-def damage_pose_nan(wall: Path) -> str:
-    np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
-    return "pose/0001.txt: the pose is not finite"
-
-
 def damage_image(wall: Path) -> str:
     path = wall / "depth/0001.png"
     path.write_bytes(path.read_bytes()[:40])
@@ -173,12 +168,18 @@ def damage_intrinsics(wall: Path) -> str:
     return "intrinsics.txt"
 
 
+def test_a_lost_pose_is_left_out_and_said(wall, tmp_path) -> None:
+    np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
+    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "wall: 1 of 3 selected frames have no pose (tracking was lost) and are left out: 1" in result.stderr
+
+
 @pytest.mark.parametrize(
     "damage",
     [
         damage_depth_size,
         damage_pose_scale,
-        damage_pose_nan,
         damage_image,
         damage_label_id,
         damage_missing_label,

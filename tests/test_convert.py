@@ -99,7 +99,7 @@ def test_a_folder_of_millimetres_stays_one(tmp_path):
     (converted,) = convert(of_folder(root), tmp_path / "out")
     assert converted.depth == "16-bit PNG, 1000 units a metre"
     source, scene = opened(root), opened(tmp_path / "out/wall")
-    assert (scene.settings.pose_convention, scene.settings.camera_axes) == ("camera_to_world", "opencv")
+    assert (scene.options.pose_convention, scene.options.camera_axes) == ("camera_to_world", "opencv")
     for backbone in ("a", "b", "gt"):
         assert_same_map(fused(scene, backbone, 0.025), fused(source, backbone, 0.025), 0.0)
 

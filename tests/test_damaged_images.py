@@ -27,9 +27,9 @@ from image_files import (
     written,
 )
 
-from semstab.datasets import arrays
-from semstab.datasets.codecs import PNG_SIGNATURE
-from semstab.datasets.images import read_color, read_depth, read_labels, read_scores
+from semstab.datasets.formats import arrays
+from semstab.datasets.formats.codecs import PNG_SIGNATURE
+from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
 from semstab.errors import DataError
 
 NOISE = np.random.default_rng(7).integers(0, 256, (24, 32, 3)).astype(np.uint8)

@@ -25,8 +25,8 @@ from image_files import (
     written,
 )
 
-from semstab.datasets import codecs
-from semstab.datasets.images import read_color, read_depth, read_labels, read_scores
+from semstab.datasets.formats import codecs
+from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
 from semstab.errors import ConfigError
 from semstab.labels import LabelSpace
 

@@ -15,7 +15,7 @@ import yaml
 import semstab
 from semstab import metrics
 from semstab.config import Config
-from semstab.datasets import disk
+from semstab.datasets.formats import disk
 from semstab.engine import Observer, load_result
 from semstab.engine.folder import Folder
 from semstab.errors import ConfigError, DataError

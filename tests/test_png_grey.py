@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from image_files import png_chunk, raw_png
 
-from semstab.datasets import png_grey
-from semstab.datasets.codecs import parse_png
+from semstab.datasets.formats import png_grey
+from semstab.datasets.formats.codecs import parse_png
 
 FILTERS = ("NONE", "SUB", "UP", "AVG", "PAETH")
 

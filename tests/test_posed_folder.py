@@ -10,8 +10,10 @@ import pytest
 from PIL import Image
 from posed_scene import H, W, fails, first_frame, opened, pose, save_image, write_scene
 
+from semstab.config import FrameSelection
 from semstab.datasets import open_dataset
-from semstab.datasets.disk import natural
+from semstab.datasets.formats.disk import natural
+from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError, DataError
 
 
@@ -68,7 +70,12 @@ def test_the_root_can_be_the_scene_and_the_current_folder(folder, monkeypatch):
 
 
 def test_a_root_without_a_scene_says_what_was_looked_for(tmp_path):
-    fails(DataError, re.escape(f"looked for {tmp_path}/depth and for {tmp_path}/*/depth"), opened, tmp_path)
+    fails(
+        DataError,
+        re.escape(f"{tmp_path}: no scene here, nor 3 folders deep; one holds depth/, pose/ and intrinsics.txt"),
+        opened,
+        tmp_path,
+    )
     fails(DataError, "nowhere: there is no such folder", opened, tmp_path / "nowhere")
 
 
@@ -107,7 +114,7 @@ def test_an_unknown_backbone_or_frame_is_named(folder):
 
 def test_two_backbones_of_one_name_are_refused(folder):
     (folder / "labels/net").rename(folder / "labels/net-scores")
-    fails(DataError, "labels/net-scores: .*scores/net is called 'net-scores' too; rename one", opened, folder)
+    fails(ConfigError, "two label sources are called 'net-scores'; rename one", opened, folder)
 
 
 def test_two_files_of_one_frame_are_refused(folder):
@@ -136,27 +143,32 @@ def test_labels_of_another_size_are_named(folder, shape):
 )
 def test_an_incomplete_frame_is_an_error_or_left_out(folder, missing, caplog):
     (folder / missing).unlink()
-    fails(DataError, f"1 missing: .*{re.escape(missing)}; add them, or set incomplete: skip", opened, folder)
+    scene, every = opened(folder), FrameSelection()
+    message = f"1 missing: .*{re.escape(missing)}; add them, or set incomplete: skip"
+    fails(DataError, message, select_frames, scene, every, scene.backbones)
+    scene = opened(folder, incomplete="skip")
     with caplog.at_level(logging.WARNING, logger="semstab"):
-        scene = opened(folder, incomplete="skip")
+        chosen = select_frames(scene, every, scene.backbones)
     assert missing in caplog.text
     assert "1 of 3 frames left out" in caplog.text
-    assert len(scene) == 2
+    assert (len(scene), chosen.indices, chosen.incomplete, chosen.left_out) == (3, [0, 2], (1,), 1)
     for backbone in scene.backbones:
-        files = [scene.frame(k, backbone).files["depth"] for k in (0, 1)]
+        files = [scene.frame(k, backbone).files["depth"] for k in chosen.indices]
         assert files == [f"{folder}/depth/frame1.png", f"{folder}/depth/frame10.png"]
-    assert scene.frame(1, "gt").index == 1
 
 
 def test_many_missing_files_are_counted(folder):
     for k in range(20):
         (folder / f"pose/extra{k}.txt").write_text("")
-    fails(DataError, r"60 missing: .*depth/extra0\.png, .*labels/net/extra0\.png.*\(55 more\)", opened, folder)
+    message = r"60 missing: .*depth/extra0\.png, .*labels/net/extra0\.png.*\(55 more\)"
+    fails(DataError, message, select_frames, opened(folder), FrameSelection(), ("net", "net-scores"))
 
 
 def test_a_scene_without_a_whole_frame_is_an_error(folder):
     (folder / "pose").rename(folder / "poses")
-    fails(DataError, "no frame has depth, pose and labels", opened, folder, incomplete="skip")
+    scene = opened(folder, incomplete="skip")
+    fails(DataError, "no selected frame has depth, pose and labels", select_frames, scene, FrameSelection(), ["net"])
+    fails(DataError, "no selected frame has depth and pose", select_frames, scene, FrameSelection())
 
 
 def test_ground_truth_may_be_sparse(folder):
@@ -185,8 +197,13 @@ def test_the_digest_follows_the_content(folder, tmp_path):
 @pytest.mark.parametrize("changed", ["depth/frame2.png", "pose/frame2.txt", "labels/net/frame2.png", "intrinsics.txt"])
 def test_the_digest_sees_a_changed_file(folder, changed):
     digest = opened(folder).digest([0, 1], "net")
-    with (folder / changed).open("ab") as file:
-        file.write(b" ")
+    content = (folder / changed).read_bytes()
+    if changed.endswith(".png"):
+        (folder / changed).write_bytes(content + b" ")
+    else:  # of text the numbers count
+        (folder / changed).write_bytes(content.replace(b"\n", b" \n"))
+        assert opened(folder).digest([0, 1], "net") == digest
+        (folder / changed).write_bytes(content.replace(b"5", b"6"))
     assert opened(folder).digest([0, 1], "net") != digest
 
 
@@ -214,7 +231,7 @@ def real(name):
 def reprojection_errors(scene, a, b):
     """Relative depth differences of frame a's valid pixels seen from frame b, where b has depth too."""
     depth_a, depth_b = scene.depth(a).astype(np.float64), scene.depth(b)
-    K_a, K_b = scene.intrinsics(depth_a.shape).matrix, scene.intrinsics(depth_b.shape).matrix
+    K_a, K_b = scene.intrinsics(a, depth_a.shape).matrix, scene.intrinsics(b, depth_b.shape).matrix
     v, u = np.nonzero(depth_a > 0)
     rays = np.linalg.inv(K_a) @ np.stack([u, v, np.ones_like(u)])
     T_ba = np.linalg.inv(scene.T_wc(b)) @ scene.T_wc(a)

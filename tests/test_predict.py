@@ -21,23 +21,17 @@ from PIL import Image
 from semstab.backbones import Prediction, create
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.datasets import open_dataset
-from semstab.datasets.images import read_labels
+from semstab.datasets.formats.images import read_labels
+from semstab.datasets.selection import select_frames
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.labels import LabelSpace
 from semstab.metrics import matched_region_flicker
-from semstab.predict import (
-    ImageFiles,
-    PredictionObserver,
-    PredictorConfig,
-    SequenceOptions,
-    load_predictor,
-    open_images,
-    parse_predictor,
-    predict_sequence,
-    predicted_config,
-)
 from semstab.predict.jobs import file_job, scene_jobs
+from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
+from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
+from semstab.predict.sources import ImageFiles
+from semstab.settings import predicted_config
 from semstab.warp import warp
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
@@ -50,8 +44,8 @@ def scene(tmp_path):
 
 
 def images_of(folder: Path, **options):
-    dataset = open_images(DatasetConfig(name="posed_folder", options={"root": str(folder), **options}))
-    return dataset.images(dataset.scenes[0])
+    dataset = open_dataset("posed_folder", {"root": str(folder), **options})
+    return dataset.scene(dataset.scenes[0])
 
 
 def clusters(**options):
@@ -113,14 +107,14 @@ def test_labels_lie_where_a_run_reads_them(scene):
 def test_scores_lie_beside_them(scene):
     report = predict(scene, scores=True, indices=[3])
     assert report.folders == (scene / "labels" / "clusters", scene / "scores" / "clusters")
-    opened = open_dataset("posed_folder", {"root": scene, "incomplete": "skip"}).scene("flight")
-    frame = opened.frame(0, "clusters-scores")
+    opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
+    frame = opened.frame(3, "clusters-scores")
     assert frame.scores.dtype == np.float16
     assert opened.label_space("clusters-scores") == opened.label_space("clusters")
     fitted = clusters().fit([predicted_scene.image(k) for k in range(2)])
     (expected,) = fitted.predict([predicted_scene.image(3)], scores=True)
     np.testing.assert_allclose(frame.scores, expected.scores, atol=1e-3)
-    np.testing.assert_array_equal(opened.frame(0, "clusters").labels, expected.labels)
+    np.testing.assert_array_equal(opened.frame(3, "clusters").labels, expected.labels)
 
 
 def test_scores_in_full_precision(scene):
@@ -301,8 +295,8 @@ def test_an_image_of_another_view_is_refused(scene):
 def test_frames_without_colour_are_named(scene):
     (scene / "color/003.png").unlink()
     with pytest.raises(DataError, match=r"1 missing: .*color/003.png; add them, or set incomplete: skip"):
-        images_of(scene)
-    assert len(images_of(scene, incomplete="skip")) == 5
+        select_frames(images_of(scene), FrameSelection(), color=True)
+    assert select_frames(images_of(scene, incomplete="skip"), FrameSelection(), color=True).indices == [0, 1, 2, 4, 5]
 
 
 def test_label_maps_that_are_incomplete_do_not_matter(scene):

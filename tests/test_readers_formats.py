@@ -19,6 +19,9 @@ from dataset_writers import (
     write_labels,
 )
 
+from semstab.config import FrameSelection
+from semstab.datasets.selection import select_frames
+
 
 @pytest.fixture(params=FORMATS)
 def form(request):
@@ -129,10 +132,11 @@ def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, written, caplog
     lost = folder / f"labels/net/{names[2]}.png"
     lost.unlink()
     with pytest.raises(ValueError, match=r"1 missing: .*add them, or set incomplete: skip") as caught:
-        opened(form, folder)
+        select_frames(opened(form, folder), FrameSelection(), ["net"])
     assert str(lost) in str(caught.value)
     scene = opened(form, folder, incomplete="skip")
-    assert (len(scene), scene.frame(1, "net").files["depth"]) == (COUNT - 1, depth)
+    assert select_frames(scene, FrameSelection(), ["net"]).indices == [0, 1, 3]
+    assert (len(scene), scene.frame(1, "net").files["depth"]) == (COUNT, depth)
     assert "1 of 4 frames left out" in caplog.text
 
 

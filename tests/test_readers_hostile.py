@@ -19,11 +19,11 @@ from posed_scene import fails
 from test_cli import bench, error_of
 
 from semstab.config import FrameSelection
-from semstab.datasets.colmap_depth import read_depth_map
-from semstab.datasets.colmap_model import read_model
+from semstab.datasets.formats.colmap_depth import read_depth_map
+from semstab.datasets.formats.colmap_model import read_model
+from semstab.datasets.formats.text_tables import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.selection import select_frames
-from semstab.datasets.text_tables import read_table, records
 from semstab.datasets.transforms_json import read_transforms
 from semstab.engine import run
 from semstab.errors import DataError, SemstabError
@@ -64,7 +64,7 @@ def promised(action) -> None:
 
 def read_all(form, folder) -> None:
     scene = opened(form, folder, intrinsics_size=None)
-    for index in select_frames(scene, FrameSelection()):
+    for index in select_frames(scene, FrameSelection()).indices:
         scene.frame(index, "net")
 
 
@@ -181,7 +181,7 @@ def test_a_pose_with_nan_is_lost_and_no_frame(tmp_path, name, caplog):
     lines = path.read_text().splitlines()
     write_lines(path, [lines[0].replace(lines[0].split()[0], "nan", 1), *lines[1:]])
     scene = opened(form, tmp_path)
-    assert select_frames(scene, FrameSelection()) == [1, 2, 3]
+    assert select_frames(scene, FrameSelection()).indices == [1, 2, 3]
     assert "1 of 4 selected frames have no pose" in caplog.text
     fails(DataError, "the pose is not finite", scene.frame, 0, "net")
 

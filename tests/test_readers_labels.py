@@ -12,10 +12,10 @@ from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
-from semstab.datasets.file_options import FileOptions
-from semstab.datasets.label_source import ScenePlace, find_sources
-from semstab.datasets.resampling import fit_labels, fit_scores
+from semstab.datasets.files.label_source import ScenePlace, find_sources
+from semstab.datasets.files.options import FileOptions
 from semstab.datasets.scannet import read_class_table
+from semstab.datasets.views.resampling import fit_labels, fit_scores
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Intrinsics
 
@@ -148,7 +148,13 @@ def test_a_scene_without_labels_has_depth_and_poses(scene):
     found = opened(FORM, root)
     assert (found.backbones, found.ground_truth, len(found)) == ((), False, COUNT)
     np.testing.assert_array_equal(found.depth(1), frames[1].depth)
-    fails(ConfigError, "backbone 'net' is not there; say where its label maps are", found.frame, 0, "net")
+    fails(
+        ConfigError,
+        "backbone 'net' is not there; put its label maps into labels/NAME/, or set option labels",
+        found.frame,
+        0,
+        "net",
+    )
 
 
 def test_ground_truth_may_be_sparse(tmp_path):
@@ -264,9 +270,8 @@ def test_labels_of_the_colour_camera_are_looked_up_with_its_intrinsics(tmp_path)
         assert 0.5 < seen.mean() < 1  # the colour camera sees less
         assert (found.labels == expected)[seen].mean() > 0.9  # but for the borders of classes
         assert not found.valid[~seen].any()
-    plain = opened(SCANNET, tmp_path, label_camera="depth").frame(0, "net")
-    assert (plain.labels != 255).all()
-    assert (plain.labels == expected).mean() < 0.8
+    plain = opened(SCANNET, tmp_path, label_camera="depth")
+    fails(DataError, "labels/net/0.png: labels are 192x120 but depth is 48x32, another view", plain.frame, 0, "net")
 
 
 def test_scores_that_the_colour_camera_does_not_have_are_not_used():

@@ -78,7 +78,7 @@ def test_options_override_scene_yaml(folder):
     raw = np.asarray(Image.open(folder / "depth/frame1.png"))
     np.testing.assert_array_equal(scene.depth(0), (raw / 2000).astype(np.float32))
     assert scene.up.tolist() == [0, -1, 0]
-    assert scene.settings.camera_axes == "opengl"
+    assert scene.options.camera_axes == "opengl"
     assert scene.label_space("net").name == "uavid7"
     assert opened(folder, classes=["x", "y"]).label_space("net").classes == ("x", "y")
 
@@ -106,7 +106,7 @@ def test_unknown_classes_matter_only_when_asked_for(folder):
     scene = opened(folder)
     assert scene.up is None
     assert scene.frame(0, "net").labels is not None
-    fails(DataError, r"scene\.yaml: the classes are not known; set 'classes", scene.label_space, "net")
+    fails(DataError, r"scene\.yaml: the classes of 'net' are not known; set classes", scene.label_space, "net")
 
 
 def test_labels_by_colour_go_through_the_taxonomy(folder):

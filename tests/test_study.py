@@ -16,7 +16,7 @@ from tiny_study import Counting, Interrupting, configure, summary
 
 import semstab
 from semstab.config import Config
-from semstab.datasets.posed_folder import PosedScene
+from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
 from semstab.engine.jobs import Job, Request, split
@@ -94,13 +94,13 @@ def test_a_point_at_the_base_settings_is_the_base_unit(root, tmp_path) -> None:
 
 def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, monkeypatch) -> None:
     decoded: list[tuple[int, str]] = []
-    frame = PosedScene.frame
+    frame = FileScene.frame
 
     def counted(self, index, backbone, *, color=True):
         decoded.append((index, backbone))
         return frame(self, index, backbone, color=color)
 
-    monkeypatch.setattr(PosedScene, "frame", counted)
+    monkeypatch.setattr(FileScene, "frame", counted)
     run_study(configure(root), tmp_path / "out")
     predicted = [pair for pair in decoded if pair[1] != "gt"]
     # a's ten frames for the sweep of frame_count, b's five
@@ -114,13 +114,13 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
 ) -> None:
     run_study(configure(root), tmp_path / "whole")
     decoded: list[int] = []
-    frame = PosedScene.frame
+    frame = FileScene.frame
 
     def counted(self, index, backbone, *, color=True):
         decoded.append(index)
         return frame(self, index, backbone, color=color)
 
-    monkeypatch.setattr(PosedScene, "frame", counted)
+    monkeypatch.setattr(FileScene, "frame", counted)
     grown = itertools.count(step=1_000_000)
     monkeypatch.setattr("semstab.engine.passes._resident_bytes", lambda: next(grown))
     run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
+from posed_writer import write_posed
+
+from semstab.frames import Frame, Intrinsics
 
 WIDTH, HEIGHT, FRAMES = 8, 6, 3
 FOCAL = 8.0
@@ -14,20 +16,19 @@ FOCAL = 8.0
 def write(root: Path, backbones: tuple[str, ...] = ("a", "b"), frames: int = FRAMES, noise: float = 0.25) -> Path:
     """Write a scene: a camera that looks along z at a wall 2 m away, moving 0.25 m (one pixel) to the right a frame."""
     rng = np.random.default_rng(7)
-    for folder in ("depth", "pose", "labels/gt", *(f"labels/{name}" for name in backbones)):
-        (root / folder).mkdir(parents=True, exist_ok=True)
-    np.savetxt(root / "intrinsics.txt", [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    (root / "scene.yaml").write_text("classes: [wall, door, window]\nup_axis: -y\n")
-    for i in range(frames):
-        name = f"{i:04d}"
-        columns = np.arange(WIDTH) + i  # the wall's own coordinate, in pixels
-        truth = np.tile((columns // 4 % 3).astype(np.uint8), (HEIGHT, 1))
-        cv2.imwrite(str(root / "depth" / f"{name}.png"), np.full((HEIGHT, WIDTH), 2000, np.uint16))
-        pose = np.eye(4)
-        pose[:3, 3] = [0.25 * i + 0.01, 0.01, 0.01]  # off the voxel faces
-        np.savetxt(root / "pose" / f"{name}.txt", pose)
-        cv2.imwrite(str(root / "labels/gt" / f"{name}.png"), truth)
+    truth = [np.tile(((np.arange(WIDTH) + i) // 4 % 3).astype(np.uint8), (HEIGHT, 1)) for i in range(frames)]
+    sources = {"gt": truth, **{name: [] for name in backbones}}
+    for labels in truth:
         for backbone in backbones:
-            wrong = rng.random(truth.shape) < noise
-            cv2.imwrite(str(root / f"labels/{backbone}" / f"{name}.png"), np.where(wrong, (truth + 1) % 3, truth))
-    return root
+            wrong = rng.random(labels.shape) < noise
+            sources[backbone].append(np.where(wrong, (labels + 1) % 3, labels).astype(np.uint8))
+    seen = {name: [frame(i, labels) for i, labels in enumerate(maps)] for name, maps in sources.items()}
+    names = [f"{i:04d}" for i in range(frames)]
+    return write_posed(root, names, seen, classes=["wall", "door", "window"], up_axis="-y")
+
+
+def frame(i: int, labels: np.ndarray) -> Frame:
+    T = np.eye(4)
+    T[:3, 3] = [0.25 * i + 0.01, 0.01, 0.01]  # off the voxel faces
+    camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    return Frame(i, np.full((HEIGHT, WIDTH), 2, np.float32), camera, T, labels=labels)

@@ -6,11 +6,12 @@ import dataclasses
 import functools
 from pathlib import Path
 
-import cv2
 import numpy as np
+from posed_writer import write_posed
 
 from semstab.config import Config
 from semstab.engine import run_study
+from semstab.frames import Frame, Intrinsics
 from semstab.plots import write_figures
 from semstab.records import Result
 
@@ -24,24 +25,21 @@ CLASSES = ["wall", "door_1", "window & <sill>", "ghost"]
 
 def write_wall(folder: Path, step: float) -> None:
     """A camera that looks along z at a wall 2.03 m away and moves to the right; blocks of 4 x 4 pixels err together."""
-    for part in ("depth", "pose", "color", "labels/gt", *(f"labels/{name}" for name in BACKBONES)):
-        (folder / part).mkdir(parents=True)
-    np.savetxt(folder / "intrinsics.txt", [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    (folder / "scene.yaml").write_text(f"classes: {CLASSES}\nup_axis: -y\n")
+    seen: dict[str, list[Frame]] = {"gt": [], **{backbone: [] for backbone in BACKBONES}}
+    camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    depth = np.full((HEIGHT, WIDTH), 2.03, np.float32)
     for i in range(FRAMES):
-        name = f"{i:04d}"
         columns = (np.arange(WIDTH) + i * step * FOCAL / 2.03).astype(int)
         truth = np.tile((columns // 24 % 3).astype(np.uint8), (HEIGHT, 1))
         pose = np.eye(4)
         pose[:3, 3] = [step * i + 0.003, 0.003, 0.0]
-        np.savetxt(folder / "pose" / f"{name}.txt", pose)
-        cv2.imwrite(str(folder / "depth" / f"{name}.png"), np.full((HEIGHT, WIDTH), 2030, np.uint16))
-        cv2.imwrite(str(folder / "color" / f"{name}.png"), np.repeat(truth[..., None] * 80, 3, axis=2))
-        cv2.imwrite(str(folder / "labels/gt" / f"{name}.png"), truth)
+        color = np.repeat(truth[..., None] * 80, 3, axis=2).astype(np.uint8)
+        seen["gt"].append(Frame(i, depth, camera, pose, labels=truth, color=color))
         for k, (backbone, share) in enumerate(BACKBONES.items()):
             wrong = np.random.default_rng([k, i]).random((HEIGHT // 4, WIDTH // 4)) < share
-            labels = np.where(np.kron(wrong, np.ones((4, 4), bool)), (truth + 1) % 3, truth)
-            cv2.imwrite(str(folder / f"labels/{backbone}" / f"{name}.png"), labels)
+            labels = np.where(np.kron(wrong, np.ones((4, 4), bool)), (truth + 1) % 3, truth).astype(np.uint8)
+            seen[backbone].append(Frame(i, depth, camera, pose, labels=labels, color=color))
+    write_posed(folder, [f"{i:04d}" for i in range(FRAMES)], seen, classes=CLASSES, up_axis="-y")
 
 
 @functools.cache

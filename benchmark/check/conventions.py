@@ -8,9 +8,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from semstab.datasets.file_scene import FileScene
-from semstab.datasets.posed_folder import PosedScene
-from semstab.datasets.scene_settings import CAMERA_AXES, SETTINGS_FILE
+from semstab.datasets import Scene
+from semstab.datasets.views.poses import CAMERA_AXES
 from semstab.frames import Frame
 
 Size = tuple[int, int]
@@ -153,22 +152,18 @@ class Reading:
 
 
 def reading(
-    scene: Any, frame: Frame, options: Mapping[str, Any], color_shape: tuple[int, ...] | None = None
+    scene: Scene, frame: Frame, options: Mapping[str, Any], color_shape: tuple[int, ...] | None = None
 ) -> Reading:
     """How a scene is configured. `frame` is one of its own; the shape (H, W, 3) of its colour suggests intrinsics."""
-    said = dict(options)
-    if isinstance(scene, PosedScene):
-        said |= scene.settings.model_dump()
-    elif isinstance(scene, FileScene):
-        said |= scene.options.model_dump()
+    said = {**options, **scene.settings}
     height, width = frame.shape
     return Reading(
         said={name: value for name, value in said.items() if value is not None},
         options=options,
         size=(width, height),
         ratios=tuple(_ratios(frame, color_shape)),
-        file=str(scene.folder / SETTINGS_FILE) if isinstance(scene, PosedScene) else None,
-        depth_scale=scene.depth_scale if isinstance(scene, PosedScene) else said.get("depth_scale"),
+        file=None if scene.settings_file is None else str(scene.settings_file),
+        depth_scale=scene.depth_scale or said.get("depth_scale"),
     )
 
 

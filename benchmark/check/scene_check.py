@@ -27,14 +27,11 @@ from semstab.check.reprojection import Sample
 from semstab.check.views import View, clusters, evenly, label_source, pairs_within, reader
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
-from semstab.datasets.file_scene import FileScene
-from semstab.datasets.posed_folder import PosedScene
-from semstab.datasets.selection import select_frames
-from semstab.errors import ConfigError, DataError
+from semstab.errors import DataError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
 from semstab.prefetch import prefetch
-from semstab.task import selected
+from semstab.task import frame_indices, selected
 
 SCHEMA = 1
 """Version of the file that --json writes."""
@@ -129,13 +126,11 @@ def check(config: Config) -> Iterator[SceneCheck]:
 
 def check_scene(scene: Scene, config: Config) -> SceneCheck:
     """Check one scene under the configuration's selection of frames, backbones, taxonomy, voxel size and stride."""
-    indices = select_frames(scene, config.frames)
-    if not indices:
-        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
     extra = (GROUND_TRUTH,) if scene.ground_truth else ()
     backbones = list(selected(config.backbones, scene.backbones, extra, "backbone", scene.name))
+    indices = frame_indices(scene, config, backbones)
     first = backbones[0] if backbones else label_source(scene)
-    look = Look(scene, indices, (first,), clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True)
+    look = Look(scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True)
     sample, how = look.sample(config.dataset.options), look.reading(config.dataset.options)
     verdict = judge(sample, how, thorough=True)
     checked = SceneCheck(
@@ -151,17 +146,14 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
     return checked if verdict.state == "unsound" else _with_coverage(checked, look, sample, config)
 
 
-def quick_check(
-    scene: Scene, indices: Sequence[int], backbone: str, options: Mapping[str, Any] | None = None
-) -> Verdict:
+def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
     """Do depth and poses of a scene agree? Reads four frames, and only before it calls them unsound some more.
 
     `options` are the dataset's, for the advice. A frame that cannot be read is passed over: whoever needs it says so.
     """
-    sources = _cheap_sources(scene, backbone)
     verdict = Verdict("unclear", "it takes two frames to tell whether depth and poses agree")
     for count in (1, CONFIRMING_CLUSTERS):
-        look = Look(scene, indices, sources, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
+        look = Look(scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
         if len(look.views) < 2:
             continue
         verdict = judge(look.sample(options or {}), look.reading(options or {}), thorough=False)
@@ -170,11 +162,9 @@ def quick_check(
     return verdict
 
 
-def require_sound(
-    scene: Scene, indices: Sequence[int], backbone: str, options: Mapping[str, Any] | None = None
-) -> Verdict:
+def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
     """The verdict of `quick_check`. Raises DataError where depth and poses contradict each other."""
-    verdict = quick_check(scene, indices, backbone, options)
+    verdict = quick_check(scene, indices, options)
     refuse_unsound(scene.name, verdict)
     return verdict
 
@@ -187,17 +177,10 @@ def refuse_unsound(scene: str, verdict: Verdict) -> None:
         )
 
 
-def _cheap_sources(scene: Scene, backbone: str) -> tuple[str | None, ...]:
-    """Label sources with which frames are read for their depth alone, the cheapest first; None reads no labels."""
-    if isinstance(scene, PosedScene | FileScene):
-        return (None,)
-    return (GROUND_TRUTH, backbone) if scene.ground_truth else (backbone,)
-
-
 class Look:
     """The frames of a scene that a check reads, thinned as they come in.
 
-    sources       label sources to read frames with, the next one where that fails; None reads no labels
+    source        label source to read frames with; None needs no labels
     groups        positions in `indices` of frames that are compared with each other
     points        about how many points are reprojected in all
     fused         number of frames, evenly spaced, that are kept for fusing, too
@@ -209,7 +192,7 @@ class Look:
         self,
         scene: Scene,
         indices: Sequence[int],
-        sources: Sequence[str | None],
+        source: str | None,
         groups: Sequence[Sequence[int]],
         points: int,
         *,
@@ -218,26 +201,26 @@ class Look:
         with_color: bool = False,
     ) -> None:
         self.scene = scene
-        self.tally = Tally(sources[0] or "")
+        self.tally = Tally(source or "")
         self.views: dict[int, View] = {}
         self.fused = evenly(len(indices), fused)
         self._first: Frame | None = None
         self._pairs = pairs_within(groups)
         self._compared = {position for group in groups for position in group}
         self._points = min(MOST_POINTS_A_VIEW, max(LEAST_POINTS_A_VIEW, points // max(1, len(self._pairs))))
-        self._labelled = sources[0] is not None
-        self._color_shape = _color_shape(scene, indices[0]) if with_color else None
-        self._read(indices, [reader(scene, source) for source in sources], passing_over)
+        self._labelled = source is not None
+        color = scene.color(indices[0]) if with_color else None
+        self._color_shape = None if color is None else color.shape
+        self._read(indices, reader(scene, source), passing_over)
 
-    def _read(self, indices: Sequence[int], readers: Sequence[Callable[[int], Frame]], passing_over: bool) -> None:
+    def _read(self, indices: Sequence[int], read: Callable[[int], Frame], passing_over: bool) -> None:
         def attempt(index: int) -> Frame | None:
-            for read in readers:
-                try:
-                    return read(index)
-                except DataError:
-                    if not passing_over:
-                        raise
-            return None
+            try:
+                return read(index)
+            except DataError:
+                if not passing_over:
+                    raise
+                return None
 
         positions = sorted(self._compared | set(self.fused))
         for position, fetched in zip(positions, prefetch(attempt, [indices[p] for p in positions]), strict=True):
@@ -264,12 +247,6 @@ class Look:
         depths = np.concatenate([view.depth[view.v, view.u] for view in self.views.values()])
         p5, p50, p95 = np.percentile(depths, (5, 50, 95)) if len(depths) else (np.nan,) * 3
         return Depth(float(np.mean(valid)), float(p5), float(p50), float(p95))
-
-
-def _color_shape(scene: Scene, index: int) -> tuple[int, ...] | None:
-    """(H, W, 3) of a frame's colour image, where it has one of its own size."""
-    color = scene.color(index) if isinstance(scene, PosedScene | FileScene) else None
-    return None if color is None else color.shape
 
 
 def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Config) -> SceneCheck:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,11 +12,8 @@ import numpy.typing as npt
 
 from semstab.check.conventions import Convention
 from semstab.datasets import GROUND_TRUTH, Scene
-from semstab.datasets.file_scene import FileScene
-from semstab.datasets.posed_folder import PosedScene
-from semstab.datasets.ray_depth import ray_lengths
-from semstab.datasets.scene_settings import CAMERA_AXES
-from semstab.errors import DataError
+from semstab.datasets.views.poses import CAMERA_AXES
+from semstab.datasets.views.ray_depth import ray_lengths
 from semstab.frames import Frame, Intrinsics
 
 MAX_PIXELS = 2**20
@@ -116,21 +112,7 @@ def label_source(scene: Scene) -> str | None:
 
 
 def reader(scene: Scene, backbone: str | None, *, color: bool = False) -> Callable[[int], Frame]:
-    """How a frame is read: with a backbone's labels, or where there are none, with all pixels class 0.
-
-    Raises DataError for a scene of a dataset that yields nothing without labels.
-    """
-    if backbone is not None:
-        return lambda index: scene.frame(index, backbone, color=color)
-    if not isinstance(scene, PosedScene | FileScene):
-        raise DataError(f"{scene.name}: there are no labels, and without any this dataset yields no depth")
-    return lambda index: _unlabelled(scene, index, color)
-
-
-def _unlabelled(scene: PosedScene | FileScene, index: int, color: bool) -> Frame:
-    depth = scene.depth(index)
-    labels = np.zeros(depth.shape, dtype=np.uint8)
-    if color:  # all that there is beside labels: the mask, too
-        return dataclasses.replace(scene.predicted(index, labels=labels), color=scene.color(index))
-    camera = scene.intrinsics(depth.shape) if isinstance(scene, PosedScene) else scene.intrinsics(index, depth.shape)
-    return Frame(index, depth, camera, scene.T_wc(index), labels=labels)
+    """How a frame is read: with a backbone's labels, or where there are none, with all pixels class 0."""
+    if backbone is None:
+        return lambda index: scene.geometry(index, color=color)
+    return lambda index: scene.frame(index, backbone, color=color)

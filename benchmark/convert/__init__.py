@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +13,13 @@ from semstab.check.views import evenly, reader
 from semstab.config import Config
 from semstab.convert.folder import SCORES_SUFFIX, DepthFormat, DepthFormatError, SceneFolder, depth_format
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
-from semstab.datasets.scene_files import LABEL_SPACE_FILE
-from semstab.datasets.scene_settings import UP_AXES
-from semstab.datasets.selection import select_frames
+from semstab.datasets.files.label_source import LABEL_SPACE_FILE
+from semstab.datasets.views.poses import UP_AXES
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame
 from semstab.prefetch import prefetch
 from semstab.results import slug
-from semstab.task import selected
+from semstab.task import frame_indices, selected
 
 __all__ = ["Converted", "convert", "convert_scene"]
 
@@ -69,11 +67,9 @@ def convert(
 
 def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Progress) -> Converted:
     """Write one scene; see `convert`."""
-    indices = select_frames(scene, config.frames)
-    if not indices:
-        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
     known = (*scene.backbones, *((GROUND_TRUTH,) if scene.ground_truth else ()))
     backbones = selected(config.backbones, known, (), "backbone", scene.name)
+    indices = frame_indices(scene, config, backbones)
     settings = {
         "dataset": config.dataset.model_dump(mode="json"),
         "scene": scene.name,
@@ -187,6 +183,6 @@ def _name(index: int) -> str:
     return f"{index:06d}"
 
 
-def _up_axis(scene: Any) -> str | None:
+def _up_axis(scene: Scene) -> str | None:
     """The name of the world's up axis, where it is one."""
     return next((name for name, axis in UP_AXES.items() if scene.up is not None and (scene.up == axis).all()), None)

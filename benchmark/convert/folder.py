@@ -15,10 +15,10 @@ import numpy.typing as npt
 import yaml
 
 from semstab.check.conventions import KNOWN_SCALES
-from semstab.datasets.images import MILLIMETRES
-from semstab.datasets.scene_files import LABEL_SPACE_FILE
-from semstab.datasets.scene_settings import SETTINGS_FILE
-from semstab.datasets.text_files import read_intrinsics
+from semstab.datasets.files.label_source import LABEL_SPACE_FILE
+from semstab.datasets.formats.images import MILLIMETRES
+from semstab.datasets.formats.text_files import read_intrinsics
+from semstab.datasets.posed_folder import SETTINGS_FILE
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path, read_json, write_json, write_text
 from semstab.frames import Frame, Intrinsics

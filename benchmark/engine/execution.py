@@ -205,7 +205,7 @@ def _checked(config: Config, missing: Sequence[Planned], told: Observers) -> dic
     tasks = {each.task.scene.name: each.task for each in reversed(missing) if isinstance(each, PlannedUnit)}
     for task in reversed(tasks.values()):
         with contextlib.suppress(DataError):
-            found[task.scene.name] = quick_check(task.scene, task.indices, task.backbone, config.dataset.options)
+            found[task.scene.name] = quick_check(task.scene, task.indices, config.dataset.options)
     for scene, verdict in found.items():
         refuse_unsound(scene, verdict)
         told.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.backends import FusionBackend
 from semstab.config import Config
 from semstab.datasets import Scene
-from semstab.datasets.disk import file_digest
+from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.jobs import Job, Outcome, shared_marker
 from semstab.engine.observer import Observers

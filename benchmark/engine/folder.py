@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from semstab.config import Config, read_yaml
-from semstab.datasets.disk import file_digest
+from semstab.datasets.formats.disk import file_digest
 from semstab.engine.jobs import Outcome, shared_marker
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import ConfigError, DataError

@@ -17,13 +17,16 @@ from semstab.records import UnitContent
 class Request:
     """A unit to compute, and what is wanted of it; see `semstab.engine.units.PlannedUnit`.
 
-    regions  whether it is the flicker of regions without classes, and nothing is fused
+    config    with its frames one by one: those of its sequence that all label sources of the plan have
+    left_out  how many selected frames lack a file or a pose
+    regions   whether it is the flicker of regions without classes, and nothing is fused
     """
 
     identity: str
     config: Config
     image_space: bool = False
     kept: bool = False
+    left_out: int = 0
     regions: bool = False
 
 

@@ -123,6 +123,7 @@ class Pass:
         """An empty map for a unit; none where it fails."""
         with self._failing([request]):
             (task,) = tasks_of(self._scene, request.config)
+            task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
             return [UnitMap(request, task, _new_map(request.config, task), truth)]
         return []

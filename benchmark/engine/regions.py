@@ -29,7 +29,7 @@ def measure_regions(job: Job, scene: Scene, request: Request) -> Outcome:
     rows = [_compared(previous, current) for previous, current in itertools.pairwise(frames)]
     flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
     found = RegionFlicker(job.scene, job.backbone, macro_mean(flicker), macro_mean(compensated), macro_mean(share))
-    digest = scene.digest(frame_indices(scene, request.config), job.backbone)
+    digest = scene.digest(frame_indices(scene, request.config, [job.backbone]), job.backbone)
     return Outcome(request.identity, UnitContent(digest, regions=found))
 
 
@@ -46,7 +46,7 @@ def _frames(job: Job, scene: Scene, request: Request) -> Iterator[Frame]:
             frame = perturb(frame, config.perturbation, job.scene)
         return frame.every(config.pixel_stride)
 
-    indices = frame_indices(scene, config)
+    indices = frame_indices(scene, config, [job.backbone])
     with contextlib.closing(prefetch(decode, indices, threads=job.threads, size=lambda frame: frame.nbytes)) as fetched:
         for each in fetched:
             yield each.item

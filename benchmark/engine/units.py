@@ -23,7 +23,7 @@ from semstab.config import (
     Perturbation,
     Sweeps,
 )
-from semstab.datasets import Regional, Scene, Tracked, open_dataset
+from semstab.datasets import Scene, open_dataset
 from semstab.engine.jobs import Request
 from semstab.errors import ConfigError
 from semstab.records import REGIONS, Variation
@@ -83,7 +83,9 @@ class PlannedUnit:
 
     def request(self) -> Request:
         """What a job is told of it."""
-        return Request(self.identity, self.config, self.image_space, self.kept)
+        frames = FrameSelection(list=tuple(self.task.indices))
+        config = self.config.model_copy(update={"frames": frames})
+        return Request(self.identity, config, self.image_space, self.kept, self.task.left_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +112,12 @@ class PlannedRegions:
     @property
     def frames(self) -> int:
         """How many are compared with the one before."""
-        return len(frame_indices(self.scene, self.config))
+        return len(frame_indices(self.scene, self.config, [self.backbone]))
 
     @property
     def digest(self) -> str:
         """A hash of its input."""
-        return self.scene.digest(frame_indices(self.scene, self.config), self.backbone)
+        return self.scene.digest(frame_indices(self.scene, self.config, [self.backbone]), self.backbone)
 
     def request(self) -> Request:
         """What a job is told of it."""
@@ -208,20 +210,22 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
 
 def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedRegions]:
     for name, scene in scenes.items():
-        regions = scene.regions if isinstance(scene, Regional) else ()
-        for backbone in selected(config.region_maps, scene.backbones, regions, "region map", name):
+        for backbone in selected(config.region_maps, scene.backbones, scene.regions, "region map", name):
             settings = _base_settings(config, name, [backbone])
-            unit, frames = [name, backbone], frame_indices(scene, settings)
+            unit, frames = [name, backbone], frame_indices(scene, settings, [backbone])
             fused_only = {"voxel_size", "strata", "statistics"}
             key = _hash(settings, {"regions": unit, "frames": frames}, fused_only)
             yield PlannedRegions(settings, scene, backbone, key)
 
 
 def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+    beside: dict[str, list[str]] = {}
+    for each in base:
+        beside.setdefault(each.unit.scene, []).append(each.unit.backbone)
     for variation, part, change in _variations(config):
         for each in _restricted(base, part, variation.sweep):
             varied = change(each.config)
-            (task,) = tasks_of(scenes[each.unit.scene], varied)
+            (task,) = tasks_of(scenes[each.unit.scene], varied, beside[each.unit.scene])
             _check_count(variation, task)
             kept = variation.sweep == BACKENDS
             yield PlannedUnit(variation, varied, task, identity(varied, task), image_space=False, kept=kept)
@@ -277,8 +281,8 @@ def _evenly_sampled(count: int, base: Config) -> Config:
 
 def _check_count(variation: Variation, task: Task) -> None:
     """Fewer frames than asked for would pass for another sampling density."""
-    tracked = isinstance(task.scene, Tracked)  # frames without a pose are left out, and said so
-    if variation.sweep == "frame_count" and len(task.indices) != variation.value and not tracked:
+    chosen = len(task.indices) + task.left_out  # what lacks a pose or a file is left out, and said so
+    if variation.sweep == "frame_count" and chosen != variation.value:
         raise ConfigError(
             f"sweeps.frame_count: {task.scene.name} has {len(task.indices)} frames over the extent of the base ones,"
             f" not {variation.value}; leave it out with 'scenes', or widen 'frames'"

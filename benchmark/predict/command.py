@@ -11,13 +11,12 @@ from typing import Any
 from pydantic import ValidationError
 from rich.console import Console
 
-from semstab.config import FrameSelection, explain
+from semstab.config import DatasetConfig, FrameSelection, explain
 from semstab.errors import ConfigError
 from semstab.predict.jobs import Job, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor
 from semstab.predict.sequence import SequenceOptions, SequenceReport, predict_sequence
 from semstab.predict.terminal import PredictionBar, print_report
-from semstab.settings import load_config, resolve
 
 
 def run(
@@ -25,7 +24,7 @@ def run(
     predictor: Mapping[str, Any],
     options: Mapping[str, Any],
     images: str | None,
-    dataset: Mapping[str, Any] | None,
+    dataset: DatasetConfig | None,
     scenes: list[str] | None,
     frames: Mapping[str, int],
     out: Path | None,
@@ -36,13 +35,12 @@ def run(
     """Predict what is selected. Raises ConfigError, DataError, MissingDependencyError; what was finished stays.
 
     predictor  settings of `PredictorConfig` without options
-    options    of the backbone; those below 'dataset' are the dataset's
+    options    of the backbone
+    dataset    resolved, where the images are those of scenes
     """
-    options = dict(options)
-    dataset_options = options.pop("dataset", {})
     config = _validated(PredictorConfig, {**predictor, "options": options}).resolved()
     selection = _validated(FrameSelection, frames)
-    jobs = _jobs(images, dataset, dataset_options, scenes, selection, out)
+    jobs = _jobs(images, dataset, scenes, selection, out)
     backbone = load_predictor(config)
     sequence_options = SequenceOptions(
         config.label_name, config.scores, batch=batch, overwrite=overwrite, command=sys.argv
@@ -56,39 +54,34 @@ def run(
         bar.close()
     for report in reports:
         print_report(report, Console(quiet=quiet))
-    if images is None and out is None and backbone.label_space is not None:
-        skip = any(len(job.indices) < len(job.sequence) for job in jobs)
-        hint = _next_command(config, {**(dataset or {}).get("options", {}), **dataset_options}, dataset or {}, skip)
-        Console(quiet=quiet).print(hint, soft_wrap=True, highlight=False)
+    if dataset is not None and out is None and backbone.label_space is not None:
+        hint = _next_command(config, dataset, selection)
+        Console(quiet=quiet).print(hint, soft_wrap=True, highlight=False, markup=False)
     return reports
 
 
-def _next_command(
-    predictor: PredictorConfig, options: Mapping[str, Any], dataset: Mapping[str, Any], skip: bool
-) -> str:
-    """What fuses the predictions; frames without one have to be left out."""
-    name = dataset["name"]
-    words = ["semstab-bench", *([] if name == "posed_folder" else ["--dataset", name])]
-    words += ["--data", str(options["root"])] if "root" in options else []
+def _next_command(predictor: PredictorConfig, dataset: DatasetConfig, frames: FrameSelection) -> str:
+    """What fuses the predictions: of the same frames, as the others have none."""
+    words = ["semstab-bench", *([] if dataset.name == "posed_folder" else ["--dataset", dataset.name])]
+    words += ["--data", str(dataset.options["root"])] if "root" in dataset.options else []
     words += ["--backbone", predictor.label_name]
-    words += ["--set", "dataset.options.incomplete=skip"] if skip else []
+    if frames != FrameSelection():
+        words += ["--frames", f"{frames.start or ''}:{frames.stop or ''}:{frames.stride}"]
     return f"fuse them: {shlex.join(words)}"
 
 
 def _jobs(
     images: str | None,
-    dataset: Mapping[str, Any] | None,
-    dataset_options: Any,
+    dataset: DatasetConfig | None,
     scenes: list[str] | None,
     frames: FrameSelection,
     out: Path | None,
 ) -> list[Job]:
-    if (images is None) == (dataset is None):
+    if images is None and dataset is not None:
+        return scene_jobs(dataset, scenes, frames, out)
+    if images is None or dataset is not None:
         raise ConfigError("say what to predict on: --images GLOB, or --data FOLDER, or --dataset NAME")
-    if images is not None:
-        return [file_job(images, frames, out)]
-    overrides = {"dataset": {**(dataset or {}), "options": {**(dataset or {}).get("options", {}), **dataset_options}}}
-    return scene_jobs(resolve(load_config(None, overrides)).dataset, scenes, frames, out)
+    return [file_job(images, frames, out)]
 
 
 def _validated(model: Any, content: Mapping[str, Any]) -> Any:

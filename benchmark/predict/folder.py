@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from semstab.datasets.images import LABEL_SUFFIXES, SCORE_SUFFIXES
-from semstab.datasets.scene_files import LABEL_SPACE_FILE
+from semstab.datasets.files.label_source import LABEL_SPACE_FILE
+from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path, read_json, write_json, write_text
 from semstab.labels import LabelSpace

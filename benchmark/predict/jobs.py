@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from semstab.config import DatasetConfig, FrameSelection
+from semstab.datasets import Scene, open_dataset
 from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError
-from semstab.predict.sources import ImageFiles, ImageSequence, SceneImages, chosen, open_images
+from semstab.predict.images import ImageSequence
+from semstab.predict.sources import ImageFiles, chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,13 +21,6 @@ class Job:
     sequence: ImageSequence
     indices: list[int]
     out: Path
-
-
-@runtime_checkable
-class InFolder(Protocol):
-    """A scene whose files lie in a folder, where its label maps are looked for."""
-
-    folder: Path
 
 
 def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
@@ -45,23 +39,21 @@ def scene_jobs(
     Raises ConfigError for a dataset without folders of its own where there is no `out`, and for a scene or frames that
     are not there.
     """
-    opened = open_images(dataset)
+    opened = open_dataset(dataset.name, dataset.options)
     names = chosen(scenes, opened.scenes, dataset.name)
     jobs = []
     for name in names:
-        images = opened.images(name)
-        indices = _some(select_frames(images.scene(), frames), images)
-        jobs.append(Job(images, indices, _place(images, out if out is None or len(names) == 1 else out / name)))
+        scene = opened.scene(name)
+        indices = _some(select_frames(scene, frames, color=True).indices, scene)
+        jobs.append(Job(scene, indices, _place(scene, out if out is None or len(names) == 1 else out / name)))
     return jobs
 
 
-def _place(images: SceneImages, out: Path | None) -> Path:
-    scene = images.scene()
-    if out is not None:
-        return out
-    if not isinstance(scene, InFolder):
-        raise ConfigError(f"{images.name}: has no folder of its own; say with --out where its predictions go")
-    return scene.folder
+def _place(scene: Scene, out: Path | None) -> Path:
+    place = out or scene.folder
+    if place is None:
+        raise ConfigError(f"{scene.name}: has no folder of its own; say with --out where its predictions go")
+    return place
 
 
 def _some(indices: list[int], sequence: ImageSequence) -> list[int]:

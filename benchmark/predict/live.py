@@ -7,7 +7,6 @@ import hashlib
 import json
 import threading
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,15 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field, field_validator
 
 from semstab.backbones import Backbone, Prediction
-from semstab.config import Config, DatasetConfig, Settings, merge, read_yaml
-from semstab.datasets import GROUND_TRUTH, Timed, Tracked
+from semstab.config import DatasetConfig, Settings
+from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset, resolved
+from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
+from semstab.predict.images import first_images
 from semstab.predict.predictor import PredictorConfig, load_predictor
-from semstab.predict.sources import ImageScene, open_images
-from semstab.settings import load_config, resolve
+from semstab.registry import Entry
 
 NAME = "predicted"
 
@@ -39,7 +39,7 @@ class PredictedOptions(Settings):
     @field_validator("dataset")
     @classmethod
     def _with_every_option(cls, value: DatasetConfig) -> DatasetConfig:
-        return resolve(Config(dataset=value)).dataset
+        return resolved(value)
 
     @field_validator("backbones")
     @classmethod
@@ -55,7 +55,7 @@ def source_name(predictor: PredictorConfig) -> str:
     return f"{predictor.label_name}-scores" if predictor.scores else predictor.label_name
 
 
-class PredictedDataset:
+class PredictedDataset(Dataset):
     """The scenes of another dataset with predicted labels; the ground truth stays what it is there.
 
     Models are loaded when their classes are first asked for, once for all scenes.
@@ -64,7 +64,7 @@ class PredictedDataset:
     Options: type[BaseModel] = PredictedOptions
 
     def __init__(self, options: PredictedOptions) -> None:
-        self._dataset = open_images(options.dataset)
+        self._dataset = open_dataset(options.dataset.name, options.dataset.options)
         self._configs = {source_name(predictor): predictor for predictor in options.backbones}
         self._loaded: dict[str, Backbone] = {}
         self._lock = threading.Lock()
@@ -76,7 +76,7 @@ class PredictedDataset:
 
     def scene(self, name: str) -> PredictedScene:
         """Open one; raises what the inner dataset raises."""
-        return PredictedScene(self._dataset.images(name), self)
+        return PredictedScene(self._dataset.scene(name), self)
 
     @property
     def predictors(self) -> Mapping[str, PredictorConfig]:
@@ -93,15 +93,18 @@ class PredictedDataset:
             return self._loaded[source]
 
 
-class PredictedScene:
-    """One scene; see `semstab.datasets.Scene`. One image is predicted at a time, whoever asks."""
+class PredictedScene(Scene):
+    """One scene of another dataset, with predicted labels. One image is predicted at a time, whoever asks."""
 
-    def __init__(self, images: ImageScene, dataset: PredictedDataset) -> None:
-        self.name = images.name
-        self.backbones: tuple[str, ...] = tuple(dataset.predictors)
-        self.ground_truth = images.ground_truth
-        self.up = images.up
-        self._images = images
+    def __init__(self, inner: Scene, dataset: PredictedDataset) -> None:
+        self.name = inner.name
+        self.backbones = tuple(dataset.predictors)
+        self.ground_truth = inner.ground_truth
+        self.up = inner.up
+        self.folder = inner.folder
+        self.settings_file = inner.settings_file
+        self.skips_incomplete = inner.skips_incomplete
+        self._inner = inner
         self._dataset = dataset
         self._fitted: dict[str, Backbone] = {}
         self._digests: dict[int, bytes] = {}
@@ -111,23 +114,53 @@ class PredictedScene:
 
     def __len__(self) -> int:
         """Number of frames."""
-        return len(self._images)
+        return len(self._inner)
 
     @property
     def timestamps(self) -> npt.NDArray[np.float64] | None:
         """The inner scene's, where it has any."""
-        scene = self._images.scene()
-        return scene.timestamps if isinstance(scene, Timed) else None
+        return self._inner.timestamps
 
     def tracked(self, index: int) -> bool:
         """Whether the frame has a pose."""
-        scene = self._images.scene()
-        return scene.tracked(index) if isinstance(scene, Tracked) else True
+        return self._inner.tracked(index)
+
+    def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
+        """Files that the frame lacks; it needs its colour where a model is among the sources."""
+        predicted = any(source in self.backbones for source in sources)
+        stored = [source for source in sources if source == GROUND_TRUTH]
+        return self._inner.missing(index, stored, color=color or predicted)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """By which conventions its files are read, by name of option."""
+        return self._inner.settings
+
+    @property
+    def depth_scale(self) -> float | None:
+        """Units of stored depth in a metre."""
+        return self._inner.depth_scale
+
+    def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
+        """The frame with what was predicted on its image."""
+        return self._inner.predicted(index, labels=labels, scores=scores)
+
+    def geometry(self, index: int, *, color: bool = False) -> Frame:
+        """The frame but for its labels; nothing is predicted for it."""
+        return self._inner.geometry(index, color=color)
+
+    def color(self, index: int) -> npt.NDArray[np.uint8] | None:
+        """Colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        return self._inner.color(index)
+
+    def image_name(self, index: int) -> str:
+        """What the frame's files are called."""
+        return self._inner.image_name(index)
 
     def label_space(self, backbone: str) -> LabelSpace:
         """The classes that the model predicts. Raises ConfigError for a model without classes."""
         if backbone == GROUND_TRUTH:
-            space: LabelSpace | None = self._images.scene().label_space(GROUND_TRUTH)
+            space: LabelSpace | None = self._inner.label_space(GROUND_TRUTH)
         else:
             space = self._dataset.model(backbone).label_space
         if space is None:
@@ -137,11 +170,11 @@ class PredictedScene:
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
         """The frame with what the model says about its image. Raises what the inner scene and the model raise."""
         if backbone == GROUND_TRUTH:
-            return self._images.scene().frame(index, backbone, color=color)
-        image = self._images.image(index)
+            return self._inner.frame(index, backbone, color=color)
+        image = self._inner.image(index)
         prediction = self._predict(index, backbone, image)
         soft = prediction.scores is not None
-        frame = self._images.predicted(
+        frame = self._inner.predicted(
             index, **({"scores": prediction.scores} if soft else {"labels": prediction.labels})
         )
         self._digests[index] = _digest(image, frame)
@@ -150,16 +183,16 @@ class PredictedScene:
     def digest(self, indices: list[int], backbone: str) -> str:
         """A hash of the model, its settings, and the image, depth and pose of those frames."""
         if backbone == GROUND_TRUTH:
-            return self._images.scene().digest(indices, backbone)
+            return self._inner.digest(indices, backbone)
         with self._lock:
             identity = self._model(backbone).identity()
         scores = self._dataset.predictors[backbone].scores
         digest = hashlib.blake2b(json.dumps([identity, scores], sort_keys=True).encode(), digest_size=16)
         for index in indices:
             if index not in self._digests:
-                image = self._images.image(index)
+                image = self._inner.image(index)
                 nothing = np.full(image.shape[:2], 255, dtype=np.uint8)
-                self._digests[index] = _digest(image, self._images.predicted(index, labels=nothing))
+                self._digests[index] = _digest(image, self._inner.predicted(index, labels=nothing))
             digest.update(self._digests[index])
         return digest.hexdigest()
 
@@ -180,26 +213,8 @@ class PredictedScene:
         """The model, fitted to this sequence's first images."""
         if backbone not in self._fitted:
             model = self._dataset.model(backbone)
-            first = range(min(model.fit_frames, len(self)))
-            self._fitted[backbone] = model.fit([self._images.image(k) for k in first])
+            self._fitted[backbone] = model.fit(first_images(self._inner, model.fit_frames))
         return self._fitted[backbone]
-
-
-def predicted_config(
-    predictors: Sequence[PredictorConfig], path: str | Path | None, overrides: Mapping[str, Any]
-) -> Config:
-    """The configuration of a file with overrides on top, its dataset's labels replaced by predictions.
-
-    Without a list of backbones in `overrides` all predictors are used.
-    """
-    content = merge(read_yaml(path) if path is not None else {}, overrides)
-    inner = content.pop("dataset", {"name": "city"})
-    content["backbones"] = overrides.get("backbones")
-    content["dataset"] = {
-        "name": NAME,
-        "options": {"dataset": inner, "backbones": [predictor.model_dump(mode="json") for predictor in predictors]},
-    }
-    return load_config(None, content)
 
 
 def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
@@ -208,3 +223,12 @@ def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
     for array in (image, frame.depth, frame.T_wc):
         digest.update(np.ascontiguousarray(array).data)
     return digest.digest()
+
+
+REGISTRY.register(
+    NAME,
+    Entry(
+        "semstab.predict.live:PredictedDataset",
+        "another dataset with labels that models make while it is fused: `run --predict`",
+    ),
+)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-from semstab.datasets.images import read_labels
+from semstab.datasets.formats.images import read_labels
 from semstab.files import write_text
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
-from semstab.predict.sources import ImageSequence, SceneImages
+from semstab.predict.images import ImageSequence
 from semstab.warp import warp
 
 COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))
@@ -62,8 +62,8 @@ def region_series(sequence: ImageSequence, indices: Sequence[int], file: Callabl
         if previous.shape != current.shape:
             continue
         plain.append(matched_region_flicker(previous, current))
-        if isinstance(sequence, SceneImages):
-            source, target = sequence.predicted(a, labels=previous), sequence.predicted(b, labels=current)
+        source, target = sequence.predicted(a, labels=previous), sequence.predicted(b, labels=current)
+        if source is not None and target is not None:
             brought, visible = warp(source.predicted, source, target)
             compensated.append(matched_region_flicker(brought, target.predicted, visible))
     return RegionSeries(names, tuple(plain), tuple(compensated))

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backbones import Backbone, Prediction
-from semstab.datasets.same_view import fitted
+from semstab.datasets.views.same_view import fitted
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType
+from semstab.predict.images import Image, ImageSequence, first_images
 from semstab.predict.region_series import RegionSeries, region_series
-from semstab.predict.sources import Image, ImageSequence, SceneImages
 from semstab.prefetch import prefetch
 
 REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers", "onnxruntime")
@@ -105,7 +105,7 @@ def predict_sequence(
     for observer in observers:
         observer.sequence_started(sequence.name, len(indices))
     started = time.perf_counter()
-    backbone = backbone.fit([sequence.image(k) for k in range(min(backbone.fit_frames, len(sequence)))])
+    backbone = backbone.fit(first_images(sequence, backbone.fit_frames))
     work = _Work(sequence, backbone, out, options, observers)
     with contextlib.closing(work):
         for fetched in prefetch(work.picture, indices, threads=options.threads, size=lambda p: p.pixels.nbytes):
@@ -200,14 +200,11 @@ def image_digest(pixels: npt.NDArray[np.uint8]) -> str:
 
 def _placed(sequence: ImageSequence, picture: _Picture, prediction: Prediction) -> Prediction:
     """The prediction at the pixels that the scene's label files have."""
-    if not isinstance(sequence, SceneImages) or not sequence.labels_like_depth:
+    frame = sequence.predicted(picture.index, labels=prediction.labels) if sequence.labels_like_depth else None
+    if frame is None:
         return prediction
-    labels = sequence.predicted(picture.index, labels=prediction.labels).labels
-    assert labels is not None
-    scores = prediction.scores
-    if scores is not None and scores.shape[:2] != labels.shape:
-        _, scores = fitted(None, scores, labels.shape, picture.name)
-    return Prediction(labels, scores)
+    assert frame.labels is not None
+    return Prediction(frame.labels, fitted(None, prediction.scores, frame.shape, picture.name)[1])
 
 
 def _folders(backbone: Backbone, out: Path, options: SequenceOptions) -> list[PredictionFolder]:

@@ -17,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
-from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.city.classes import uavid8
 from semstab.datasets.city.flight import FLIGHTS
 from semstab.datasets.city.options import CityOptions, SimulatedBackbone
 from semstab.datasets.city.rendering import Caster, Rendered, render
 from semstab.datasets.city.simulation import Simulation, View
 from semstab.datasets.city.world import World, build_world
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
@@ -34,7 +34,7 @@ GENERATOR_VERSION = 1
 """Part of every digest: raise it with any change of the towns, the flights, the rendering or the error model."""
 
 
-class City:
+class City(Dataset):
     """The dataset. It keeps the scene that was opened last, so that its backbones share what is rendered."""
 
     Options: type[BaseModel] = CityOptions
@@ -57,15 +57,15 @@ class City:
         return self._last
 
 
-class CityScene:
+class CityScene(Scene):
     """One flight over one town; see `semstab.datasets.Scene`."""
 
-    ground_truth: bool = True
+    ground_truth = True
 
     def __init__(self, name: str, options: CityOptions) -> None:
         self.name = name
-        self.backbones: tuple[str, ...] = tuple(options.backbones)
-        self.up: npt.NDArray[np.float64] | None = np.array([0.0, 0.0, 1.0])
+        self.backbones = tuple(options.backbones)
+        self.up = np.array([0.0, 0.0, 1.0])
         self._options = options
         self._flight = FLIGHTS[name]
         self._origin = np.array(options.origin, dtype=np.float64)
@@ -81,7 +81,7 @@ class CityScene:
         return np.array([self._share(index) * self._flight.seconds for index in range(len(self))])
 
     @property
-    def intrinsics(self) -> Intrinsics:
+    def camera(self) -> Intrinsics:
         """Of every frame: square pixels, the optical axis in the middle of the image."""
         W, H = self._options.width, self._options.height
         f = W / (2 * np.tan(np.deg2rad(self._options.field_of_view) / 2))
@@ -105,14 +105,14 @@ class CityScene:
         labels: npt.NDArray[np.uint8] | None = rendered.classes
         scores = None
         if model is not None:
-            view = View(index, rendered, self.intrinsics, T_wc, self._origin)
+            view = View(index, rendered, self.camera, T_wc, self._origin)
             simulation = Simulation(model, self._options.seed, backbone, self.name)
             labels, scores = (None, simulation.scores(view)) if model.softness else (simulation.labels(view), None)
         where = f"city/{self.name}/frame {index}"
         return Frame(
             index=index,
             depth=rendered.depth,
-            intrinsics=self.intrinsics,
+            intrinsics=self.camera,
             T_wc=T_wc,
             labels=labels,
             scores=scores,
@@ -169,7 +169,7 @@ class CityScene:
                 return self._rendered[index]
             moving = Caster(self._world.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
-            rendered = render(self._still, moving, T, self.intrinsics, size)
+            rendered = render(self._still, moving, T, self.camera, size)
             kept = sum(other.nbytes for other in self._rendered.values())
             if kept + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
                 self._rendered[index] = rendered

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from semstab.datasets import GROUND_TRUTH
-from semstab.datasets.file_options import FileOptions
-from semstab.datasets.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
-from semstab.datasets.scene_files import LABEL_SPACE_FILE
-from semstab.datasets.templates import Folders, Template, inside, matching_folders
-from semstab.errors import ConfigError
+from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.templates import Folders, Template, inside, matching_folders
+from semstab.datasets.formats.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
+from semstab.errors import ConfigError, DataError
 from semstab.labels import LabelSpace
 
 logger = logging.getLogger("semstab")
@@ -22,6 +21,9 @@ Kind = Literal["labels", "scores"]
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES}
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
 REGIONS = "regions/{backbone}/{name}"
+LABEL_SPACE_FILE = "label_space.yaml"
+"""In a folder of label maps or scores: their classes, where they are not the scene's; a taxonomy file."""
+
 SEPARATE = "{scene}/{backbone}/{name}"
 """The template of label maps in a folder of their own."""
 
@@ -82,8 +84,13 @@ def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) 
     return found
 
 
-def find_regions(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> dict[str, LabelSource]:
-    """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none."""
+def find_regions(
+    options: FileOptions, place: ScenePlace, names: Sequence[str], sources: Collection[str]
+) -> dict[str, LabelSource]:
+    """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none.
+
+    Raises DataError where the name is one of `sources`, too.
+    """
     folders = Folders()
     base = place.folder if options.labels_root is None else options.labels_root
     template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
@@ -91,6 +98,8 @@ def find_regions(options: FileOptions, place: ScenePlace, names: Sequence[str]) 
         backbone: _source("labels", base, filled, names, folders)
         for backbone, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
     }
+    if both := next((name for name in found if name in sources), None):
+        raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
     return {backbone: source for backbone, source in found.items() if source.files}
 
 
@@ -128,18 +137,19 @@ def _source(kind: Kind, base: Path, template: str, names: Iterable[str], folders
     return LabelSource(kind, expected, {name: path for name, path in found if path is not None})
 
 
-def label_spaces(options: FileOptions, sources: Mapping[str, LabelSource]) -> dict[str, LabelSpace | None]:
-    """The label space of each source: that of option taxonomies, else of a label_space.yaml beside its maps, else that
-    of all; None where nothing says it. Raises ConfigError for one that cannot be used.
+def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:
+    """That of option taxonomies, else of a label_space.yaml beside its maps, else that of the scene in `folder`.
+
+    None where nothing says it. Raises ConfigError for one that cannot be used.
     """
-    shared: LabelSpace | None = None
-    if options.classes is not None:
-        shared = LabelSpace(name="classes of the dataset", classes=options.classes)
-    elif options.taxonomy is not None:
-        shared = LabelSpace.load(options.taxonomy)
-    spaces = {}
-    for name, source in sources.items():
-        beside = next(iter(source.files.values())).parent / LABEL_SPACE_FILE
-        own = options.taxonomies.get(name, beside if beside.is_file() else None)
-        spaces[name] = shared if own is None else LabelSpace.load(own)
-    return spaces
+    beside = next(iter(source.files.values())).parent / LABEL_SPACE_FILE
+    if name in options.taxonomies:
+        return LabelSpace.load(options.taxonomies[name])
+    if beside.is_file():
+        return LabelSpace.load(beside)
+    try:
+        if options.classes is not None:
+            return LabelSpace(name="classes of the scene", classes=options.classes)
+        return None if options.taxonomy is None else LabelSpace.load(options.taxonomy)
+    except ConfigError as error:
+        raise ConfigError(f"{folder}: {error}") from error

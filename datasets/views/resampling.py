@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.images import Labels
 from semstab.frames import Intrinsics
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+
+Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Scores = npt.NDArray[np.floating[Any]]
 
 TIE = 1e-6
 """Pixels by which a position between two pixels is moved on, so that ties do not depend on rounding."""
@@ -32,9 +34,7 @@ def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[
     return fitted
 
 
-def fit_scores(
-    scores: npt.NDArray[np.floating[Any]], K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]
-) -> npt.NDArray[np.floating[Any]]:
+def fit_scores(scores: Scores, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Scores:
     """Scores (H', W', K) as a camera with K_depth and an image (H, W) sees them: linear between pixel centres.
 
     Beyond the outer centres the outer pixels hold. Pixels that K does not see get scores of 0, which no one uses.

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from semstab.datasets.cameras import Camera
-from semstab.datasets.disk import AGAIN, natural
-from semstab.datasets.poses import Poses, from_quaternions
-from semstab.datasets.text_tables import to_number
+from semstab.datasets.formats.disk import AGAIN, natural
+from semstab.datasets.formats.text_tables import to_number
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.poses import Poses, from_quaternions
 from semstab.errors import DataError
 from semstab.frames import Intrinsics
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from semstab.datasets.disk import read_bytes
-from semstab.datasets.poses import Poses
+from semstab.datasets.formats.disk import read_bytes
+from semstab.datasets.views.poses import Poses
 from semstab.errors import DataError, one_line
 
 MAX_JSON_BYTES = 2**28

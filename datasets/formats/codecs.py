@@ -22,8 +22,8 @@ import deflate  # its checksums take a twentieth of zlib's time
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets import png_grey
-from semstab.datasets.disk import AGAIN
+from semstab.datasets.formats import png_grey
+from semstab.datasets.formats.disk import AGAIN
 from semstab.errors import DataError, one_line
 
 MAX_PIXELS = 2**28

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.disk import read_bytes
+from semstab.datasets.formats.disk import read_bytes
 from semstab.errors import DataError, one_line
 from semstab.frames import Intrinsics
 

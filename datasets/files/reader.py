@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -11,11 +11,12 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.disk import natural, subfolders
-from semstab.datasets.file_options import FileOptions
-from semstab.datasets.file_scene import FileScene, FrameSource
-from semstab.datasets.label_source import ScenePlace
-from semstab.datasets.scene_files import nearest
+from semstab.datasets.files.label_source import ScenePlace
+from semstab.datasets.files.messages import nearest
+from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.scene import FileScene, FrameSource
+from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.scene import Dataset
 from semstab.errors import ConfigError, DataError
 
 DEEPEST = 3
@@ -25,14 +26,19 @@ DEEPEST = 3
 Options = TypeVar("Options", bound=FileOptions)
 
 
-class FileDataset(ABC, Generic[Options]):
+class FileDataset(Dataset, Generic[Options]):
     """Scenes of files below a root. A reader says what a scene's folder looks like, and lists its frames.
 
     Raises DataError where there is no scene.
+
+    looks_like         what a scene's folder holds, as errors say it
+    labels_like_depth  whether label maps that are made for it have the depth's pixels, not those of the images
+    settings_file      name of a file in a scene's folder that says what no option says, which `settled` reads
     """
 
     looks_like: str
-    """What a scene's folder holds, as errors say it."""
+    labels_like_depth = False
+    settings_file: str | None = None
 
     def __init__(self, options: Options) -> None:
         self.options = options
@@ -46,20 +52,21 @@ class FileDataset(ABC, Generic[Options]):
 
     def scene(self, name: str) -> FileScene:
         """Open one. Raises ConfigError for a name that is not there, and what `FileScene` raises."""
-        return self._open(name, self.options)
-
-    def images(self, name: str) -> FileScene:
-        """Open one for prediction, whatever label maps there are or lack."""
-        return self._open(name, self.options.model_copy(update={"labels": {}, "scores": {}}))
-
-    def _open(self, name: str, options: Options) -> FileScene:
         if name not in self._places:
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self._places)}")
         place = self._places[name]
+        options = self.settled(place.folder)
         frames = self.frames(place.folder)
         if not frames:
             raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
-        return FileScene(place, frames, options, self.class_ids())
+        scene = FileScene(place, frames, options, self.class_ids())
+        scene.labels_like_depth = self.labels_like_depth
+        scene.settings_file = None if self.settings_file is None else place.folder / self.settings_file
+        return scene
+
+    def settled(self, folder: Path) -> FileOptions:
+        """The options with which a scene's folder is read."""
+        return self.options
 
     def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
         """By label source, a table (65536,) from the ids of its files to those of its taxonomy, where they differ."""

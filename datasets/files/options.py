@@ -14,6 +14,13 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Id = Annotated[int, Field(ge=0, le=65535)]
 
+Taxonomy = Annotated[str | None, Field(description="taxonomy of the label maps: a name or a YAML file")]
+ScoresLayout = Annotated[Literal["KHW", "HWK"] | None, Field(description="axes of score arrays")]
+DepthKind = Annotated[
+    Literal["planar", "ray"] | None,
+    Field(description="depth is measured along the optical axis, or along the ray of the pixel"),
+]
+MetresPerUnit = Annotated[Positive | None, Field(description="metres in a unit of the poses")]
 DepthScale = Annotated[Positive | None, Field(description="units of the depth files in a metre")]
 InvalidDepth = Annotated[tuple[Finite, ...], Field(description="stored values that mean 'no depth', besides 0")]
 MaxDepth = Annotated[Positive | None, Field(description="metres from which depth is not valid, the sky for example")]
@@ -49,21 +56,13 @@ def zero_is_void() -> dict[str, tuple[int, ...]]:
     return {GROUND_TRUTH: (0,)}
 
 
-class FileOptions(Settings):
-    """What can be said of any dataset of files; a reader replaces the defaults that its format fixes.
+class FileSettings(Settings):
+    """How files are read; a reader replaces the defaults that its format fixes.
 
     Templates hold {scene} (the scene's folder below root), {backbone} and {name} (the frame's name); without a suffix
     they find any that can be read.
     """
 
-    root: Path = Field(description="a scene's folder, or the folder above scenes")
-    incomplete: Literal["error", "skip"] = Field(
-        "error", description="a frame without depth, pose or labels is an error, or is left out with a warning"
-    )
-
-    labels_root: Path | None = Field(
-        None, description="folder of label maps and scores; the scene's own where not given"
-    )
     labels: str | dict[str, str] | None = Field(
         None,
         description="template of label maps: labels/{backbone}/{name}, or in a labels_root {scene}/{backbone}/{name};"
@@ -72,9 +71,9 @@ class FileOptions(Settings):
     scores: str | dict[str, str] | None = Field(
         None, description="the same of soft scores: scores/{backbone}/{name}; none in a labels_root unless given"
     )
-    scores_layout: Literal["KHW", "HWK"] = Field("KHW", description="axes of score arrays")
+    scores_layout: ScoresLayout = "KHW"
     ground_truth: GroundTruth = None
-    taxonomy: str | None = Field(None, description="taxonomy of the label maps: a name or a YAML file")
+    taxonomy: Taxonomy = None
     classes: tuple[str, ...] | None = Field(None, description="class names in id order, instead of a taxonomy")
     taxonomies: dict[str, str] = Field(
         default_factory=dict, description="taxonomies of single label sources; gt is the ground truth"
@@ -85,16 +84,14 @@ class FileOptions(Settings):
     )
 
     depth_scale: DepthScale = None
-    depth_kind: Literal["planar", "ray"] = Field(
-        "planar", description="depth is measured along the optical axis, or along the ray of the pixel"
-    )
+    depth_kind: DepthKind = "planar"
     invalid_depth: InvalidDepth = ()
     max_depth: MaxDepth = None
 
     pose_convention: PoseConvention = "camera_to_world"
     camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = None
-    metres_per_unit: Positive = Field(1.0, description="metres in a unit of the poses")
+    metres_per_unit: MetresPerUnit = 1.0
 
     intrinsics_size: Size = None
     pixel_centre: PixelCentre = 0
@@ -107,3 +104,15 @@ class FileOptions(Settings):
         if self.classes is not None and self.taxonomy is not None:
             raise ValueError("give classes or taxonomy, not both")
         return self
+
+
+class FileOptions(FileSettings):
+    """What can be said of any dataset of files: where they are, and how they are read."""
+
+    root: Path = Field(description="a scene's folder, or the folder above scenes")
+    incomplete: Literal["error", "skip"] = Field(
+        "error", description="a selected frame without depth, pose or labels is an error, or is left out and counted"
+    )
+    labels_root: Path | None = Field(
+        None, description="folder of label maps and scores; the scene's own where not given"
+    )

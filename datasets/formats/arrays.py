@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.disk import AGAIN
+from semstab.datasets.formats.disk import AGAIN
 from semstab.errors import DataError, one_line
 
 MAX_ARRAY_BYTES = 2**32

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from semstab.datasets.disk import natural, subfolders
+from semstab.datasets.formats.disk import natural, subfolders
 from semstab.errors import ConfigError, DataError
 
 LONGEST = 400

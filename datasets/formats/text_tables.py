@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.disk import read_bytes
+from semstab.datasets.formats.disk import read_bytes
 from semstab.errors import DataError
 
 MAX_TABLE_BYTES = 2**28

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.scene_settings import CAMERA_AXES
 from semstab.errors import DataError
 
 Poses = npt.NDArray[np.float64]
+
+CAMERA_AXES: Mapping[str, Poses] = {
+    "opencv": np.eye(3),
+    "opengl": np.diag([1.0, -1.0, -1.0]),
+    "ned": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+}
+"""From OpenCV camera axes (x right, y down, z forward) to the named ones: opengl has x right, y up, z backward;
+ned has x forward, y right, z down, as TartanAir."""
+
+UP_AXES: Mapping[str, tuple[float, float, float]] = {
+    "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
+}  # fmt: skip
 
 UNIT_TOLERANCE = 0.01
 LARGEST = 1e9

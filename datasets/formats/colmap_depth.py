@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.codecs import MAX_PIXELS
-from semstab.datasets.disk import AGAIN, read_bytes
-from semstab.datasets.images import Read
+from semstab.datasets.formats.codecs import MAX_PIXELS
+from semstab.datasets.formats.disk import AGAIN, read_bytes
+from semstab.datasets.formats.images import Read
 from semstab.errors import DataError
 
 HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")

@@ -10,9 +10,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.arrays import decode_array
-from semstab.datasets.codecs import Png, decode_exr, decode_jpeg, decode_tiff, parse_png
-from semstab.datasets.disk import read_bytes
+from semstab.datasets.formats.arrays import decode_array
+from semstab.datasets.formats.codecs import Png, decode_exr, decode_jpeg, decode_tiff, parse_png
+from semstab.datasets.formats.disk import read_bytes
+from semstab.datasets.views.resampling import Labels
 from semstab.errors import ConfigError, DataError
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
@@ -25,7 +26,6 @@ MASK_SUFFIXES = (".png",)
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
 
-Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 Size = tuple[int, int]
 Read = Callable[[Path], bytes]
 

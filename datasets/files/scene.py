@@ -1,0 +1,375 @@
+"""A scene whose frames lie in files, of whatever layout: what readers of file formats share."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.datasets.files.label_source import (
+    LABEL_SPACE_FILE,
+    LabelSource,
+    ScenePlace,
+    find_masks,
+    find_regions,
+    find_sources,
+    label_space,
+)
+from semstab.datasets.files.messages import listed, nearest
+from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.templates import Folders
+from semstab.datasets.formats import disk
+from semstab.datasets.formats.colmap_depth import read_depth_map
+from semstab.datasets.formats.images import MILLIMETRES, read_color, read_depth, read_labels, read_mask, read_scores
+from semstab.datasets.formats.text_files import read_pose
+from semstab.datasets.scene import GROUND_TRUTH, Scene
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
+from semstab.datasets.views.ray_depth import planar
+from semstab.datasets.views.resampling import Labels, Scores, fit_labels, fit_scores
+from semstab.datasets.views.same_view import fitted
+from semstab.errors import ConfigError, DataError
+from semstab.frames import Frame, Intrinsics
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+
+NO_ID = IGNORE_16BIT - 1
+"""In a table of class ids: an id that is not in it."""
+
+PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table"}
+"""Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSource:
+    """Where one frame comes from.
+
+    name          what path templates call it
+    depth         the file
+    pose          (4, 4) in the dataset's convention, or the file that holds it
+    pose_file     what errors of the pose name
+    camera        of the depth image
+    label_camera  of the images that label maps belong to, where that is another one
+    color         the file that it has, or would have; None where that is not known
+    depth_scale   units in a metre, where the dataset's own files say so
+    timestamp     seconds
+    """
+
+    name: str
+    depth: Path
+    pose: Poses | Path
+    pose_file: Path
+    camera: Camera
+    label_camera: Camera | None = None
+    color: Path | None = None
+    depth_scale: float | None = None
+    timestamp: float | None = None
+
+
+class FileScene(Scene):
+    """One sequence of files, each required when it is read; opening it reads no image.
+
+    Raises ConfigError for options that cannot be used, DataError for two frames of one name.
+    """
+
+    folder: Path
+
+    def __init__(
+        self,
+        place: ScenePlace,
+        frames: Sequence[FrameSource],
+        options: FileOptions,
+        class_ids: Mapping[str, npt.NDArray[np.uint16]] | None = None,
+    ) -> None:
+        names = [frame.name for frame in frames]
+        if len(set(names)) < len(names):
+            raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
+        self.name = place.name
+        self.folder = place.folder
+        self.options = options
+        self.skips_incomplete = options.incomplete == "skip"
+        self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
+        self._frames = frames
+        self._class_ids = class_ids or {}
+        labels = find_sources(options, place, names)
+        regions = find_regions(options, place, names, labels)
+        self._sources = {**labels, **regions}
+        self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
+        self.ground_truth = GROUND_TRUTH in labels
+        self.regions = tuple(regions)
+        self._masks = find_masks(options, place, names)
+        self._folders = Folders()
+        self._spaces: dict[str, LabelSpace | None] = {}
+        self._digests: dict[Path, bytes] = {}
+
+    def __len__(self) -> int:
+        """Number of frames of the sequence, those that lack a file or a pose among them."""
+        return len(self._frames)
+
+    @cached_property
+    def timestamps(self) -> npt.NDArray[np.float64] | None:
+        """(len,) seconds on the dataset's own clock; None where it has none."""
+        if self.options.frames_per_second is not None:
+            return np.arange(len(self)) / self.options.frames_per_second
+        times = [frame.timestamp for frame in self._frames]
+        return None if None in times else np.array(times, dtype=np.float64)
+
+    def tracked(self, index: int) -> bool:
+        """Whether the frame has a pose: one that is not finite says that tracking was lost."""
+        return bool(np.isfinite(self._stored_pose(self._frame(index))).all())
+
+    def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
+        """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
+        frame = self._frame(index)
+        files = [frame.depth, *([frame.pose] if isinstance(frame.pose, Path) else [])]
+        lost = [str(path) for path in files if not self._folders.has(path)]
+        lost += [path for name in sources for path in self._source(name).missing(frame.name)]
+        if color and self._color_file(frame) is None:
+            lost.append(f"{self.folder}: the colour of {frame.name}" if frame.color is None else str(frame.color))
+        return lost
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """By which conventions its files are read, by name of option."""
+        return self.options.model_dump()
+
+    @property
+    def depth_scale(self) -> float:
+        """Units of its stored depth in a metre: what is said, else what its kind of file means."""
+        return self._scale(self._frames[0])
+
+    def label_space(self, backbone: str) -> LabelSpace:
+        """The classes of that label source.
+
+        Raises DataError where nothing says them, ConfigError where there is no such source, or it has none.
+        """
+        source = self._source(backbone)
+        if backbone in self.regions:
+            raise ConfigError(f"{self.folder}: '{backbone}' holds regions without classes, which cannot be fused")
+        space = self._space(backbone)
+        if space is None:
+            where = next(iter(source.files.values())).parent
+            raise DataError(
+                f"{self.settings_file or self.folder}: the classes of '{backbone}' are not known; set classes:"
+                f" [name, ...] in id order, taxonomy: NAME, or taxonomies: {{{backbone}: NAME}}, or put a"
+                f" {LABEL_SPACE_FILE} into {where}"
+            )
+        return space
+
+    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+        """Frame 0 <= index < len with that source's labels or scores, and colour where there is any and it is wanted.
+
+        Labels of another size than the depth are brought to its pixels. Raises DataError that names the file,
+        ConfigError where there is no such frame or backbone.
+        """
+        file, kind = self._label_file(self._frame(index), backbone), self._source(backbone).kind
+        depth = self.depth(index)
+        labels = self._labels(index, backbone, file, depth.shape) if kind == "labels" else None
+        scores = self._scores(index, file, depth.shape) if kind == "scores" else None
+        return self._framed(index, depth, labels, scores, color=color, files={kind: file})
+
+    def geometry(self, index: int, *, color: bool = False) -> Frame:
+        """The frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
+        depth = self.depth(index)
+        return self._framed(index, depth, np.zeros(depth.shape, dtype=np.uint8), None, color=color)
+
+    def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
+        """The frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
+
+        They are brought to the depth's pixels. Raises DataError that names the file.
+        """
+        depth = self.depth(index)
+        where = str(self._frame(index).color or self.image_name(index))
+        labels, scores = self._fitted(index, labels, scores, depth.shape, where)
+        return self._framed(index, depth, labels, scores, color=False)
+
+    def depth(self, index: int) -> npt.NDArray[np.float32]:
+        """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
+        source = self._frame(index)
+        scale = self.options.depth_scale or source.depth_scale
+        read = read_depth_map if source.depth.suffix.lower() == ".bin" else read_depth
+        depth = read(source.depth, scale, self._read)
+        for value in self.options.invalid_depth:
+            with np.errstate(over="ignore"):
+                depth[depth == np.float32(value) / np.float32(self._scale(source))] = 0
+        if self.options.max_depth is not None:
+            depth[depth >= self.options.max_depth] = 0
+        if self.options.depth_kind == "ray":
+            return planar(depth, self.intrinsics(index, depth.shape))
+        return depth
+
+    def color(self, index: int) -> npt.NDArray[np.uint8] | None:
+        """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
+        path = self._color_file(self._frame(index))
+        return None if path is None else read_color(path)
+
+    def image_name(self, index: int) -> str:
+        """What path templates call the frame."""
+        return self._frame(index).name
+
+    def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
+        """Intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        camera, options = self._frame(index).camera, self.options
+        return Camera(camera.intrinsics, options.intrinsics_size or camera.size).at(shape, options.pixel_centre or 0.0)
+
+    def T_wc(self, index: int) -> Poses:
+        """Pose (4, 4) camera-to-world in metres, OpenCV camera axes; needs no labels.
+
+        Raises DataError that names the file. That the pose is rigid is checked by `Frame`.
+        """
+        source, options = self._frame(index), self.options
+        stored = self._stored_pose(source).copy()
+        with np.errstate(over="ignore"):
+            stored[:3, 3] *= options.metres_per_unit or 1.0
+        convention, axes = options.pose_convention or "camera_to_world", options.camera_axes or "opencv"
+        return to_camera_to_world(stored, convention, axes, str(source.pose_file))
+
+    def digest(self, indices: list[int], backbone: str) -> str:
+        """A hash of the settings, the classes, and the depth, poses and labels of those frames; colour does not count.
+
+        Of the images it is the content that `frame` read, where it did; others are read for it.
+        """
+        space = self._space(backbone)
+        settings = self.options.model_dump(mode="json", exclude=PLACES)
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
+        if backbone in self._class_ids:
+            digest.update(self._class_ids[backbone].tobytes())
+        for index in indices:
+            source = self._frame(index)
+            digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
+            mask = [self._masks[source.name]] if source.name in self._masks else []
+            for path in (source.depth, self._label_file(source, backbone), *mask):
+                digest.update(self._digests.get(path) or disk.file_digest(path))
+        return digest.hexdigest()
+
+    def _scale(self, source: FrameSource) -> float:
+        usual = MILLIMETRES if source.depth.suffix.lower() == ".png" else 1.0
+        return self.options.depth_scale or source.depth_scale or usual
+
+    def _framed(
+        self,
+        index: int,
+        depth: npt.NDArray[np.float32],
+        labels: Labels | None,
+        scores: Scores | None,
+        *,
+        color: bool,
+        files: Mapping[str, Path] | None = None,
+    ) -> Frame:
+        """The frame with labels or scores that have the depth's pixels."""
+        source, timestamps = self._frame(index), self.timestamps
+        image = self._color_file(source) if color else None
+        mask = self._masks.get(source.name)
+        known = {"depth": source.depth, "pose": source.pose_file, "color": image, "mask": mask} | dict(files or {})
+        return Frame(
+            index=int(index),
+            depth=depth,
+            intrinsics=self.intrinsics(index, depth.shape),
+            T_wc=self.T_wc(index),
+            labels=labels,
+            scores=scores,
+            color=None if image is None else read_color(image),
+            mask=None if mask is None else self._mask(index, mask, depth.shape),
+            timestamp=None if timestamps is None else float(timestamps[index]),
+            files={what: str(path) for what, path in known.items() if path is not None},
+        )
+
+    def _labels(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Labels:
+        labels = read_labels(path, self._space(backbone), self._read)
+        if backbone in self._class_ids:
+            labels = _translated(labels, self._class_ids[backbone], path)
+        if void := self.options.void_ids.get(backbone):
+            ignore = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+            labels = np.where(np.isin(labels, void), labels.dtype.type(ignore), labels)
+        fitting: Labels = self._stored(index, labels, None, shape, str(path), "labels are")[0]
+        return fitting
+
+    def _scores(self, index: int, path: Path, shape: tuple[int, ...]) -> Scores:
+        scores = read_scores(path, self.options.scores_layout or "KHW", (shape[0], shape[1]), self._read)
+        fitting: Scores = self._stored(index, None, scores, shape, str(path), "scores are")[1]
+        return fitting
+
+    def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+        """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
+        mask = read_mask(path, self._read).astype(np.uint8)
+        masked: npt.NDArray[np.bool_] = self._stored(index, mask, None, shape, str(path), "the mask is")[0] == 1
+        return masked
+
+    def _stored(
+        self, index: int, labels: Any, scores: Any, shape: tuple[int, ...], where: str, what: str
+    ) -> tuple[Any, Any]:
+        """What a file holds, at the depth's pixels; where it must have them, `Frame` says that it has not."""
+        return (labels, scores) if self.labels_like_depth else self._fitted(index, labels, scores, shape, where, what)
+
+    def _fitted(
+        self, index: int, labels: Any, scores: Any, shape: tuple[int, ...], where: str, what: str = "the image is"
+    ) -> tuple[Any, Any]:
+        """Labels (H', W') and scores (H', W', K), each where given, as the depth's camera sees them."""
+        camera = self._frame(index).label_camera
+        if camera is None:
+            return fitted(labels, scores, shape, where, what)
+        ours, size, centre = self.intrinsics(index, shape), (shape[0], shape[1]), self.options.pixel_centre or 0.0
+        return (
+            None if labels is None else fit_labels(labels, camera.at(labels.shape, centre), ours, size),
+            None if scores is None else fit_scores(scores, camera.at(scores.shape, centre), ours, size),
+        )
+
+    def _geometry_bytes(self, source: FrameSource) -> bytes:
+        """The pose and the cameras of a frame, as bytes that are equal where they are."""
+        cameras = (source.camera, source.label_camera, source.depth_scale)
+        return self._stored_pose(source).tobytes() + repr(cameras).encode()
+
+    def _read(self, path: Path) -> bytes:
+        """The content of an image file; its digest is kept, so that `digest` need not read the file again."""
+        data = disk.read_bytes(path)
+        self._digests[path] = disk.digest(data)
+        return data
+
+    def _stored_pose(self, source: FrameSource) -> Poses:
+        return read_pose(source.pose) if isinstance(source.pose, Path) else source.pose
+
+    def _space(self, backbone: str) -> LabelSpace | None:
+        """The classes of a label source, None where nothing says them; what says them is read once."""
+        if backbone not in self._spaces:
+            source = self._source(backbone)
+            none = backbone in self.regions
+            self._spaces[backbone] = None if none else label_space(self.options, self.folder, backbone, source)
+        return self._spaces[backbone]
+
+    def _source(self, backbone: str) -> LabelSource:
+        known = self._sources
+        if backbone not in known:
+            hint = nearest(backbone, known) if known else "put its label maps into labels/NAME/, or set option labels"
+            raise ConfigError(f"{self.folder}: backbone '{backbone}' is not there; {hint}")
+        return known[backbone]
+
+    def _label_file(self, source: FrameSource, backbone: str) -> Path:
+        labels = self._source(backbone)
+        if source.name not in labels.files:
+            lost = [path for frame in self._frames for path in labels.missing(frame.name)]
+            raise DataError(f"{self.folder}: {listed(lost)}; choose frames that have them, or add them")
+        return labels.files[source.name]
+
+    def _color_file(self, source: FrameSource) -> Path | None:
+        """The colour image of a frame, where there is one."""
+        return source.color if source.color is not None and self._folders.has(source.color) else None
+
+    def _frame(self, index: int) -> FrameSource:
+        if not 0 <= index < len(self):
+            raise ConfigError(f"{self.folder}: there is no frame {index}; it has {len(self)}, counted from 0")
+        return self._frames[index]
+
+
+def _translated(labels: Labels, table: npt.NDArray[np.uint16], path: Path) -> Labels:
+    """table[labels]. Raises DataError for an id that the table does not have."""
+    translated: Labels = table[labels]
+    if (unknown := translated == NO_ID).any():
+        raise DataError(f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?")
+    return translated

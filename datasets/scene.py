@@ -1,0 +1,158 @@
+"""What every dataset yields: scenes of one class, which say what they have and by default lack the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from semstab.datasets.views.resampling import Labels, Scores
+from semstab.datasets.views.same_view import fitted
+from semstab.errors import DataError
+from semstab.frames import Frame, Intrinsics
+from semstab.labels import LabelSpace
+
+GROUND_TRUTH = "gt"
+"""The name under which a scene's ground truth labels are selected like a backbone's."""
+
+
+class Scene(ABC):
+    """One sequence. Opening it reads no image; what reads one may be called from several threads at once.
+
+    A dataset has to give `name`, `backbones`, and the four methods that are abstract; the rest are defaults for what a
+    scene may lack, or slower ways to get what `frame` holds too.
+
+    name               the scene's name, usable in a file name
+    backbones          names of the label sources, without the ground truth
+    ground_truth       whether `frame(i, "gt")` works too
+    regions            maps of regions without classes, which `frame` reads by name and nothing fuses
+    up                 (3,) unit vector of the world's up axis, or None where it is not known
+    folder             where its files lie and label maps of it are looked for, or None where it has none
+    settings_file      the file that says what no option says, or None where there is no such file
+    labels_like_depth  whether its label maps have the pixels of the depth, not those of the colour images
+    skips_incomplete   whether selected frames that lack a file are left out; else they are an error
+    """
+
+    name: str
+    backbones: tuple[str, ...]
+    ground_truth: bool = False
+    regions: tuple[str, ...] = ()
+    up: npt.NDArray[np.float64] | None = None
+    folder: Path | None = None
+    settings_file: Path | None = None
+    labels_like_depth: bool = True
+    skips_incomplete: bool = False
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of frames of the sequence, those that lack a file or a pose among them."""
+
+    @abstractmethod
+    def label_space(self, backbone: str) -> LabelSpace:
+        """The classes of that backbone's label maps or scores."""
+
+    @abstractmethod
+    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+        """Frame 0 <= index < len, with that backbone's labels or scores in its own label space.
+
+        Without `color` a scene may leave colour out, where that saves time.
+
+        Raises DataError that names the file.
+        """
+
+    @abstractmethod
+    def digest(self, indices: list[int], backbone: str) -> str:
+        """A hash of the content behind those frames: the same digest means the same numbers."""
+
+    @property
+    def timestamps(self) -> npt.NDArray[np.float64] | None:
+        """(len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
+        return None
+
+    def tracked(self, index: int) -> bool:
+        """Whether the frame has a pose, which tracking may have lost. Reads no image."""
+        return True
+
+    def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
+        """Files that the frame lacks, to be read with the labels of these sources, or its colour. Reads no image."""
+        return []
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """By which conventions its files are read, by name of option: what a check may advise to change."""
+        return {}
+
+    @property
+    def depth_scale(self) -> float | None:
+        """Units of stored depth in a metre, None where depth is not stored."""
+        return None
+
+    def geometry(self, index: int, *, color: bool = False) -> Frame:
+        """The frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
+        sources = (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.backbones[:1])
+        for source in sources:  # the ground truth is the cheapest, but may be sparse
+            try:
+                frame = self.frame(index, source, color=color)
+            except DataError:
+                if source == sources[-1]:
+                    raise
+            else:
+                return dataclasses.replace(frame, labels=np.zeros(frame.shape, dtype=np.uint8), scores=None)
+        raise DataError(f"{self.name}: there are no labels, and without any this dataset yields no depth")
+
+    def depth(self, index: int) -> npt.NDArray[np.float32]:
+        """Depth (H, W) float32 in metres along the optical axis."""
+        return self.geometry(index).depth
+
+    def T_wc(self, index: int) -> npt.NDArray[np.float64]:
+        """Pose (4, 4) camera-to-world in metres, OpenCV camera axes."""
+        return self.geometry(index).T_wc
+
+    def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
+        """Intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        return self.geometry(index).intrinsics
+
+    def color(self, index: int) -> npt.NDArray[np.uint8] | None:
+        """Colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        return self.geometry(index, color=True).color
+
+    def image(self, index: int) -> npt.NDArray[np.uint8]:
+        """Colour (H, W, 3) uint8 RGB. Raises DataError where the frame has none."""
+        color = self.color(index)
+        if color is None:
+            raise DataError(f"{self.name}, {self.image_name(index)}: the frame has no colour image to predict on")
+        return color
+
+    def image_name(self, index: int) -> str:
+        """What the frame's files are called, without suffix."""
+        return f"{index:06d}"
+
+    def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
+        """The frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
+
+        They are brought to the depth's pixels. Raises DataError where image and depth do not show the same view.
+        """
+        frame = self.geometry(index)
+        labels, scores = fitted(labels, scores, frame.shape, f"{self.name}, {self.image_name(index)}")
+        return dataclasses.replace(frame, labels=labels, scores=scores, color=None)
+
+
+class Dataset(ABC):
+    """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it."""
+
+    Options: type[BaseModel]
+
+    @property
+    @abstractmethod
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes, in order."""
+
+    @abstractmethod
+    def scene(self, name: str) -> Scene:
+        """Open one. Raises DataError where its files are missing or contradict each other."""
