@@ -1,0 +1,90 @@
+"""The command line `semstab-bench`. Heavy imports stand inside the commands: --help answers at once."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from semstab import __version__
+from semstab.cli.data import check, convert, predict
+from semstab.cli.listing import list_
+from semstab.cli.options import say
+from semstab.cli.running import run, study, view
+from semstab.errors import SemstabError
+from semstab.process import settle
+
+INTERRUPTED = 130
+
+
+class Group(TyperGroup):
+    """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put `run` in front of bare options."""
+        own = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
+        if not args or (args[0].startswith("-") and args[0] not in own):
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """The group's own help, with the options of `run` in it."""
+        own = self.params
+        self.params = [*own, *self.commands["run"].params]
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self.params = own
+
+    def invoke(self, ctx: Any) -> Any:
+        """The one place that catches: bad input is one line and exit code 2."""
+        try:
+            return super().invoke(ctx)
+        except SemstabError as error:
+            say(f"error: {error}")
+            raise typer.Exit(error.exit_code) from error
+        except KeyboardInterrupt as error:
+            say("interrupted; what was finished is kept, and the same command with the same --out goes on from there")
+            raise typer.Exit(INTERRUPTED) from error
+        except OSError as error:
+            say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
+            raise typer.Exit(2) from error
+
+
+app = typer.Typer(
+    cls=Group,
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="How stable are a segmentation backbone's predictions at the same physical place?\n\n"
+    "Fuses label maps by depth and pose into metric voxels and measures VSS, SBD, OP and entropy. Without a command it "
+    "runs; with no option either, on the built-in city.",
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"semstab {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+    ] = False,
+) -> None:
+    """Options that stand before the command."""
+
+
+for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
+    app.command(name)(command)
+app.command("view")(view)
+app.command("list")(list_)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    settle()
+    app()

@@ -1,0 +1,165 @@
+"""The commands check, convert and predict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semstab.cli.options import (
+    Backbones,
+    ConfigFile,
+    DataFolder,
+    DatasetName,
+    DatasetSettings,
+    Frames,
+    Quiet,
+    Scenes,
+    VoxelSize,
+    overrides,
+    select_dataset,
+    selection,
+    slice_of,
+)
+from semstab.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from semstab.config import Config
+
+
+def predict(
+    backbone: Annotated[str, typer.Option("--backbone", "-m", help="Model, as named by `semstab-bench list`.")],
+    images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    frames: Frames = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder above labels/ and scores/; the scene's own by default.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="What the predictions are called; the model's name here.")] = None,
+    model: Annotated[str | None, typer.Option(help="Folder that save_pretrained wrote, or a hub id.")] = None,
+    revision: Annotated[str | None, typer.Option(help="Branch, tag or commit on the hub.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16; float32 by default.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")
+    ] = None,
+    batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
+    mapping: Annotated[str | None, typer.Option(help="strict, or lenient: near classes count as well.")] = None,
+    scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.KEY=VALUE."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
+    from semstab.predict import command
+    from semstab.settings import load_config, resolve
+
+    named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
+    size = None if image_size is None else _image_size(image_size)
+    options = overrides({**named, "image_size": size}, settings or [])
+    chosen: dict[str, Any] = {}
+    select_dataset(chosen, dataset, data, None)
+    of_dataset = options.pop("dataset", {})
+    if chosen:
+        chosen["dataset"].setdefault("options", {}).update(of_dataset)
+    said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
+    command.run(
+        predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
+        options=options,
+        images=images,
+        dataset=resolve(load_config(None, chosen)).dataset if chosen else None,
+        scenes=None if scene == ["all"] else scene,
+        frames={} if frames is None else slice_of(frames),
+        out=out,
+        batch=batch,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+
+
+def check(
+    config: ConfigFile = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
+    voxel_size: VoxelSize = None,
+    frames: Frames = None,
+    settings: DatasetSettings = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
+    named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
+    problems = _check(selection(config, named, settings, dataset, data, frames), json_file, quiet)
+    if problems:
+        first, *more = problems
+        raise DataError(f"{first}" + (f" (and {len(more)} more, see above)" if more else ""))
+
+
+def convert(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder in which each scene becomes a folder.")],
+    config: ConfigFile = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
+    frames: Frames = None,
+    settings: DatasetSettings = None,
+    depth_error: Annotated[
+        float, typer.Option(min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")
+    ] = 0.0,
+    quiet: Quiet = False,
+) -> None:
+    """Write any dataset as posed folders. Goes on where it was."""
+    _convert(
+        selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames),
+        out,
+        depth_error,
+        quiet,
+    )
+
+
+def _image_size(text: str) -> int | list[int]:
+    """'512' as a number, '512x896' as height and width."""
+    sides = text.lower().split("x")
+    if len(sides) > 2 or not all(side.isdigit() for side in sides):
+        raise ConfigError(f"--image-size {text}: write the shorter side, for example 512, or HEIGHTxWIDTH")
+    return int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]
+
+
+def _check(config: Config, json_file: Path | None, quiet: bool) -> list[str]:
+    """Check and print scene by scene; what is wrong, one line each."""
+    from rich.console import Console
+
+    from semstab.check import SCHEMA, check
+    from semstab.check.display import print_check
+    from semstab.files import write_json
+
+    console, found = Console(quiet=quiet), []
+    for checked in check(config):
+        print_check(checked, console)
+        found.append(checked)
+    if json_file is not None:
+        write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in found]})
+    return [f"{checked.scene}: {problem}" for checked in found for problem in checked.problems]
+
+
+def _convert(config: Config, out: Path, depth_error: float, quiet: bool) -> None:
+    from rich.console import Console
+
+    from semstab.convert import convert
+    from semstab.convert.display import FrameBar, print_converted
+
+    console = Console(quiet=quiet)
+    with FrameBar(Console(stderr=True, quiet=quiet)) as bar:
+        for converted in convert(config, out, depth_error=depth_error, progress=bar):
+            print_converted(converted, console)

@@ -1,0 +1,110 @@
+"""Options that commands share, and what they say as settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semstab.errors import ConfigError
+
+if TYPE_CHECKING:
+    from semstab.config import Config
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")]
+DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
+DatasetSettings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000."),
+]
+DatasetName = Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")]
+Scenes = Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")]
+Backbones = Annotated[
+    list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
+]
+VoxelSize = Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")]
+Frames = Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")]
+TrustGeometry = Annotated[
+    bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
+]
+Rerun = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|spawn|connect|URL|serve|off",
+        help="Recording: a file, OUT/recording.rrd by default; and a viewer to start, to connect to, or to serve.",
+    ),
+]
+Report = Annotated[str, typer.Option(metavar="on|off", help="Write tables, figures and report.html.")]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.")]
+Scheduler = Annotated[str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+
+
+def selection(
+    file: Path | None,
+    named: dict[str, Any],
+    settings: list[str] | None,
+    dataset: str | None,
+    data: Path | None,
+    frames: str | None,
+) -> Config:
+    """The resolved configuration of a file and options that select data."""
+    from semstab.settings import load_config, resolve
+
+    chosen = overrides(named, settings or [])
+    select_dataset(chosen, dataset, data, None)
+    if frames is not None:
+        chosen["frames"] = slice_of(frames)
+    return resolve(load_config(file, chosen))
+
+
+def overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:
+    """The settings given as options, those of --set last."""
+    from semstab.files import parse_yaml
+
+    content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}
+    for setting in settings:
+        path, equals, text = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {setting}: write KEY=VALUE")
+        *groups, key = path.split(".")
+        inner: Any = content
+        for group in groups:
+            inner = inner.setdefault(group, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"--set {setting}: '{group}' is given as an option too; use one of the two")
+        inner[key] = parse_yaml(text, f"--set {setting}")
+    return content
+
+
+def select_dataset(overrides: dict[str, Any], name: str | None, data: Path | None, seed: int | None) -> None:
+    """Put the dataset that options select into the settings."""
+    if data is not None and not data.is_dir():
+        raise ConfigError(f"{data}: there is no such folder")
+    given = {"root": str(data)} if data is not None else {}
+    options = given | ({"seed": seed} if seed is not None else {})
+    name = name or ("posed_folder" if data is not None else None)
+    if name is None and not options:
+        return
+    group = overrides.setdefault("dataset", {})
+    if name is not None:
+        group["name"] = name
+    group["options"] = group.get("options", {}) | options
+
+
+def slice_of(text: str) -> dict[str, int]:
+    """'START:STOP:STRIDE' as settings; each part may be empty."""
+    parts = text.split(":")
+    if len(parts) > 3 or not all(part.strip().isdigit() for part in parts if part):
+        raise ConfigError(f"--frames {text}: write START:STOP:STRIDE, for example 0:80:4 or ::4")
+    if len(parts) == 1:
+        raise ConfigError(
+            f"--frames {text}: write {text}:{int(text or 0) + 1} for one frame, :{text} for the first {text}"
+        )
+    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part}
+
+
+def say(text: str) -> None:
+    """A line beside the results: on standard error."""
+    typer.echo(text, err=True)

@@ -1,0 +1,240 @@
+"""The commands run, study and view."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semstab.cli.options import (
+    Backbones,
+    ConfigFile,
+    DataFolder,
+    DatasetName,
+    Frames,
+    Jobs,
+    Quiet,
+    Report,
+    Rerun,
+    Scenes,
+    Scheduler,
+    TrustGeometry,
+    VoxelSize,
+    overrides,
+    say,
+    select_dataset,
+    slice_of,
+)
+from semstab.errors import ConfigError
+
+if TYPE_CHECKING:
+    from semstab.config import Config
+    from semstab.engine import Executor, Observer
+    from semstab.recording import Recording
+    from semstab.records import Result
+
+
+DISAGREE = 3
+
+
+def run(
+    backend: Annotated[list[str] | None, typer.Option("--backend", "-b", help="Fusion backend; repeatable.")] = None,
+    config: ConfigFile = None,
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse in: a name or a YAML file.")] = None,
+    voxel_size: VoxelSize = None,
+    pixel_stride: Annotated[int | None, typer.Option(help="Use every n-th pixel of each axis.")] = None,
+    frames: Frames = None,
+    device: Annotated[str | None, typer.Option(help="CPU:0, or CUDA:0 for backends that take a device.")] = None,
+    check: Annotated[str | None, typer.Option(help="Backend to check against, or 'none'.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640."),
+    ] = None,
+    trust_geometry: TrustGeometry = False,
+    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
+    statistics: Annotated[
+        bool | None,
+        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; runs/TIME by default.")] = None,
+    rerun: Rerun = None,
+    report: Report = "on",
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
+    predict: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[,KEY=VALUE...]", help="Model that makes the labels, nothing on disk; repeatable."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
+    chosen = overrides(
+        {
+            "backends": backend,
+            "scenes": scene,
+            "backbones": backbone,
+            "taxonomy": taxonomy,
+            "voxel_size": voxel_size,
+            "pixel_stride": pixel_stride,
+            "check": check,
+            "events": events,
+            "statistics": statistics,
+            "check_geometry": False if trust_geometry else None,
+        },
+        settings or [],
+    )
+    select_dataset(chosen, dataset, data, seed)
+    if frames is not None:
+        chosen["frames"] = slice_of(frames)
+    if check in ("none", "off"):
+        chosen["check"] = None
+    resolved = _load(config, chosen, predict or [])
+    if device is not None:
+        resolved = _on_device(resolved, device)
+    _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)
+
+
+def study(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Study file, or a shipped study: see `list`.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; studies/NAME by default.")] = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="PART", help="A sweep, shared_taxonomy or backends; repeatable.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
+    ] = None,
+    rerun: Rerun = "off",
+    report: Report = "on",
+    trust_geometry: TrustGeometry = False,
+    quiet: Quiet = False,
+) -> None:
+    """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
+    from semstab.settings import load_study
+
+    config = load_study(file, overrides({"check_geometry": False if trust_geometry else None}, settings or []))
+    if only is not None:
+        config = config.only(only)
+    _execute(config, out or Path("studies") / config.name, _executor(jobs, scheduler), rerun, report, quiet)
+
+
+def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
+    """Open a run's recording in the rerun viewer."""
+    import subprocess
+
+    from semstab.recording.target import viewer_command
+
+    recording = run / "recording.rrd" if run.is_dir() else run
+    if not recording.exists():
+        raise ConfigError(f"{recording}: there is no recording; run again without --rerun off")
+    raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
+
+
+def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
+    """Run it, say what was found, and end with the exit code that this calls for."""
+    from rich.console import Console
+
+    from semstab.api import run_study
+    from semstab.progress import ProgressBar, failure_lines
+    from semstab.terminal import print_summary
+
+    if report not in ("on", "off"):
+        raise ConfigError(f"--report {report}: write on or off")
+    recording = _recording(rerun, out)
+    observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
+    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
+    try:
+        result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
+        for line in failure_lines(result):
+            say(f"error: {line}")
+        if not quiet:
+            console = Console()
+            if result.select():
+                print_summary(result, console)
+            for line in _where(result, out, recording, report):
+                console.print(line, soft_wrap=True, markup=False, highlight=False)
+        for each in recording:
+            each.serve()
+    finally:
+        for observer in observers:
+            observer.close()
+    if result.failures:
+        raise typer.Exit(2)
+    if not result.agrees:
+        say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
+        raise typer.Exit(DISAGREE)
+
+
+def _recording(rerun: str | None, out: Path) -> list[Recording]:
+    if rerun == "off":
+        return []
+    from semstab.recording import Recording, Target
+
+    return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
+
+
+def _where(result: Result, out: Path, recording: list[Recording], report: str) -> Iterator[str]:
+    """Where to find what."""
+    yield f"folder: {out}"
+    if report == "on" and result.select():
+        yield f"report: {out / 'report.html'}"
+    for each in recording:
+        file = each.target.file
+        yield f"recording: semstab-bench view {out if file == out / 'recording.rrd' else file}"
+
+
+def _executor(jobs: int, scheduler: str | None) -> Executor:
+    import logging
+
+    from semstab.engine import DaskCluster, InProcess, LocalProcesses
+
+    if scheduler is None:
+        return LocalProcesses(jobs) if jobs > 1 else InProcess()
+    if jobs > 1:
+        raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
+    cluster = DaskCluster(scheduler)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what becomes of a unit is said in one line
+    return cluster
+
+
+def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> Config:
+    """The configuration; with models whose predictions take the place of the dataset's labels."""
+    if not predict:
+        from semstab.settings import load_config
+
+        return load_config(path, overrides)
+    from semstab.predict.predictor import parse_predictor
+    from semstab.settings import predicted_config
+
+    return predicted_config([parse_predictor(text) for text in predict], path, overrides)
+
+
+def _on_device(config: Config, device: str) -> Config:
+    from semstab.backends import takes_option
+
+    placed = [
+        backend.model_copy(update={"options": backend.options | {"device": device}})
+        if takes_option(backend.name, "device")
+        else backend
+        for backend in config.backends
+    ]
+    if placed == config.backends and not any(backend.options.get("device") == device for backend in placed):
+        raise ConfigError(f"--device {device}: none of {', '.join(b.name for b in placed)} runs on a device")
+    return config.model_copy(update={"backends": placed})
+
+
+def _default_out() -> Path:
+    from datetime import datetime
+
+    return Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
