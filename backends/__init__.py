@@ -68,15 +68,12 @@ class FusionBackend(Protocol):
 
         Raises DataError, with the map unchanged, where the frame cannot be fused.
         """
-        ...
 
     def table(self) -> VoxelTable:
         """The map so far."""
-        ...
 
     def events(self) -> Events | None:
         """The log of observations, or None where the backend keeps none."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,33 +109,26 @@ class GrowingMap(FusionBackend, Protocol):
     @property
     def voxel_size(self) -> float:
         """Edge of a voxel, metres."""
-        ...
 
     @property
     def origin(self) -> npt.NDArray[np.int64]:
         """(3,) voxel index that packed keys count from; of an empty map 0."""
-        ...
 
     @property
     def changes(self) -> Changes:
         """What the last frame did to each voxel."""
-        ...
 
     def __len__(self) -> int:
         """The number of voxels."""
-        ...
 
     def column(self, name: str, rows: npt.NDArray[np.int64] | slice = ...) -> npt.NDArray[Any]:
         """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""
-        ...
 
     def evidence_of(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """Evidence (n, K) of the voxels of those rows."""
-        ...
 
     def index_of(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Voxel indices (n, 3) of the voxels of those rows."""
-        ...
 
 
 def create(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> FusionBackend:

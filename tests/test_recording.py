@@ -190,7 +190,8 @@ def test_the_blueprint_shows_every_series_and_every_backbone(run) -> None:
     pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", "drift of this frame")}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
-        assert names >= {*SERIES.values(), *maps, *pictures, "Classes", "Notes", "Depth", "Frames to blame"}
+        legends = {"Classes", "Drift of a frame at each pixel"}
+        assert names >= {*SERIES.values(), *maps, *pictures, *legends, "Notes", "Depth", "Frames to blame"}
 
 
 def test_every_map_has_an_eye_that_looks_down_on_it(run) -> None:

@@ -22,10 +22,11 @@ from test_recording import config_of, grid, notes, read, read_blueprints, series
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
+from semstab.engine.units import make_plan
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.metrics import compensated_flicker
-from semstab.recording import Recording, camera, flips, voxel_maps
+from semstab.recording import Recording, camera, drift_colors, flips, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
@@ -94,10 +95,31 @@ def state(table: semstab.VoxelTable) -> tuple[list[list[int]], list[float]]:
 def level(drift: float | None) -> int:
     """By the definition of the levels: the k-th begins at SBD_MAX (k / LEVELS)^2."""
     if drift is None:
-        return camera.FIRST_SEEN
+        return drift_colors.FIRST_SEEN
     if drift < 1e-9:
-        return camera.NO_DRIFT
-    return camera.NO_DRIFT + 1 + min(int(camera.LEVELS * (drift / voxel_maps.SBD_MAX) ** 0.5 + 1e-9), camera.LEVELS - 1)
+        return drift_colors.NO_DRIFT
+    level = int(drift_colors.LEVELS * (drift / voxel_maps.SBD_MAX) ** 0.5 + 1e-9)
+    return drift_colors.NO_DRIFT + 1 + min(level, drift_colors.LEVELS - 1)
+
+
+def test_no_class_wears_a_colour_of_drift(compared) -> None:
+    """The legend is drawn in the colours of the pictures; red ones give way to a class that glows."""
+    fire = (230, 30, 0)
+    for colors in ([(0, 0, 255), (128, 128, 128)], [fire, (0, 220, 240)], [fire, (0, 220, 240), (200, 0, 190)]):
+        classes = LabelSpace("glowing", tuple("abc"[: len(colors)]), colors=tuple(colors))
+        shown = drift_colors.ramp(classes)
+        assert shown.shape == (drift_colors.LEVELS, 3)
+        assert min(np.linalg.norm(shown - color, axis=1).min() for color in colors) >= drift_colors.NEAR
+    rows = read(compared[1] / "recording.rrd")
+    pictures, legend = (
+        [row for row in rows[f"/wall/{at}"] if "AnnotationContext:context" in row]
+        for at in ("camera/a/drift", "drift_legend")
+    )
+    assert pictures[0]["AnnotationContext:context"] == legend[0]["AnnotationContext:context"]
+    (levels,) = rows["/wall/drift_legend/levels"]
+    shown = image(levels, "SegmentationImage").reshape(-1).tolist()
+    assert shown[0] == drift_colors.FIRST_SEEN
+    assert shown[2:] == [drift_colors.NO_DRIFT + 1 + level for level in range(drift_colors.LEVELS)]
 
 
 def test_labels_camera_and_colour_are_those_of_the_frames(compared) -> None:

@@ -13,7 +13,8 @@ flips/BACKBONE/voxel_N                  StateChange: the dominant class of the v
 flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them; Points3D: where those voxels are
 difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
 difference_report/BACKBONE/A and B      TextDocument: how many they are
-legend, log                             Points2D: the classes and their colours; TextLog: each unit's final numbers
+legend, drift_legend                    Points2D: the classes and their colours; SegmentationImage: the levels of drift
+log                                     TextLog: each unit's final numbers
 """
 
 from semstab.recording.observer import Recording

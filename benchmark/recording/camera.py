@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import io
-import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from semstab.frames import Frame, Intrinsics
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.recording.background import Background
 from semstab.recording.entities import path
-from semstab.recording.voxel_maps import SBD_MAX
 
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""
@@ -29,14 +27,6 @@ IMAGE_SIDE = 640
 JPEG_QUALITY = 80
 COLOR_BYTES = 400_000_000
 """Of a scene's colour, where its frames' files are JPEG: those within their share go into the recording as they are."""
-
-NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
-LEVELS = 24
-LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
-"""Bits at which one level of drift ends and the next begins: finer where drift is small; the last one is open."""
-
-# Red, orange, yellow, white: what drifts lights up like a glowing body.
-GLOW = np.array([(150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230)], dtype=np.float64)
 
 
 def stride_of(shape: tuple[int, int]) -> int:
@@ -63,30 +53,6 @@ class Overlay:
         if self._logged.get(entity, (1, 1, 0)) != (*scale, shift):
             self._logged[entity] = (*scale, shift)
             stream.log(entity, rr.Transform3D(translation=[shift, shift, 0], scale=[*scale, 1]))
-
-
-def drift_levels(drift: npt.NDArray[np.float32], seen: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
-    """Picture of drift in bits (H, W), NaN where a voxel is seen for the first time; `seen` where there is a voxel."""
-    level = np.searchsorted(LEVEL_EDGES[1:-1], drift, side="right") + NO_DRIFT + 1
-    level[drift == 0] = NO_DRIFT
-    level[np.isnan(drift)] = FIRST_SEEN
-    level[~seen] = NO_VOXEL
-    return level.astype(np.uint8)
-
-
-def drift_context() -> rr.AnnotationContext:
-    """Names and colours of the levels; over the colour image only what drifts is seen, and dimly what is new."""
-    names = [f"{low:.4f} to {high:.4f} bits" for low, high in itertools.pairwise(LEVEL_EDGES)]
-    names[-1] = f"{LEVEL_EDGES[-2]:.4f} bits and more"
-    at = np.linspace(0, len(GLOW) - 1, LEVELS)
-    glow = np.stack([np.interp(at, np.arange(len(GLOW)), channel) for channel in GLOW.T], axis=1).astype(int)
-    infos: list[tuple[int, str, tuple[int, ...]]] = [
-        (NO_VOXEL, "no voxel", (0, 0, 0, 200)),
-        (FIRST_SEEN, "first seen", (40, 60, 110, 170)),
-        (NO_DRIFT, "no drift", (0, 0, 0, 150)),
-    ]
-    infos += [(NO_DRIFT + 1 + k, name, (*glow[k].tolist(), 255)) for k, name in enumerate(names)]
-    return rr.AnnotationContext([rr.AnnotationInfo(*info) for info in infos])
 
 
 def label_context(classes: LabelSpace) -> rr.AnnotationContext:

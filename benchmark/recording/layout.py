@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
 from semstab.engine.units import Plan
-from semstab.recording import legend
+from semstab.recording import drift_colors, legend
 from semstab.recording.entities import path
 from semstab.recording.series import SERIES, entity
 from semstab.recording.voxel_maps import TABS, TITLES, chunk, defaults, visualizer
@@ -34,6 +34,8 @@ OUTLIERS = 0.005
 # In a window of 1500 x 850 points, as laptops have it; in others the proportions are alike.
 LEFT, TITLE = (808, 538), 27
 """Width and height of what is left of the camera, and the height of a view's title or of a row of tabs."""
+DRIFT_LEGEND = TITLE + 70
+"""Height of the legend of drift, with its title."""
 DIFFERENCE_ASPECT, COMPARED_ASPECT = 2.2, 1.6
 
 MOST_BESIDE = 4
@@ -133,7 +135,12 @@ def _overview(scene: str, tasks: list[Task], scenery: Scenery | None, chunks: in
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
     classes_view = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
     left = rrb.Vertical(maps, classes_view, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
-    top = rrb.Horizontal(left, _cameras(scene, tasks), column_shares=[5, 4])
+    levels = rrb.VisualBounds2D(x_range=drift_colors.LEGEND[0], y_range=drift_colors.LEGEND[1])
+    drift_view = rrb.Spatial2DView(
+        origin=path(scene, "drift_legend"), name="Drift of a frame at each pixel", visual_bounds=levels
+    )
+    right = rrb.Vertical(_cameras(scene, tasks), drift_view, row_shares=[LEFT[1] - DRIFT_LEGEND, DRIFT_LEGEND])
+    top = rrb.Horizontal(left, right, column_shares=[5, 4])
     return rrb.Vertical(top, _below(scene, tasks), row_shares=[5, 2], name="Overview")
 
 

@@ -21,14 +21,12 @@ from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned
 from semstab.frames import Frame
 from semstab.metrics import compensated_flicker
-from semstab.recording import legend, series
+from semstab.recording import drift_colors, legend, series
 from semstab.recording.background import Background
 from semstab.recording.camera import (
     IMAGE_SIDE,
     CameraLog,
     Overlay,
-    drift_context,
-    drift_levels,
     label_context,
     stride_of,
 )
@@ -353,7 +351,10 @@ class _Group:
         stride = stride_of(frame.shape)
         labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
         coarse = stride * _sampling(labels.shape)
-        for name, picture, step in (("labels", labels, stride), ("drift", drift_levels(*caused.at(coarse)), coarse)):
+        for name, picture, step in (
+            ("labels", labels, stride),
+            ("drift", drift_colors.levels_of(*caused.at(coarse)), coarse),
+        ):
             entity = f"{self._entity}/{name}"
             self._overlay.log(stream, entity, frame.shape, picture.shape, step)
             stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
@@ -385,10 +386,11 @@ def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
             name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
             stream.log(path(scene), getattr(rr.ViewCoordinates, name), static=True)
         legend.log_legend(stream, path(scene, "legend"), task.mapping.target)
+        drift_colors.log_legend(stream, path(scene, "drift_legend"), task.mapping.target)
     for task in plan.tasks:
         entity = path(task.scene.name, "camera", task.backbone)
         stream.log(f"{entity}/labels", label_context(task.mapping.target), static=True)
-        stream.log(f"{entity}/drift", drift_context(), static=True)
+        stream.log(f"{entity}/drift", drift_colors.context(task.mapping.target), static=True)
     series.log_styles(stream, plan)
 
 

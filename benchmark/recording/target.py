@@ -134,8 +134,8 @@ def _why_no_viewer(url: str) -> str | None:
     """None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
     try:
         host, port = _address(url)
-        with contextlib.closing(socket.create_connection((host, port), timeout=ANSWER_SECONDS)) as plain:
-            connection = plain if url.startswith("rerun+http:") else _encrypted(plain, host)
+        plain = socket.create_connection((host, port), timeout=ANSWER_SECONDS)
+        with plain, plain if url.startswith("rerun+http:") else _encrypted(plain, host) as connection:
             connection.sendall(HTTP2_PREFACE)
             answer = connection.recv(9)
     except (OSError, ValueError) as error:

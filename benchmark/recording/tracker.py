@@ -10,7 +10,7 @@ import numpy.typing as npt
 from semstab.backends import GrowingMap
 from semstab.backends.numba_hash import NumbaHash
 from semstab.frames import Frame
-from semstab.recording.drift_kernel import find_voxels
+from semstab.recording.kernels import find_voxels
 
 
 class Tracker:

@@ -22,7 +22,7 @@ from semstab.labels import LabelSpace
 from semstab.metrics import CATEGORY_COLORS
 from semstab.metrics.category import categorise
 from semstab.metrics.voxelwise import mean_drift
-from semstab.recording.belief_kernel import read_off
+from semstab.recording.kernels import read_off
 from semstab.results import RECURRENT
 from semstab.voxels import VoxelTable
 
