@@ -15,7 +15,7 @@ import numpy as np
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.errors import ConfigError
 from semstab.files import parse_yaml
-from semstab.labels import LabelMapping, LabelSpace
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelMapping, LabelSpace
 
 Leniency = Literal["strict", "lenient"]
 
@@ -132,8 +132,9 @@ class InTaxonomy:
         labels = self._mapping.labels(prediction.labels, "prediction")
         if prediction.scores is None:
             return Prediction(labels)
-        scores = self._mapping.scores(prediction.scores, "prediction")
-        return Prediction(labels, np.asarray(scores, dtype=np.float32))
+        scores = np.array(self._mapping.scores(prediction.scores, "prediction"), dtype=np.float32)
+        scores[labels == (IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT)] = 0
+        return Prediction(labels, scores)
 
 
 def _keys(name: str) -> list[str]:

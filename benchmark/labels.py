@@ -182,6 +182,7 @@ class LabelMapping:
     def scores(self, scores: npt.NDArray[np.floating[Any]], where: str) -> npt.NDArray[np.floating[Any]]:
         """Map soft scores (H, W, K of the source): classes that fall together are summed, ignored ones dropped.
 
+        Where an ignored class has the largest score, as where a label map has its id, all scores are 0: ignored.
         Raises DataError where the number of classes differs from the source space's.
         """
         if scores.shape[2] != len(self.source):
@@ -194,6 +195,9 @@ class LabelMapping:
         for k, row in enumerate(self.rows):
             if row is not None:
                 mapped[..., row] += scores[..., k]
+        ignored = np.array([row is None for row in self.rows])
+        if ignored.any():
+            mapped[ignored[scores.argmax(axis=2)]] = 0
         return mapped
 
     def _table(self, itemsize: int) -> npt.NDArray[np.int32]:

@@ -62,11 +62,11 @@ class PosedFolder(FileDataset[PosedOptions]):
         return [
             FrameSource(
                 name=name,
-                depth=depth.get(name, folder / f"depth/{name}{suffix}"),
-                pose=(pose := poses.get(name, folder / f"pose/{name}.txt")),
+                depth=depth.get(name) or folder / f"depth/{name}{suffix}",
+                pose=(pose := poses.get(name) or folder / f"pose/{name}.txt"),
                 pose_file=pose,
                 camera=camera,
-                color=colors.get(name, folder / f"color/{name}{COLOR_SUFFIXES[0]}"),
+                color=colors.get(name) or folder / f"color/{name}{COLOR_SUFFIXES[0]}",
             )
             for name in sorted({*depth, *poses}, key=natural)
         ]

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+import tiny_scene
 from dataset_writers import FORMATS, matrix_text, opened, source, write_labels, write_lines
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,7 +15,9 @@ from hypothesis import strategies as st
 from semstab.config import Config, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.selection import select_frames
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
+from semstab.pipeline import run
+from semstab.plan import make_plan
 
 # --- by number
 
@@ -170,3 +173,45 @@ def test_the_city_s_frames_can_be_chosen_by_time() -> None:
     scene = open_dataset("city", {"frames": 9}).scene("scene0")
     first, last = scene.timestamps[2], scene.timestamps[5]
     assert select_frames(scene, FrameSelection(from_time=first, to_time=last)).indices == [2, 3, 4, 5]
+
+
+# --- what was not asked for
+
+
+def test_label_maps_that_were_not_asked_for_neither_break_nor_change_a_run(tmp_path):
+    """A second model predicted every other frame only, and its classes cannot be read."""
+    root = tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=6)
+    settings = {"voxel_size": 0.25, "backends": ["numpy"], "check": None, "backbones": ["a"]}
+    before = run_of(root, settings)
+    partial = root / "labels/partial"
+    partial.mkdir()
+    for k in (0, 2, 4):
+        (partial / f"{k:04d}.png").write_bytes((root / f"labels/a/{k:04d}.png").read_bytes())
+    (partial / "label_space.yaml").write_text("classes: 3")
+    for incomplete in ("error", "skip"):
+        (found,) = run_of(root, settings, incomplete=incomplete)
+        assert (found.table, found.frames) == (before[0].table, 6)
+
+
+def test_frames_are_selected_on_the_sequence_and_what_lacks_a_file_is_counted(tmp_path):
+    root = tiny_scene.write(tmp_path / "wall", backbones=("a", "partial"), frames=12)
+    for k in set(range(12)) - {0, 3, 6, 9}:
+        (root / f"labels/partial/{k:04d}.png").unlink()
+    every_third = {"backbones": ["partial"], "frames": {"stride": 3}}
+    assert plan_of(root, every_third).tasks[0].indices == [0, 3, 6, 9]
+    (task,) = plan_of(root, every_third, incomplete="skip").tasks  # the stride is not applied to what is left
+    assert (task.indices, task.left_out) == ([0, 3, 6, 9], 0)
+    with pytest.raises(DataError, match=r"4 missing: .*labels/partial/0002\.png"):
+        plan_of(root, {"backbones": ["partial"], "frames": {"stride": 2}})
+    (task,) = plan_of(root, {"backbones": ["partial"], "frames": {"stride": 2}}, incomplete="skip").tasks
+    assert (task.indices, task.left_out) == ([0, 6], 4)
+
+
+def plan_of(root, settings, **options):
+    dataset = {"name": "posed_folder", "options": {"root": str(root), **options}}
+    return make_plan(Config.build({"dataset": dataset, **settings}))
+
+
+def run_of(root, settings, **options):
+    dataset = {"name": "posed_folder", "options": {"root": str(root), **options}}
+    return run(Config.build({"dataset": dataset, **settings})).runs

@@ -106,6 +106,18 @@ def test_scores_of_classes_that_fall_together_are_summed():
     assert FINE.mapping_to(COARSE).scores(scores, "").tolist() == [[[0.625, 0.125]]]
 
 
+def test_where_the_label_is_ignored_the_scores_are():
+    """A class that is left out takes its pixels with it, not only its share of them."""
+    source = LabelSpace("fine", ("road", "sky", "tree"))
+    target = LabelSpace("coarse", ("road", "tree"), ignored=("sky",))
+    mapping = source.mapping_to(target)
+    scores = np.random.default_rng(0).dirichlet(np.ones(3), (40, 50)).astype(np.float32)
+    mapped = mapping.scores(scores, "")
+    labels = mapping.labels(scores.argmax(axis=2).astype(np.uint8), "")
+    np.testing.assert_array_equal(mapped.sum(axis=2) > 0, labels != 255)
+    np.testing.assert_array_equal(mapped[labels != 255], scores[labels != 255][:, [0, 2]])
+
+
 def test_half_precision_scores_are_summed_in_single():
     scores = np.full((1, 1, 4), 40000, np.float16)
     mapped = FINE.mapping_to(COARSE).scores(scores, "")

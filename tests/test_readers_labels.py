@@ -315,6 +315,17 @@ def test_void_ids_and_taxonomies_go_by_label_source(tmp_path):
     assert set(np.unique(other.frame(0, "net").labels)) & {2, 4, 255} == {255}
 
 
+def test_void_ids_of_scores_are_those_of_their_largest_class(scene):
+    root, names, frames = scene
+    for name, frame in zip(names, frames, strict=True):
+        save(root / f"room/labels/net/{name}.png", frame.labels)
+        save(root / f"room/scores/net/{name}.npy", np.eye(8, dtype=np.float16).T[frame.labels].transpose(2, 0, 1))
+    found = opened(FORM, root, void_ids={"net": (1, 2), "net-scores": (1, 2)})
+    hard, soft = found.frame(0, "net"), found.frame(0, "net-scores")
+    assert 0.05 < (hard.labels == 255).mean() < 1
+    np.testing.assert_array_equal(soft.predicted == soft.ignore_id, hard.labels == 255)
+
+
 def test_a_label_space_beside_the_maps_goes_before_that_of_all(scene):
     root, names, frames = scene
     write_labels(root / "room", names, frames)

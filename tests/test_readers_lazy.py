@@ -56,3 +56,23 @@ def test_ten_thousand_frames_open_at_once(tmp_path):
     assert (len(scene), chosen[0], chosen[-1]) == (count, 0, count - 1)
     assert scene.T_wc(count - 1)[0, 3] == 500
     fails(DataError, r"009999_left_depth\.npy: the file is empty", scene.depth, count - 1)
+
+
+def test_a_posed_folder_of_ten_thousand_frames_opens_at_once(tmp_path):
+    """Two label sources, of which one has every hundredth frame; what is selected is all that has to be there."""
+    names = [f"{k:06d}" for k in range(10_000)]
+    for part in ("depth", "pose", "labels/all", "labels/some"):
+        (tmp_path / part).mkdir(parents=True)
+    for name in names:
+        (tmp_path / f"depth/{name}.png").touch()
+        (tmp_path / f"labels/all/{name}.png").touch()
+        write_lines(tmp_path / f"pose/{name}.txt", ["1 0 0 0", "0 1 0 0", "0 0 1 0"])
+    for name in names[::100]:
+        (tmp_path / f"labels/some/{name}.png").touch()
+    write_lines(tmp_path / "intrinsics.txt", ["9 0 3", "0 9 3", "0 0 1"])
+    started = time.process_time()
+    scene = opened(FORMATS["posed_folder"], tmp_path)
+    assert select_frames(scene, FrameSelection(), ["all"]).indices == [*range(10_000)]
+    assert select_frames(scene, FrameSelection(stride=100), ["all", "some"]).left_out == 0
+    assert time.process_time() - started < 5
+    fails(DataError, "9900 missing", select_frames, scene, FrameSelection(), ["some"])

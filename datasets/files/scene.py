@@ -171,7 +171,7 @@ class FileScene(Scene):
         file, kind = self._label_file(self._frame(index), backbone), self._source(backbone).kind
         depth = self.depth(index)
         labels = self._labels(index, backbone, file, depth.shape) if kind == "labels" else None
-        scores = self._scores(index, file, depth.shape) if kind == "scores" else None
+        scores = self._scores(index, backbone, file, depth.shape) if kind == "scores" else None
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
@@ -291,8 +291,13 @@ class FileScene(Scene):
         fitting: Labels = self._stored(index, labels, None, shape, str(path), "labels are")[0]
         return fitting
 
-    def _scores(self, index: int, path: Path, shape: tuple[int, ...]) -> Scores:
+    def _scores(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Scores:
         scores = read_scores(path, self.options.scores_layout or "KHW", (shape[0], shape[1]), self._read)
+        if void := self.options.void_ids.get(backbone):
+            space = self._space(backbone)
+            ids = range(scores.shape[2]) if space is None else space.ids
+            ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
+            scores = np.where(ignored[..., None], scores.dtype.type(0), scores)
         fitting: Scores = self._stored(index, None, scores, shape, str(path), "scores are")[1]
         return fitting
 

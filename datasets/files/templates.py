@@ -77,13 +77,15 @@ def matching_folders(base: Path, template: Template, placeholder: str, **values:
 
 
 def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
-    """`folder / relative`, which must lie in `root`.
+    """`folder / relative`, which must lie in `root`, as `folder` does.
 
     Raises DataError with `where` (the file that names the path) where it does not, or no path can be called so.
     """
     if UNSAFE.search(relative) or len(relative) > LONGEST:
         raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
     path = folder / relative
+    if ".." not in relative and not relative.startswith("/"):
+        return path
     if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):  # noqa: PTH100  symlinks may lead out
         raise DataError(
             f"{where}: the path {relative[:200]!r} leaves {root}; set root to the folder that holds all files"
@@ -100,16 +102,21 @@ class Folders:
     def has(self, path: Path) -> bool:
         """Whether there is a file or folder of that path."""
         parent, name = os.path.split(path)
-        if parent not in self._names:
-            try:
-                self._names[parent] = frozenset(os.listdir(parent or "."))  # noqa: PTH208  names, not paths
-            except OSError:
-                self._names[parent] = frozenset()
-        return name in self._names[parent]
+        return name in self._listed(parent)
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
         """The path where it has one of the suffixes, else that with the first suffix there is a file of."""
-        if path.suffix.lower() in suffixes:
-            return path if self.has(path) else None
-        candidates = (path.with_name(path.name + suffix) for suffix in suffixes)
-        return next((candidate for candidate in candidates if self.has(candidate)), None)
+        parent, name = os.path.split(path)
+        there = self._listed(parent)
+        if os.path.splitext(name)[1].lower() in suffixes:  # noqa: PTH122  of ten thousand names
+            return path if name in there else None
+        suffix = next((suffix for suffix in suffixes if name + suffix in there), None)
+        return None if suffix is None else Path(parent, name + suffix)
+
+    def _listed(self, folder: str) -> frozenset[str]:
+        if folder not in self._names:
+            try:
+                self._names[folder] = frozenset(os.listdir(folder or "."))  # noqa: PTH208  names, not paths
+            except OSError:
+                self._names[folder] = frozenset()
+        return self._names[folder]
