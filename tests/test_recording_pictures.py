@@ -31,7 +31,7 @@ from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
 from semstab.recording.voxel_maps import TITLES
-from semstab.settings import load_config, make_plan
+from semstab.settings import load_config
 from semstab.task import read as read_frame
 
 CLASSES = LabelSpace("abc", ("a", "b", "c"))
