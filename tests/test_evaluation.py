@@ -21,13 +21,14 @@ import semstab
 from semstab.config import Config
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.memory import estimate
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.metrics import sbd
 from semstab.plots import figures
 from semstab.plots.maps import right_or_wrong
 from semstab.plots.statistics import DriftByOP, draw_intervals, draw_reliability
 from semstab.report import TOPICS, write_report
-from semstab.settings import load_config, make_plan
+from semstab.settings import load_config
 from semstab.statistics import Estimate, analyse, describe, nulls
 from semstab.statistics.__main__ import main
 from semstab.tables import tables, to_json

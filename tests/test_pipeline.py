@@ -333,7 +333,7 @@ def test_a_damaged_image_stops_the_run_at_its_frame(root) -> None:
     watching = Watching()
     with pytest.raises(DataError, match=r"depth/0002\.png: not a PNG image"):
         semstab.engine.run(configure(root, backbones=["a"], threads=4), observers=[watching])
-    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1"]
+    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1", "finished"]
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
@@ -363,7 +363,7 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
     semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
     Painting.wants_color = True
     semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
-    assert seen == [False, True, False] + [True] * 3  # that in the middle is for the figures
+    assert seen == [False] * 3 + [True] * 3
 
 
 def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:

@@ -22,6 +22,7 @@ from semstab.backends.numba_hash import NumbaHash
 from semstab.config import Config
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
+from semstab.engine.units import Plan, PlannedUnit
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
@@ -30,8 +31,10 @@ from semstab.recording.entities import Clock
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
 from semstab.recording.voxel_maps import SBD_MAX, TITLES
-from semstab.results import GroupResult, RunResult, Unit, UnitSummary
-from semstab.task import Plan, Task, load_config
+from semstab.records import Record, Result, Variation
+from semstab.results import Unit, UnitSummary
+from semstab.settings import load_config
+from semstab.task import Task
 from semstab.voxels import VoxelTable
 
 NANOSECONDS = 1_000_000_000
@@ -363,7 +366,7 @@ def test_without_a_recording_rerun_is_not_imported(run) -> None:
     program = (
         "import sys, semstab; from semstab.settings import load_config;"
         f"semstab.engine.run(load_config({str(run / 'config.yaml')!r}));"
-        "assert 'semstab.pipeline' in sys.modules and 'rerun' not in sys.modules"
+        "assert 'semstab.engine.execution' in sys.modules and 'rerun' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
 
@@ -407,15 +410,19 @@ def record(path: Path, frames: list[Frame], *, finish: bool = True) -> tuple[Rec
     """Drive a recording as the pipeline does."""
     watching = Recording(path)
     task = Task(Scene(), "net/x", [f.index for f in frames], CLASSES.mapping_to(CLASSES), ("numpy",))
-    watching.run_started(Plan(Config(voxel_size=0.25), (task,)))
+    config = Config(voxel_size=0.25)
+    unit = PlannedUnit(Variation(), config, task, "key", image_space=True, kept=True)
+    watching.run_started(Plan(config, {}, (unit,), ()), [])
     backend = backends.create("numpy", voxel_size=0.25, num_classes=3)
     for each in frames:
         watching.frame_fused(UNIT, each, FrameRow(backend.integrate(each), each.timestamp, math.nan))
+        watching.frame_finished(task, each)
     table = backend.table()
     if finish:
         watching.unit_fused(UNIT, table)
         watching.unit_finished(UNIT, table, summary_of(table))
-        watching.run_finished(RunResult((GroupResult((summary_of(table),), ()),)))
+        watching.group_finished(task)
+        watching.run_finished(Result("run", "numpy", (Record("key", Variation(), summary_of(table)),)))
     return watching, table
 
 

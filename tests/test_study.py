@@ -15,7 +15,7 @@ import tiny_study
 from tiny_study import Counting, Interrupting, configure, summary
 
 import semstab
-from semstab.config import Config
+from semstab.config import BACKENDS, Config
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
@@ -25,7 +25,7 @@ from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.json_form import to_json
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
-from semstab.records import BACKENDS, Variation
+from semstab.records import Variation
 from semstab.results import Unit
 from semstab.settings import resolve
 from semstab.statistics import compare_backbones, nulls

@@ -21,9 +21,10 @@ from records import record, study, voxels
 from wall_study import BACKBONES, STEPS, wall_study
 
 from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.config import BACKENDS, SHARED
 from semstab.files import write_text
 from semstab.metrics import entropy, op, sbd, vss
-from semstab.records import BACKENDS, SHARED, ImageSpace, RegionFlicker, Result
+from semstab.records import ImageSpace, RegionFlicker, Result
 from semstab.statistics import Estimate
 from semstab.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
 from semstab.testing import checks

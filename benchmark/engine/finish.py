@@ -48,9 +48,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
             observers.tell(lambda observer: observer.unit_fused(unit, table))
     with watch("statistics"):
         truth = None if one.truth is None else _table(one.truth, task)
-        found = analyse_map(task, config, table, one.backend.events() if config.statistics else None, truth)
+        events = one.backend.events() if config.statistics else None
+        found = analyse_map(task, config, table, events, truth) if one.request.judged else None
     with watch("measure"):
-        summary = _summary(task, config, table, one.rows, found)
+        summary = _summary(one, table, found)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
     content = UnitContent(task.digest, summary, files=saved)
@@ -80,7 +81,9 @@ def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
     )
 
 
-def _summary(task: Task, config: Config, table: VoxelTable, rows: Sequence[FrameRow], found: Analysis) -> UnitSummary:
+def _summary(
+    task: Task, config: Config, table: VoxelTable, rows: Sequence[FrameRow], found: Analysis | None
+) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
     stages = [row.stage_ms() for row in rows]
     return UnitSummary(
@@ -92,11 +95,13 @@ def _summary(task: Task, config: Config, table: VoxelTable, rows: Sequence[Frame
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
-        statistics=nulls(found.summary),
+        statistics={} if found is None else nulls(found.summary),
     )
 
 
-def _savers(stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis) -> Savers:
+def _savers(
+    stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis | None
+) -> Savers:
     """What is to be written of a unit beside its summary."""
     config, unit = one.request.config, one.task.units[0]
     savers: Savers = {}
@@ -105,7 +110,7 @@ def _savers(stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable |
     if not one.request.kept:
         return savers
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
-        save_voxels, table, columns=found.maps if config.statistics else {}
+        save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
     )
     savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
     events = one.backend.events() if config.events else None

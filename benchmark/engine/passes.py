@@ -142,7 +142,7 @@ class Pass:
         """A frame into every map of a stream."""
         watched = [one for one in stream.maps if one.request.kept]
         with self._failing([one.request for one in stream.maps]):
-            now = stream.next_frame(fetched.item, self._watch)
+            now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
             if watched and not watched[0].rows:
                 require_memory(stream.task, watched[0].request.config, now.frame)
             for one in stream.maps:
