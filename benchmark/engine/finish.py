@@ -19,7 +19,7 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.jobs import Job, Outcome, shared_marker
 from semstab.engine.observer import Observers
-from semstab.engine.series import FrameRow, to_csv
+from semstab.engine.series import to_csv
 from semstab.engine.stream import Stream, UnitMap
 from semstab.errors import DataError
 from semstab.files import atomic_path, write_text
@@ -81,10 +81,9 @@ def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
     )
 
 
-def _summary(
-    task: Task, config: Config, table: VoxelTable, rows: Sequence[FrameRow], found: Analysis | None
-) -> UnitSummary:
+def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
+    task, config, rows = one.task, one.request.config, one.rows
     stages = [row.stage_ms() for row in rows]
     return UnitSummary(
         unit=task.units[0],
