@@ -14,7 +14,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from semstab.errors import ConfigError
-from semstab.files import parse_yaml
+from semstab.files import MAX_YAML_BYTES, parse_yaml, read_limited
 
 
 class Settings(BaseModel):
@@ -222,7 +222,7 @@ class Config(Settings):
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """The mapping in a YAML file. Raises ConfigError in one line where there is none."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -20,11 +20,12 @@ from semstab.datasets.files.label_source import (
     find_masks,
     find_regions,
     find_sources,
+    label_paths,
     label_space,
 )
 from semstab.datasets.files.messages import listed, nearest
 from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.templates import Folders, inside
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.colmap_depth import read_depth_map
 from semstab.datasets.formats.images import MILLIMETRES, read_color, read_depth, read_labels, read_mask, read_scores
@@ -90,6 +91,9 @@ class FileScene(Scene):
         names = [frame.name for frame in frames]
         if len(set(names)) < len(names):
             raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
+        for frame in frames:  # files of predictions are called so
+            if ".." in frame.name or frame.name.startswith("/"):
+                inside(place.folder, place.folder, frame.name, str(frame.pose_file))
         self.name = place.name
         self.folder = place.folder
         self.options = options
@@ -103,6 +107,7 @@ class FileScene(Scene):
         self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
+        self.label_paths = tuple(label_paths(options, place, names))
         self._masks = find_masks(options, place, names)
         self._folders = Folders()
         self._spaces: dict[str, LabelSpace | None] = {}
