@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     DepthScale,
@@ -19,7 +20,6 @@ from semstab.datasets.files.options import (
     Size,
 )
 from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera, camera_of

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.check.conventions import OPTION, Reading, reading
+from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
     FUSED_FRAMES,
     Coverage,
@@ -23,9 +23,8 @@ from semstab.check.coverage import (
 )
 from semstab.check.geometry import Verdict, judge, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
-from semstab.check.registration import Edges, find_offset, grey_levels, image_edges, label_edges
+from semstab.check.remarks import remarks
 from semstab.check.reprojection import Sample
-from semstab.check.sentinels import find_sentinel
 from semstab.check.views import View, clusters, evenly, label_source, pairs_within, reader
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
@@ -46,9 +45,6 @@ LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
 QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
 """The quick check looks at one place with so many points, and before it refuses data at so many places."""
-
-REGISTERED_FRAMES = 16
-"""Frames in which the edges of labels are compared with those of depth."""
 
 LABELLED_FRAMES = 8
 """Frames in which the labels of every backbone but the first are counted."""
@@ -149,7 +145,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         motion=_motion(sample),
         verdict=verdict,
         labels=tuple(_labels(scene, name, indices, config, look) for name in backbones),
-        remarks=tuple(_remarks(scene, look, how)),
+        remarks=tuple(remarks(scene, [look.views[at] for at in sorted(look.views)], how, look.tally.backbone)),
     )
     return checked if verdict.state == "unsound" else _with_coverage(checked, look, sample, config)
 
@@ -282,37 +278,6 @@ def _persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, s
         return persistence(views, coverage, voxel_size, stride)
     except DataError:
         return None
-
-
-def _remarks(scene: Scene, look: Look, how: Reading) -> Iterator[str]:
-    views = [look.views[position] for position in sorted(look.views)]
-    if how.convention.depth == "planar" and (
-        found := find_sentinel((view.depth for view in views), how.depth_scale or 1)
-    ):
-        values = [*how.said.get("invalid_depth", ()), found.value]
-        yield f"{found}; set {how.change('invalid_depth', '[' + ', '.join(f'{value:.15g}' for value in values) + ']')}"
-    some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
-    if (offset := find_offset(list(_edges(scene, some)))) is not None:
-        what = "the images" if some[0].labels is None else f"labels of {look.tally.backbone}"
-        mend = "register them to the depth"
-        if "color_intrinsics" in scene.settings:
-            mend = f"set {OPTION}color_intrinsics: [fx, fy, cx, cy], or {mend}"
-        yield f"{what} look as if they were not registered to the depth: {offset}; {mend}"
-
-
-def _edges(scene: Scene, views: Sequence[View]) -> Iterator[Edges]:
-    """Depth and edges of the labels, or without labels of the images, of views."""
-    for view in views:
-        if view.labels is not None:
-            yield view.depth, label_edges(view.labels, view.ignore_id)
-            continue
-        try:
-            color = scene.color(view.index)
-            grey = None if color is None else scene.predicted(view.index, labels=grey_levels(color)).labels
-        except DataError:  # no image of the depth's view: whoever needs it says so
-            continue
-        if grey is not None:
-            yield view.depth, image_edges(grey[:: view.stride, :: view.stride])
 
 
 def _motion(sample: Sample) -> Motion | None:
