@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
@@ -23,7 +24,6 @@ from semstab.datasets.files.options import (
     zero_is_void,
 )
 from semstab.datasets.files.reader import FileDataset, files_named, require_equal
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats.json_files import number, read_object
 from semstab.datasets.formats.text_tables import read_table

@@ -10,6 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
@@ -19,7 +20,6 @@ from semstab.datasets.files.options import (
     UpAxis,
 )
 from semstab.datasets.files.reader import FileDataset, files_named, require_equal
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats.text_tables import read_table
 from semstab.datasets.views.cameras import camera_of

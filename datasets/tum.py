@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     DepthScale,
@@ -23,7 +24,6 @@ from semstab.datasets.files.options import (
     UpAxis,
 )
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.text_tables import read_table, records, to_number
 from semstab.datasets.views.cameras import camera_of
