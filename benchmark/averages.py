@@ -8,6 +8,7 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from semstab.measures import Measure
 from semstab.metrics import macro_mean, pool
 from semstab.results import Means
 from semstab.statistics import number_at
@@ -93,6 +94,16 @@ def pooled(records: Sequence[Record]) -> Pooled:
 def _macro(records: Sequence[Record], *path: str) -> float:
     """The macro mean of a number of the units' statistics; NaN where none has it."""
     return macro_mean([number_at(record.statistics, *path) for record in records])
+
+
+def over_all(measure: Measure) -> Callable[[Pooled], float]:
+    """Takes a measure's mean over all voxels."""
+    return lambda pooled: pooled.every[measure]
+
+
+def over_recurrent(measure: Measure) -> Callable[[Pooled], float]:
+    """Takes a measure's mean over the voxels with OP >= 3."""
+    return lambda pooled: pooled.recurrent[measure]
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from semstab.averages import ENOUGH, Level, Pooled, Sweep, complete_scenes, describe, levels, pooled
+from semstab.measures import SBD, VSS
 from semstab.study.results import StudyResult
 
-VISIBLE_VSS = 0.001
+VISIBLE_VSS = 10.0 ** -VSS.digits[0]
 """A difference of VSS counts from one unit of the last decimal of the paper's main tables on."""
 
-VISIBLE_SBD = 0.0001
+VISIBLE_SBD = 10.0 ** -SBD.digits[0]
 """Likewise for SBD."""
 
 VISIBLE_SHARE = 0.0001
@@ -118,7 +119,7 @@ def more_disagreement(voxels: Pooled) -> Outcome:
     """Is VSS of the recurrent voxels lower than that of all?"""
     if voxels.recurrent.voxels < ENOUGH:
         return _untested(f"{voxels.recurrent.voxels:,} voxels have OP>=3; {ENOUGH:,} are needed.")
-    every, recurrent = voxels.every.vss, voxels.recurrent.vss
+    every, recurrent = voxels.every[VSS], voxels.recurrent[VSS]
     return _outcome(
         f"VSS {recurrent:.4f} for OP>=3 against {every:.4f} over all voxels: {100 * (1 - recurrent):.1f}% of the"
         f" evidence disagrees, not {100 * (1 - every):.1f}%.",
@@ -143,12 +144,12 @@ def _drift(result: StudyResult) -> Finding:
 
 def falling_drift(voxels: Pooled) -> Outcome:
     """Does mean SBD fall from each stratum to the next?"""
-    strata = [row for row in voxels.strata if row.sbd_voxels >= ENOUGH]
+    strata = [row for row in voxels.strata if row.defined(SBD) >= ENOUGH]
     if len(strata) < 2:
         return _untested(f"Fewer than two strata of OP have {ENOUGH:,} voxels with an SBD.")
     return _outcome(
-        f"SBD {', '.join(f'{row.sbd:.4f} at {row.name}' for row in strata)}.",
-        [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a.sbd - b.sbd < VISIBLE_SBD],
+        f"SBD {', '.join(f'{row[SBD]:.4f} at {row.name}' for row in strata)}.",
+        [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a[SBD] - b[SBD] < VISIBLE_SBD],
     )
 
 
@@ -278,7 +279,7 @@ def _values(sweep: Sweep, found: Sequence[Level], separator: str = ", ") -> str:
 
 
 def _vss(level: Level) -> float:
-    return level.mean(lambda p: p.every.vss)
+    return level.mean(lambda p: p.every[VSS])
 
 
 def _share(level: Level) -> float:
@@ -286,4 +287,4 @@ def _share(level: Level) -> float:
 
 
 def _recurrent_vss(level: Level) -> float:
-    return level.mean(lambda p: p.recurrent.vss)
+    return level.mean(lambda p: p.recurrent[VSS])

@@ -11,7 +11,7 @@ import functools
 import math
 import reprlib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path, PurePath
 from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints, runtime_checkable
 
@@ -36,7 +36,7 @@ class OwnForm(Protocol):
 
     @classmethod
     def of_json_content(cls, content: Any) -> Any:
-        """Read it; raises ValueError, TypeError or KeyError where it does not fit."""
+        """Read it, with `fields_of`; raises ValueError or TypeError where it does not fit."""
 
 
 # --- To JSON ----------------------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
         line = misfit.line()
     except RecursionError:
         line = "content: is nested too deeply"
-    raise DataError(f"{where}: {line}; it is damaged, or another version's: make it again")
+    raise DataError(f"{where}: {line}; it is damaged, or another version's; delete it and compute it again")
 
 
 class _MisfitError(Exception):
@@ -147,7 +147,7 @@ def _float(content: Any) -> float:
     if content is None:
         return math.nan
     if type(content) is int and abs(content) < 2**1023:
-        return float(content)
+        return content  # as it was written
     raise _expected("a number", content)
 
 
@@ -259,33 +259,32 @@ def _entries(content: Any) -> dict[str, Any]:
     return content
 
 
+def fields_of(content: Any, hints: Mapping[str, Any], optional: Collection[str] = ()) -> dict[str, Any]:
+    """The entries of a JSON object that are asked for, each read as its type; `optional` ones may be missing."""
+    entries, values = _entries(content), {}
+    for name, hint in hints.items():
+        try:
+            if name in entries:
+                values[name] = _reader(hint)(entries[name])
+            elif name not in optional:
+                raise _MisfitError("is missing")
+        except _MisfitError as misfit:
+            misfit.steps.append(f".{name}")
+            raise
+    return values
+
+
 def _dataclass(cls: Any) -> Reader:
-    hints = get_type_hints(cls)
-    known = [field for field in dataclasses.fields(cls) if field.init]
-    inlined = [(field.name, _reader(hints[field.name])) for field in known if "inline" in field.metadata]
-    own = [
-        (field.name, field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING, hints)
-        for field in known
-        if "inline" not in field.metadata
-    ]
-    readers: dict[str, Reader] = {}  # made when first needed: a type may hold itself
+    types_of, known = get_type_hints(cls), [field for field in dataclasses.fields(cls) if field.init]
+    own = {field.name: types_of[field.name] for field in known if "inline" not in field.metadata}
+    inline = {field.name: types_of[field.name] for field in known if "inline" in field.metadata}
+    missing = dataclasses.MISSING
+    optional = {field.name for field in known if field.default is not missing or field.default_factory is not missing}
     make = _built(lambda values: cls(**values))
 
     def read(content: Any) -> Any:
-        entries = _entries(content)
-        values = {name: reader(entries) for name, reader in inlined}
-        for name, required, types_of in own:
-            try:
-                if name in entries:
-                    if name not in readers:
-                        readers[name] = _reader(types_of[name])
-                    values[name] = readers[name](entries[name])
-                elif required:
-                    raise _MisfitError("is missing")
-            except _MisfitError as misfit:
-                misfit.steps.append(f".{name}")
-                raise
-        return make(values)
+        values = {name: _reader(hint)(content) for name, hint in inline.items()}
+        return make(values | fields_of(content, own, optional))
 
     return read
 
@@ -296,7 +295,7 @@ def _built(make: Reader) -> Reader:
     def read(content: Any) -> Any:
         try:
             return make(content)
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
+        except (ValueError, TypeError) as error:
             raise _MisfitError(f"{type(error).__name__}: {error}") from error
 
     return read

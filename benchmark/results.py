@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+from semstab.json_form import INLINE, fields_of, to_json
+from semstab.measures import Measure, measures
 
 SCHEMA = 1
 """Version of summary.json."""
@@ -79,24 +81,55 @@ class FrameReport:
 
 
 @dataclass(frozen=True)
-class Means:
-    """Means over a group of voxels: a stratum, a class, the recurrent ones. NaN where undefined.
+class MeasureMeans:
+    """The mean of every measure over a group of voxels, by its key; NaN where undefined.
 
-    share is the group's part of all voxels, 0 to 1; sbd runs over its sbd_voxels, those with OP >= 2, only.
+    voxels has, for the measures that do not exist at every OP, over how many the mean runs. In JSON these are entries
+    KEY and KEY_voxels of what the means belong to.
+    """
+
+    value: Mapping[str, float]
+    voxels: Mapping[str, int]
+
+    def json_content(self) -> dict[str, float]:
+        """Entries by key."""
+        return {**self.value, **{f"{key}_voxels": n for key, n in self.voxels.items()}}
+
+    @classmethod
+    def of_json_content(cls, content: Any) -> MeasureMeans:
+        """The entries of all measures."""
+        rare = [measure.key for measure in measures() if measure.lowest_op > 1]
+        counts = fields_of(content, {f"{key}_voxels": int for key in rare})
+        value = fields_of(content, {measure.key: float for measure in measures()})
+        return cls(value, {key: counts[f"{key}_voxels"] for key in rare})
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over a group of voxels: a stratum, a class, the recurrent ones; `means[VSS]` is that of a measure.
+
+    share is the group's part of all voxels, 0 to 1.
     """
 
     name: str
     share: float
     voxels: int
-    vss: float
-    sbd: float
-    entropy: float
-    sbd_voxels: int
+    means: MeasureMeans = field(metadata=INLINE)
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means.value[measure.key]
+
+    def defined(self, measure: Measure) -> int:
+        """The voxels over which the measure's mean runs."""
+        return self.means.voxels.get(measure.key, self.voxels)
 
 
 @dataclass(frozen=True)
 class TableSummary:
-    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes."""
+    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
+
+    `summary[VSS]` is the mean of a measure over all voxels where it is defined.
+    """
 
     K: int
     voxel_size: float
@@ -104,12 +137,13 @@ class TableSummary:
     observations: int
     voxels: int
     mean_op: float
-    vss: float
-    sbd: float
-    entropy: float
+    means: MeasureMeans = field(metadata=INLINE)
     strata: tuple[Means, ...]
     recurrent: Means
     classes: tuple[Means, ...]
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means.value[measure.key]
 
 
 @dataclass(frozen=True)
@@ -121,52 +155,19 @@ class UnitSummary:
     nothing was asked for.
     """
 
-    unit: Unit
+    unit: Unit = field(metadata=INLINE)
     taxonomy: str
     frames: int
-    table: TableSummary
+    table: TableSummary = field(metadata=INLINE)
     flicker_percent: float
     fuse_ms_per_frame: float
-    stages_ms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
     left_out: int = 0
-    statistics: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        rest = {name: getattr(self, name) for name in _UNIT_FIELDS}
-        return (
-            dataclasses.asdict(self.unit)
-            | rest
-            | {"stages_ms": dict(self.stages_ms), "left_out": self.left_out}
-            | dataclasses.asdict(self.table)
-            | {"statistics": dict(self.statistics)}
-        )
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> UnitSummary:
-        """Read one entry of 'runs'; null is NaN."""
-        content = _defined(content)
-        groups = {
-            "strata": tuple(_means(row) for row in content["strata"]),
-            "classes": tuple(_means(row) for row in content["classes"]),
-            "recurrent": _means(content["recurrent"]),
-        }
-        table = {field.name: content[field.name] for field in dataclasses.fields(TableSummary)}
-        return cls(
-            Unit(content["scene"], content["backbone"], content["backend"]),
-            table=TableSummary(**table | groups),
-            **{name: content[name] for name in _UNIT_FIELDS},
-            stages_ms=_defined(content.get("stages_ms", {})),  # runs of earlier versions have none
-            left_out=content.get("left_out", 0),
-            statistics=content.get("statistics", {}),
-        )
-
-
-_UNIT_FIELDS = ("taxonomy", "frames", "flicker_percent", "fuse_ms_per_frame")
+    statistics: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Difference:
+class Deviation:
     """Largest and mean absolute difference of one quantity over the voxels that two tables share."""
 
     max: float
@@ -175,26 +176,18 @@ class Difference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json."""
+    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
+
+    differences  of OP, of every measure and of the evidence, by their keys
+    """
 
     scene: str
     backbone: str
     backends: tuple[str, str]
     voxels: tuple[int, int]
     only_in: tuple[int, int]
-    differences: Mapping[str, Difference]
+    differences: Mapping[str, Deviation]
     agrees: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Agreement:
-        """Read one entry of 'agreement'; null is NaN."""
-        differences = {name: Difference(**_defined(row)) for name, row in content["differences"].items()}
-        pairs = {name: tuple(content[name]) for name in ("backends", "voxels", "only_in")}
-        return cls(**dict(content) | pairs | {"differences": differences})
 
 
 @dataclass(frozen=True)
@@ -203,16 +196,6 @@ class GroupResult:
 
     runs: tuple[UnitSummary, ...]
     agreement: tuple[Agreement, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object; `from_dict` reads it back."""
-        return {"runs": [run.to_dict() for run in self.runs], "agreement": [row.to_dict() for row in self.agreement]}
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> GroupResult:
-        """Read what `to_dict` wrote."""
-        runs = tuple(UnitSummary.from_dict(row) for row in content["runs"])
-        return cls(runs, tuple(Agreement.from_dict(row) for row in content["agreement"]))
 
 
 @dataclass(frozen=True)
@@ -242,18 +225,12 @@ class RunResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of summary.json."""
-        return {
-            "schema": SCHEMA,
-            "runs": [run.to_dict() for run in self.runs],
-            "agreement": [row.to_dict() for row in self.agreement],
-            "comparisons": [dict(row) for row in self.comparisons],
-        }
-
-
-def _means(row: Mapping[str, Any]) -> Means:
-    return Means(**_defined(row))
-
-
-def _defined(row: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON's null is NaN."""
-    return {key: math.nan if value is None else value for key, value in row.items()}
+        content: dict[str, Any] = to_json(
+            {
+                "schema": SCHEMA,
+                "runs": self.runs,
+                "agreement": self.agreement,
+                "comparisons": self.comparisons,
+            }
+        )
+        return content

@@ -16,9 +16,10 @@ import numpy.typing as npt
 import yaml
 
 from semstab.config import Config, read_yaml
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError
 from semstab.files import read_json, write_json, write_text
-from semstab.metrics import dominant, entropy, sbd, vss
+from semstab.json_form import from_json, to_json
+from semstab.measures import dominant, measures
 from semstab.results import STAGES, FrameReport, GroupResult, RunResult, Unit, slug
 from semstab.voxels import Events, VoxelTable
 
@@ -90,15 +91,12 @@ class RunFolder:
         content = read_json(path)
         if not isinstance(content, dict) or content.get("key") != key:
             return None
-        try:
-            result = GroupResult.from_dict(content)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: damaged ({error!r}); delete it, and the unit is computed again") from error
+        result = from_json(GroupResult, content, path)
         return result if all(self.voxels_path(run.unit).exists() for run in result.runs) else None
 
     def save_group(self, scene: str, backbone: str, key: str, result: GroupResult) -> None:
         """Mark the group as finished; from now on it is kept."""
-        write_json(self._group_path(scene, backbone), {"key": key, **result.to_dict()})
+        write_json(self._group_path(scene, backbone), {"key": key, **to_json(result)})
 
     def save_unit(
         self, unit: Unit, table: VoxelTable, events: Events | None, rows: list[FrameRow], maps: Maps | None = None
@@ -144,8 +142,8 @@ class RunFolder:
 
 def save_voxels(table: VoxelTable, path: Path, maps: Maps | None = None) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
-    measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
-    table.save(path, measures | dict(maps or {}))
+    columns = {measure.key: measure.of(table) for measure in measures()}
+    table.save(path, {**columns, "label": dominant(table), **(maps or {})})
 
 
 def group_key(config: Config, scene: str, backbone: str, digest: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from semstab.errors import DataError
 from semstab.files import read_json, write_json
-from semstab.json_form import INLINE, from_json, to_json
+from semstab.json_form import INLINE, fields_of, from_json, to_json
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Sum:
 
     @classmethod
     def of_json_content(cls, content: Any) -> "Sum":
-        return cls(float(content["total"]))
+        return cls(fields_of(content, {"total": float})["total"])
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def damaged(key: str, value: object) -> Any:
         ("by_name", {"x": {"y": True}}, "by_name.x.y: should be a number, is True"),
         ("path", 3, "path: should be text"),
         ("name", 3, "name: should be text"),
-        ("total", None, "TypeError"),
+        ("total", "x", "total: should be a number"),
         ("maybe", 3, "maybe: should be an object"),
         ("count", 3.0, "count: should be a whole number"),
         ("count", None, "count: should be a whole number"),

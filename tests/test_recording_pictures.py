@@ -27,6 +27,7 @@ from semstab.backends.numba_hash import NumbaHash
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
+from semstab.measures import SBD_MAX
 from semstab.metrics import compensated_flicker
 from semstab.plan import load_config, make_plan
 from semstab.plan import read as read_frame
@@ -34,7 +35,7 @@ from semstab.recording import Recording, Target, camera, flips, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
-from semstab.recording.voxel_maps import TITLES
+from semstab.recording.voxel_maps import looks
 
 CLASSES = LabelSpace("abc", ("a", "b", "c"))
 
@@ -100,7 +101,7 @@ def level(drift: float | None) -> int:
         return camera.FIRST_SEEN
     if drift < 1e-9:
         return camera.NO_DRIFT
-    return camera.NO_DRIFT + 1 + min(int(camera.LEVELS * (drift / voxel_maps.SBD_MAX) ** 0.5 + 1e-9), camera.LEVELS - 1)
+    return camera.NO_DRIFT + 1 + min(int(camera.LEVELS * (drift / SBD_MAX) ** 0.5 + 1e-9), camera.LEVELS - 1)
 
 
 def test_labels_camera_and_colour_are_those_of_the_frames(compared) -> None:
@@ -424,7 +425,7 @@ def test_500_frames_of_4k_stay_below_the_size_that_is_stated() -> None:
     _, jpeg = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, camera.JPEG_QUALITY])
     color = max(500 * jpeg.size, camera.COLOR_BYTES)
     labels, drift, depth = W * H, (W // 2) * (H // 2), 2 * (W // 2) * (H // 2)
-    voxels = (voxel_maps.BUDGET + voxel_maps.MAX_VOXELS) * (3 * 4 + 4 * len(TITLES))
+    voxels = (voxel_maps.BUDGET + voxel_maps.MAX_VOXELS) * (3 * 4 + 4 * len(looks()))
     assert 500 * (labels + drift + depth) + color + voxels < 0.7e9
 
 

@@ -16,6 +16,7 @@ from tiny_study import Counting, Interrupting, configure, summary
 import semstab
 from semstab.datasets.posed_folder import PosedScene
 from semstab.errors import ConfigError, DataError
+from semstab.json_form import to_json
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.plan import read
 from semstab.results import Unit
@@ -48,7 +49,7 @@ def test_every_unit_has_the_numbers_of_a_run_with_its_settings(root, tmp_path) -
     assert [record.variation for record in result.records] == [cell.variation for cell in cells]
     for cell, record in zip(cells, result.records, strict=True):
         (run,) = semstab.run(cell.config, out=tmp_path / "run" / record.key).runs
-        expected, found = run.to_dict(), record.summary.to_dict()
+        expected, found = to_json(run), to_json(record.summary)
         for name in tiny_study.TIMES:
             expected.pop(name), found.pop(name)
         np.testing.assert_equal(found, expected)
@@ -444,7 +445,7 @@ def test_a_damaged_unit_file_is_named(root, tmp_path) -> None:
     unit.unlink()
     run_study(config, out)
     unit.write_text(json.dumps({**json.loads(unit.read_text()), "summary": {}}))
-    with pytest.raises(DataError, match=r"units/\w+\.json: damaged"):
+    with pytest.raises(DataError, match=r"units/\w+\.json: scene: is missing; .*delete it"):
         run_study(config, out)
 
 

@@ -22,6 +22,7 @@ from wall_study import BACKBONES, STEPS, wall_study
 
 from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.files import write_text
+from semstab.measures import SBD, VSS
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.statistics import Estimate
 from semstab.study.results import BACKENDS, SHARED, ImageSpace, RegionFlicker, StudyResult
@@ -246,7 +247,7 @@ def test_pooling_counts_a_scene_by_its_voxels():
     small, large = record(voxels((1, 2, SPLIT, 0.2)), scene="x"), record(voxels((9, 1, SURE)), scene="y")
     together = pooled([small, large])
     assert (together.voxels, together.observations, together.mean_op) == (10, 11, 1.1)
-    assert (together.every.vss, together.every.sbd, together.once) == pytest.approx((0.975, 0.2, 0.9))
+    assert (together.every[VSS], together.every[SBD], together.once) == pytest.approx((0.975, 0.2, 0.9))
 
 
 # --- Fusion implementations -------------------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.metrics.voxelwise import entropy, sbd, vss
-from semstab.results import Agreement, Difference, Unit
+from semstab.measures import measures
+from semstab.results import Agreement, Deviation, Unit
 from semstab.voxels import VoxelTable
 
 TOLERANCE = 1e-9
@@ -34,9 +34,7 @@ def compare(
     in_a, in_b = _shared_rows(a, b)
     quantities: dict[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]] = {
         "op": (a.op, b.op),
-        "vss": (vss(a), vss(b)),
-        "sbd": (sbd(a), sbd(b)),
-        "entropy": (entropy(a), entropy(b)),
+        **{measure.key: (measure.of(a), measure.of(b)) for measure in measures()},
         "evidence": (a.evidence, b.evidence),
     }
     differences = {name: _difference(x[in_a], y[in_b]) for name, (x, y) in quantities.items()}
@@ -62,10 +60,10 @@ def _shared_rows(a: VoxelTable, b: VoxelTable) -> tuple[npt.NDArray[np.int64], n
     return order[twin], order[twin + 1] - len(a)
 
 
-def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Difference:
+def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Deviation:
     x, y = x.astype(np.float64), y.astype(np.float64)
     difference = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y))
     difference = np.where(np.isnan(difference), 1.0, difference)
     if not difference.size:
-        return Difference(math.nan, math.nan)
-    return Difference(float(difference.max()), float(difference.mean()))
+        return Deviation(math.nan, math.nan)
+    return Deviation(float(difference.max()), float(difference.mean()))

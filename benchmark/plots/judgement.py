@@ -15,14 +15,12 @@ from semstab.plots.statistics import DriftByOP, Rows, draw_agreement, draw_drift
 from semstab.plots.style import Figure
 from semstab.results import slug
 from semstab.statistics import estimate_at, expected_sbd
+from semstab.statistics.comparison import compared
 from semstab.statistics.verdict import RELIABLE, TENTATIVE
 from semstab.study.results import Record, StudyResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
-
-MEASURES = {"psa": "PSA", "alpha": "alpha", "vss": "VSS", "accuracy": "accuracy"}
-"""Those of a comparison that are drawn: higher is better for all."""
 
 
 def statistics_figures(result: StudyResult, kept: Sequence[Record]) -> list[Figure]:
@@ -99,12 +97,12 @@ def _reliability(judged: Sequence[Record]) -> Iterator[Figure]:
 
 
 def _comparison(result: StudyResult) -> Iterator[Figure]:
+    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
     panels: dict[str, dict[str, dict[str, Any]]] = {}
     for found in result.comparisons:
         for row in found["paired"]["differences"]:
-            if row["measure"] in MEASURES:
-                rows = panels.setdefault(MEASURES[row["measure"]], {}).setdefault(found["scene"], {})
-                rows[f"{row['a']} less {row['b']}"] = estimate_at(row, "difference")
+            rows = panels.setdefault(words[row["measure"]], {}).setdefault(found["scene"], {})
+            rows[f"{row['a']} less {row['b']}"] = estimate_at(row, "difference")
     if panels:
         yield Figure(
             "comparison",
@@ -113,8 +111,8 @@ def _comparison(result: StudyResult) -> Iterator[Figure]:
             " from a bootstrap over blocks of space. An interval that holds 0 decides nothing.",
             "One panel a measure with the difference of each pair of backbones in each scene and its interval, and 0.",
             lambda: draw_intervals(
-                {name: panels[name] for name in MEASURES.values() if name in panels},
-                dict.fromkeys(MEASURES.values(), (0.0,)),
+                panels,
+                dict.fromkeys(panels, (0.0,)),
             ),
         )
 

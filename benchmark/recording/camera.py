@@ -19,9 +19,9 @@ import rerun as rr
 from semstab.datasets import Scene
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.measures import SBD_MAX
 from semstab.recording.background import Background
 from semstab.recording.entities import path
-from semstab.recording.voxel_maps import SBD_MAX
 
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""

@@ -10,6 +10,7 @@ from typing import Any
 import rerun as rr
 
 from semstab.errors import DataError
+from semstab.measures import ENTROPY, VSS
 from semstab.plan import Plan, Task
 from semstab.recording.entities import Clock, path
 from semstab.results import RECURRENT, Unit
@@ -18,8 +19,8 @@ SERIES = {
     "drift": "Mean drift of updates (bits)",
     "flicker_percent": "Flicker (%)",
     "compensated_flicker": "Flicker, motion-compensated (%)",
-    "map_vss": "Mean VSS so far (0 to 1)",
-    "map_entropy": "Mean entropy so far (0 to 1)",
+    "map_vss": f"Mean {VSS.word} so far (0 to {VSS.largest:g})",
+    "map_entropy": f"Mean {ENTROPY.word} so far (0 to {ENTROPY.largest:g})",
     "map_recurrent": f"Share OP >= {RECURRENT} so far (0 to 1)",
     "new_voxels": "New voxels",
     "updated_voxels": "Updated voxels",

@@ -11,9 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.measures import Quantity
 from semstab.voxels import Events, VoxelTable
 
 Float64 = npt.NDArray[np.float64]
+
+PSA = Quantity(key="psa", title="PSA", better="higher")
+KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
+ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(2, 4))
 
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""

@@ -10,20 +10,20 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
+from semstab.measures import measures
 from semstab.statistics import fusion_rules
 from semstab.statistics.comparison import (
     EDGES,
-    LOWER_IS_BETTER,
-    MEASURES,
     Tables,
     coverage,
     paired,
     repeated_rows,
     standard_weights,
     standardised,
+    voxelwise,
 )
 from semstab.statistics.content import mean, plain
-from semstab.statistics.correctness import Truth, correctness, join_truth
+from semstab.statistics.correctness import ACCURACY, ECE, MIOU, Truth, correctness, join_truth
 from semstab.statistics.matching import require_same_map
 from semstab.voxels import Events, VoxelTable
 
@@ -49,7 +49,7 @@ def compare_backbones(
     if len(tables) < 2:
         raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
     weights = standard_weights(tables)
-    everywhere = {measure: standardised(tables, measure, seed=seed, weights=weights) for measure in MEASURES}
+    everywhere = {m.key: standardised(tables, m, seed=seed, weights=weights) for m in voxelwise()}
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "seed": seed,
@@ -78,7 +78,7 @@ def _ranking_by_rule(tables: Tables, events: Mapping[str, Events], truth: VoxelT
 
 
 def _values(fused: fusion_rules.Fused, rows: npt.NDArray[np.int64], truth: Truth | None) -> dict[str, float]:
-    values = {"vss": mean(fused.vss[rows]), "sbd": mean(fused.sbd[rows]), "entropy": mean(fused.entropy[rows])}
+    values = {measure.key: mean(measure.of(fused)[rows]) for measure in measures()}
     if truth is not None:
         known = rows[truth.known[rows]]
         right = correctness(fused.belief[known], truth.label[known])
@@ -87,5 +87,5 @@ def _values(fused: fusion_rules.Fused, rows: npt.NDArray[np.int64], truth: Truth
 
 
 def _order(values: Mapping[str, Mapping[str, float]], measure: str) -> list[str]:
-    sign = 1 if measure in (*LOWER_IS_BETTER, "ece") else -1
+    sign = next(q.sign for q in (*measures(), ACCURACY, MIOU, ECE) if q.key == measure)
     return sorted(values, key=lambda name: (math.isnan(values[name][measure]), sign * values[name][measure]))

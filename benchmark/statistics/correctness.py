@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.information import normalise
-from semstab.metrics import dominant, strata
+from semstab.measures import Quantity, dominant
+from semstab.metrics import strata
 from semstab.results import RECURRENT
 from semstab.statistics.agreement import psa, ratio_of
 from semstab.statistics.blocks import UNDEFINED, BlockBootstrap, Estimate
@@ -19,6 +20,11 @@ from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+
+ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
+MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
+ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
+BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
 
 STABLE = 0.8
 """A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.information import normalise
-from semstab.metrics import dominant, sbd, strata, vss
+from semstab.measures import dominant, measures, sbd, vss
+from semstab.metrics import strata
 from semstab.metrics.summary import STRATA
 from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
@@ -272,9 +273,7 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> lis
         label = fusion_rules.labels(fused.belief)
         row: dict[str, Any] = {
             "rule": rule,
-            "vss": mean(fused.vss[again]),
-            "sbd": mean(fused.sbd[again]),
-            "entropy": mean(fused.entropy[again]),
+            **{measure.key: mean(measure.of(fused)[again]) for measure in measures()},
             "relabelled_share": mean((label != usual)[again]),
         }
         if truth is not None:
@@ -286,8 +285,7 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> lis
 
 
 def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> list[dict[str, Any]]:
-    within, between = maps["entropy_within"], maps["entropy_between"]
-    columns = {"vss": vss(table), "sbd": sbd(table), "entropy": within + between} | {
+    columns = {measure.key: measure.of(table) for measure in measures()} | {
         name: maps[name] for name in ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_between")
     }
     rows = []

@@ -13,13 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.metrics import sbd
+from semstab.measures import Quantity, sbd
 from semstab.statistics.agreement import ONE_HOT
 from semstab.statistics.content import mean
 from semstab.voxels import Events, VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+
+FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
 LEAST_DRAWS, MOST_DRAWS, ENOUGH_HITS = 100, 1999, 20
 """Random orders of a voxel: at least, at most, and how many in a tail settle its p-value."""

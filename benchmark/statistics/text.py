@@ -7,11 +7,10 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from semstab.measures import measures
+
 Row = tuple[str, Any, str]
 WIDTH = 80
-
-STRATA_KEYS = ("name", "voxels", "psa", "vss", "sbd", "sbd_null", "entropy_within", "entropy_between")
-RULE_KEYS = ("rule", "vss", "sbd", "entropy", "relabelled_share", "accuracy", "ece")
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
@@ -118,12 +117,18 @@ def _correctness(summary: Mapping[str, Any]) -> list[Row]:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterable[str]:
-    yield from ("", *_table(summary["strata"], STRATA_KEYS))
+    yield from (
+        "",
+        *_table(
+            summary["strata"],
+            ("name", "voxels", "psa", *(m.key for m in measures()), "sbd_null", "entropy_within", "entropy_between"),
+        ),
+    )
     if found := summary["correctness"]:
         yield from ("", *_table(found["strata"], ("name", "voxels", "accuracy", "miou", "ece", "brier")))
     yield from ("", *_table(summary["agreement"]["classes"], ("name", "observations", "kappa", "alpha")))
     if rules := summary["fusion_rules"]:
-        yield from ("", *_table(rules, [key for key in RULE_KEYS if key in rules[0]]))
+        yield from ("", *_table(rules, [key for key in rules[0] if key not in ("miou", "brier")]))
 
 
 def _table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[str]:

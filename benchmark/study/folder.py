@@ -12,11 +12,12 @@ from typing import Any
 from semstab.datasets.disk import file_digest
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.json_form import from_json
 from semstab.results import Unit, UnitSummary, slug
 from semstab.study.config import StudyConfig
 from semstab.study.grid import Cell, RegionCell
 from semstab.study.jobs import Outcome, shared_marker
-from semstab.study.results import OVERVIEW, VOXELS, ImageSpace, Record, StudyResult, read_image_space
+from semstab.study.results import OVERVIEW, VOXELS, ImageSpace, Record, StudyResult
 
 UNITS = "units"
 SETTINGS = "study.yaml"
@@ -63,16 +64,16 @@ class StudyFolder:
     def record(self, cell: Cell, content: Mapping[str, Any]) -> Record:
         """A cell's record from the content of its unit's file. Raises DataError where that is damaged."""
         key = unit_key(cell.identity, content["input"])
+        path = self.path / UNITS / f"{key}.json"
         try:
             return Record(
                 key=key,
                 variation=cell.variation,
-                summary=UnitSummary.from_dict(content["summary"]),
-                image_space=read_image_space(content["image_space"]) if cell.image_space else ImageSpace(),
+                summary=from_json(UnitSummary, content["summary"], path),
+                image_space=from_json(ImageSpace, content["image_space"], path) if cell.image_space else ImageSpace(),
                 voxels=self._voxels(cell.unit) if cell.voxels else None,
             )
-        except (KeyError, TypeError, ValueError) as error:
-            path = self.path / UNITS / f"{key}.json"
+        except KeyError as error:
             raise DataError(f"{path}: damaged ({error!r}); delete it, and the unit is computed again") from error
 
     def save_result(self, result: StudyResult) -> None:
@@ -126,5 +127,5 @@ def load_study_result(folder: str | Path) -> StudyResult:
     content = read_json(folder / "summary.json")
     try:
         return StudyResult.from_dict(content, folder, read_json(folder / "manifest.json"))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError) as error:
         raise DataError(f"{folder / 'summary.json'}: not the summary of a study ({error!r})") from error

@@ -22,6 +22,7 @@ from semstab.errors import DataError
 from semstab.evaluation import analyse_map, truth_task
 from semstab.files import atomic_path
 from semstab.frames import Frame
+from semstab.json_form import to_json
 from semstab.memory import available_bytes, require_memory
 from semstab.pipeline import Stopwatch, flicker_between, new_map, require_voxels, unit_summary
 from semstab.plan import Task, prepare, tasks_of
@@ -187,10 +188,10 @@ class Pass:
             truth = None if one.truth is None else _table(one.truth, task)
             found = analyse_map(task, config, table, one.backend.events() if config.statistics else None, truth)
             summary = unit_summary(task, config, table, unit, one.rows, found.summary)
-            content: dict[str, Any] = {"input": task.digest, "summary": summary.to_dict()}
+            content: dict[str, Any] = {"input": task.digest, "summary": to_json(summary)}
             files: dict[str, Callable[[Path], None]] = {}
             if one.request.image_space and stream.image_space is not None:
-                content["image_space"] = dataclasses.asdict(stream.image_space.result(summary.flicker_percent))
+                content["image_space"] = to_json(stream.image_space.result(summary.flicker_percent))
                 content["up"] = _up(self._scene, table, stream.poses)
                 files[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
             if one.request.voxels:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from semstab.datasets import Scene
 from semstab.errors import DataError
 from semstab.exclusion import leave_out
 from semstab.frames import Frame
+from semstab.json_form import to_json
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.perturbation import perturb
 from semstab.plan import frame_indices
@@ -31,7 +31,7 @@ def measure_regions(job: Job, scene: Scene, request: Request) -> Outcome:
     flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
     found = RegionFlicker(job.scene, job.backbone, macro_mean(flicker), macro_mean(compensated), macro_mean(share))
     digest = scene.digest(frame_indices(scene, request.config), job.backbone)
-    return Outcome(request.identity, {"input": digest, "regions": dataclasses.asdict(found)})
+    return Outcome(request.identity, {"input": digest, "regions": to_json(found)})
 
 
 def _frames(job: Job, scene: Scene, request: Request) -> Iterator[Frame]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from semstab.json_form import INLINE, from_json, to_json
 from semstab.results import Agreement, GroupResult, RunResult, Unit, UnitSummary
 from semstab.voxels import VoxelTable
 
@@ -120,18 +120,12 @@ class RegionFlicker:
     compensated_flicker_percent: float
     compensated_share: float
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> RegionFlicker:
-        """Read the JSON object; null is NaN."""
-        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in content.items()}
-        return cls(**values)
-
 
 @dataclass(frozen=True)
 class Failure:
     """A unit that could not be computed, and the one line that says why."""
 
-    unit: Unit
+    unit: Unit = field(metadata=INLINE)
     variation: Variation
     message: str
 
@@ -203,64 +197,56 @@ class StudyResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the study's summary.json; `load_study_result` reads it back."""
-        return {
-            "schema": SCHEMA,
-            "name": self.name,
-            "backend": self.backend,
-            "up": {scene: list(axis) for scene, axis in self.up.items()},
-            "runs": [_record_content(record) for record in self.records],
-            "failures": [
-                dataclasses.asdict(row.unit) | {"variation": dataclasses.asdict(row.variation), "message": row.message}
-                for row in self.failures
-            ],
-            "agreement": [row.to_dict() for row in self.agreement],
-            "regions": [dataclasses.asdict(row) for row in self.regions],
-            "comparisons": [dict(row) for row in self.comparisons],
-        }
+        content: dict[str, Any] = to_json(
+            {
+                "schema": SCHEMA,
+                "name": self.name,
+                "backend": self.backend,
+                "up": self.up,
+                "runs": [_record_content(record) for record in self.records],
+                "failures": self.failures,
+                "agreement": self.agreement,
+                "regions": self.regions,
+                "comparisons": self.comparisons,
+            }
+        )
+        return content
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], folder: Path, manifest: Mapping[str, Any]) -> StudyResult:
         """Read what `to_dict` wrote; voxel files lie in `folder`."""
+        where = folder / "summary.json"
         return cls(
             name=content["name"],
             backend=content["backend"],
-            records=tuple(_record(row, folder) for row in content["runs"]),
-            failures=tuple(_failure(row) for row in content["failures"]),
-            agreement=tuple(Agreement.from_dict(row) for row in content["agreement"]),
+            records=tuple(_record(row, folder, where) for row in content["runs"]),
+            failures=from_json(tuple[Failure, ...], content["failures"], where),
+            agreement=from_json(tuple[Agreement, ...], content["agreement"], where),
             up={scene: (axis[0], axis[1], axis[2]) for scene, axis in content["up"].items()},
             manifest=manifest,
-            regions=tuple(RegionFlicker.from_dict(row) for row in content["regions"]),
+            regions=from_json(tuple[RegionFlicker, ...], content["regions"], where),
             comparisons=tuple(content.get("comparisons", ())),  # studies of earlier versions have none
         )
 
 
 def _record_content(record: Record) -> dict[str, Any]:
-    return record.summary.to_dict() | {
+    return {
+        **to_json(record.summary),
         "key": record.key,
-        "variation": dataclasses.asdict(record.variation),
-        "image_space": dataclasses.asdict(record.image_space),
+        "variation": record.variation,
+        "image_space": record.image_space,
         "voxels_file": None if record.voxels is None else f"{VOXELS}/{record.voxels.name}",
     }
 
 
-def _record(row: Mapping[str, Any], folder: Path) -> Record:
+def _record(row: Mapping[str, Any], folder: Path, where: Path) -> Record:
     return Record(
         key=row["key"],
-        variation=Variation(**row["variation"]),
-        summary=UnitSummary.from_dict(row),
-        image_space=read_image_space(row["image_space"]),
+        variation=from_json(Variation, row["variation"], where),
+        summary=from_json(UnitSummary, row, where),
+        image_space=from_json(ImageSpace, row["image_space"], where),
         voxels=None if row["voxels_file"] is None else folder / row["voxels_file"],
     )
-
-
-def _failure(row: Mapping[str, Any]) -> Failure:
-    unit = Unit(row["scene"], row["backbone"], row["backend"])
-    return Failure(unit, Variation(**row["variation"]), row["message"])
-
-
-def read_image_space(row: Mapping[str, float | None]) -> ImageSpace:
-    """The measures from JSON, where null is NaN."""
-    return ImageSpace(**{name: math.nan if value is None else value for name, value in row.items()})
 
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import DataError
 from semstab.evaluation import comparable, comparison
+from semstab.json_form import from_json
 from semstab.manifest import manifest
 from semstab.metrics import compare
 from semstab.results import Agreement
@@ -168,7 +169,7 @@ def _result(config: StudyConfig, folder: StudyFolder, grid: Grid, found: _Found)
         comparisons=tuple(_comparisons(records)) if config.statistics else (),
         up=_up_axes(grid.cells, contents),
         regions=tuple(
-            RegionFlicker.from_dict(contents[cell.identity]["regions"])
+            from_json(RegionFlicker, contents[cell.identity]["regions"], folder.path)
             for cell in grid.regions
             if cell.identity in contents
         ),

@@ -6,17 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from semstab.statistics import estimate_at, number_at
+from semstab.statistics.comparison import compared
 from semstab.study.results import StudyResult
 from semstab.tables.table import Column, Group, Row, Table
 
-MEASURES = {
-    "psa": "PSA",
-    "alpha": "alpha",
-    "vss": "VSS",
-    "sbd": "SBD",
-    "entropy": "entropy",
-    "accuracy": "accuracy",
-}
 _COMMON = "On the voxels that every backbone saw twice or more."
 _INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
 
@@ -43,10 +36,10 @@ def _differences(result: StudyResult) -> Table:
 
 
 def _difference_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
-    rows = sorted(found["paired"]["differences"], key=lambda row: list(MEASURES).index(row["measure"]))
+    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
     return tuple(
-        (row["a"], row["b"], MEASURES[row["measure"]], estimate_at(row, "difference"), number_at(row, "p_holm"))
-        for row in rows
+        (row["a"], row["b"], words[row["measure"]], estimate_at(row, "difference"), number_at(row, "p_holm"))
+        for row in found["paired"]["differences"]
     )
 
 
@@ -71,18 +64,18 @@ def _ranking(result: StudyResult) -> Table:
 def _ranking_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
     rankings = {ranking["measure"]: ranking["ranks"] for ranking in found["paired"]["rankings"]}
     rows: list[Row] = []
-    for measure, name in MEASURES.items():
-        for rank in rankings.get(measure, ()):
+    for quantity in compared(truth=True):
+        for rank in rankings.get(quantity.key, ()):
             backbone = rank["backbone"]
             rows.append(
                 (
-                    name,
+                    quantity.word,
                     rank["rank"],
                     backbone,
                     f"{rank['low']} to {rank['high']}",
                     100 * number_at(rank, "best"),
-                    estimate_at(found, "paired", "values", measure, backbone),
-                    estimate_at(found, "standardised", "values", measure, backbone),
+                    estimate_at(found, "paired", "values", quantity.key, backbone),
+                    estimate_at(found, "standardised", "values", quantity.key, backbone),
                 )
             )
     return tuple(rows)
