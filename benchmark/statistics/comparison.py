@@ -121,8 +121,9 @@ def standardised(
     for name, table in tables.items():
         columns = np.zeros((len(table), 2 * S))
         stratum = _stratum(table, edges)
-        again = np.flatnonzero(stratum)
-        columns[again, stratum[again] - 1] = voxelwise()[measure](table)[again]
+        values = voxelwise()[measure](table)
+        again = np.flatnonzero((stratum > 0) & ~np.isnan(values))
+        columns[again, stratum[again] - 1] = values[again]
         columns[again, S + stratum[again] - 1] = 1.0
         bootstrap = BlockBootstrap(spatial_blocks(table.index, table.voxel_size), seed=seed)
         estimates[name] = bootstrap.estimate(columns, weighted, (0.0, 1.0))
@@ -237,9 +238,14 @@ def _columns(
     quantities = compared(truth=truth is not None)
     statistics: dict[Quantity, Statistic] = {q: alpha_of if q is ALPHA else ratio_of for q in quantities}
     columns: dict[Quantity, dict[str, Float64]] = {measure: {} for measure in statistics}
+    for measure, values in voxelwise().items():
+        own = [values(table)[r] for table, r in zip(tables.values(), rows, strict=True)]
+        known = ~np.isnan(own).any(axis=0)
+        columns[measure] = {
+            name: np.stack([np.where(known, value, 0.0), known], axis=1)
+            for name, value in zip(tables, own, strict=True)
+        }
     for (name, table), r in zip(tables.items(), rows, strict=True):
-        for measure, values in voxelwise().items():
-            columns[measure][name] = np.stack([values(table)[r], np.ones(len(r))], axis=1)
         columns[ALPHA][name] = alpha_columns(table)[r]
         if truth is not None:
             true = join_truth(table, truth)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from semstab.measures import measures
 from semstab.statistics import number_at
+from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 from semstab.study.results import Record, StudyResult
-from semstab.tables.stability import settings
+from semstab.tables.stability import of_measures, settings
 from semstab.tables.statistics import (
     INTERVALS,
     SEEN_TWICE,
@@ -20,6 +22,9 @@ from semstab.tables.statistics import (
     rows_of,
 )
 from semstab.tables.table import Column, Group, Row, Table
+
+RIGHT = (ACCURACY, MIOU, ECE, BRIER)
+"""How right fused labels are, in the order of the columns."""
 
 
 def ceiling(result: StudyResult) -> list[Table]:
@@ -56,10 +61,7 @@ def _correct_by_stratum(result: StudyResult) -> list[Table]:
     columns = (
         Column("persistence", "Persistence"),
         Column("voxels", "Voxels", 0),
-        Column("accuracy", "Accuracy", 3, "higher"),
-        Column("miou", "mIoU", 3, "higher"),
-        Column("ece", "ECE", 3, "lower"),
-        Column("brier", "Brier", 3, "lower"),
+        *map(Column.of, RIGHT),
     )
     groups = tuple(Group(name, _stratum_rows(records)) for name, records in judged.items())
     caption = (
@@ -97,14 +99,9 @@ def rules(result: StudyResult) -> list[Table]:
         return []
     columns = (
         Column("rule", "Rule"),
-        Column("vss", "VSS", 3, "higher"),
-        Column("sbd", "SBD", 4, "lower"),
-        Column("entropy", "Entropy", 4, "lower"),
+        *of_measures(),
         Column("relabelled_percent", "Relabelled (%)", 2),
-        Column("accuracy", "Accuracy", 3, "higher"),
-        Column("miou", "mIoU", 3, "higher"),
-        Column("ece", "ECE", 3, "lower"),
-        Column("brier", "Brier", 3, "lower"),
+        *map(Column.of, RIGHT),
     )
     groups = tuple(Group(name, _rule_rows(records)) for name, records in judged.items())
     caption = (
@@ -120,7 +117,7 @@ def rules(result: StudyResult) -> list[Table]:
 
 def _stratum_rows(records: Sequence[Record]) -> tuple[Row, ...]:
     return tuple(
-        (name, sum(row["voxels"] for row in rows), *means(rows, "accuracy", "miou", "ece", "brier"))
+        (name, sum(row["voxels"] for row in rows), *means(rows, *(quantity.key for quantity in RIGHT)))
         for name, rows in rows_of(records, "correctness", "strata").items()
     )
 
@@ -128,10 +125,9 @@ def _stratum_rows(records: Sequence[Record]) -> tuple[Row, ...]:
 def _rule_rows(records: Sequence[Record]) -> tuple[Row, ...]:
     rows: list[Row] = []
     for name, found in rows_of(records, "fusion_rules").items():
-        vss, sbd, entropy, relabelled, *right = means(
-            found, "vss", "sbd", "entropy", "relabelled_share", "accuracy", "miou", "ece", "brier"
-        )
-        rows.append((name, vss, sbd, entropy, 100 * relabelled, *right))
+        (relabelled,) = means(found, "relabelled_share")
+        measured, right = (means(found, *(q.key for q in of)) for of in (measures(), RIGHT))
+        rows.append((name, *measured, 100 * relabelled, *right))
     return tuple(rows)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from semstab.averages import ENOUGH, Level, Sweep, complete_scenes, levels, over_all, over_recurrent, swept
-from semstab.measures import VSS, measures
+from semstab.measures import SBD, VSS, measures
+from semstab.statistics.agreement import ALPHA, PSA
 from semstab.study.results import StudyResult
 from semstab.tables.stability import SBD_OVER, of_measures
 from semstab.tables.table import Column, Group, Row, Table
@@ -44,10 +45,8 @@ def _agreement_table(result: StudyResult, sweep: Sweep) -> Table | None:
     columns = (
         Column("value", sweep.header),
         Column("mean_op", "Mean OP", 2),
-        Column("vss", "VSS, all voxels", 4, "higher"),
-        Column("sbd", "SBD", 4, "lower"),
-        Column("psa", "PSA", 4, "higher"),
-        Column("alpha", "Alpha", 4, "higher"),
+        Column("vss", "VSS, all voxels", VSS.digits[1], VSS.better),
+        *(Column.of(quantity, compared=True) for quantity in (SBD, PSA, ALPHA)),
         Column("sbd_excess", "SBD excess", 4, signed=True),
     )
     by_backbone = {name: levels(result, sweep.name, name) for name in result.backbones}

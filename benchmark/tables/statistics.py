@@ -7,8 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from semstab.averages import by_backbone
+from semstab.measures import ENTROPY, VSS
 from semstab.metrics import macro_mean
 from semstab.statistics import Estimate, estimate_at, number_at
+from semstab.statistics.agreement import ALPHA, KAPPA, PSA
+from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.verdict import ADVICE
 from semstab.study.results import Record, StudyResult
 from semstab.tables.table import Column, Group, Row, Table
@@ -25,11 +28,7 @@ def temporal_agreement(result: StudyResult) -> list[Table]:
     """Do frames agree about a place? Measures that do not depend on OP."""
     columns = (
         REPEATED,
-        Column("vss", "VSS", 3, "higher"),
-        Column("psa", "PSA", 3, "higher"),
-        Column("kappa", "Kappa", 2, "higher"),
-        Column("alpha", "Alpha", 2, "higher"),
-        Column("flip_rate", "Flip rate", 3, "lower"),
+        *map(Column.of, (VSS, PSA, KAPPA, ALPHA, FLIP_RATE)),
     )
     numbers = (
         number("repeated", "voxels"),
@@ -55,8 +54,7 @@ def class_agreement(result: StudyResult) -> list[Table]:
     columns = (
         Column("class", "Class"),
         Column("observations", "Observations", 0),
-        Column("kappa", "Kappa", 2, "higher"),
-        Column("alpha", "Alpha", 2, "higher"),
+        *map(Column.of, (KAPPA, ALPHA)),
     )
     groups = tuple(Group(name, _class_rows(records)) for name, records in judged.items())
     caption = (
@@ -110,7 +108,7 @@ def drift(result: StudyResult) -> list[Table]:
 def uncertainty(result: StudyResult) -> list[Table]:
     """The entropy of the belief, within frames and between them."""
     columns = (
-        Column("entropy", "Entropy", 4, "lower"),
+        Column.of(ENTROPY),
         Column("within", "within frames", 4, "lower"),
         Column("between", "between frames", 4, "lower"),
         Column("within_percent", "within (%)", 0),
@@ -142,7 +140,7 @@ def verdicts(result: StudyResult) -> list[Table]:
     columns = (
         SCENE,
         Column("verdict", "Verdict"),
-        Column("alpha", "Alpha", 2, "higher"),
+        Column.of(ALPHA),
         Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
