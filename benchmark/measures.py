@@ -122,6 +122,13 @@ def entropy(table: Beliefs) -> Float64:
     return normalised
 
 
+def margin(table: Beliefs) -> Float64:
+    """How far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
+    second, first = np.partition(normalise(table.evidence), -2, axis=1)[:, -2:].T
+    lead: Float64 = first - second
+    return lead
+
+
 def dominant(table: Beliefs) -> npt.NDArray[np.int64]:
     """Dominant class (n,): argmax_k e_k, the lowest on ties."""
     label: npt.NDArray[np.int64] = table.evidence.argmax(axis=1)
@@ -144,8 +151,9 @@ ENTROPY = Measure(
     key="entropy", title="Entropy", short="H", better="lower", digits=(4, 4), of=entropy, range=(0.0, 0.5),
     section=_SECTION,
 )  # fmt: skip
+MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0))
 
-_REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY)}
+_REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 
 
 def measures() -> tuple[Measure, ...]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from semstab import backends
 from semstab.errors import DataError
 from semstab.frames import Frame, Intrinsics
-from semstab.measures import ENTROPY, SBD, VSS, measures
+from semstab.measures import ENTROPY, SBD, VSS, margin, measures
 from semstab.metrics import (
     compare,
     dominant,
@@ -236,6 +236,13 @@ def test_vss_and_entropy_of_a_voxel(evidence, concentration, uncertainty):
     assert entropy(table)[0] == pytest.approx(uncertainty)
 
 
+@pytest.mark.parametrize(
+    ("evidence", "lead"), [([4, 0, 0, 0], 1), ([1, 1, 1, 1], 0), ([2, 2, 0, 0], 0), ([1, 0, 2, 1], 0.25), ([1, 3], 0.5)]
+)
+def test_the_margin_is_how_far_the_dominant_class_is_ahead(evidence, lead):
+    assert margin(voxel_table([4], [evidence]))[0] == pytest.approx(lead)
+
+
 def test_op_is_the_number_of_frames():
     assert op(voxel_table([1, 5], [[1, 0]] * 2)).tolist() == [1, 5]
 
@@ -300,7 +307,7 @@ def test_a_map_agrees_with_itself():
     assert (row.scene, row.backbone, row.backends) == ("s", "b", ("numpy", "open3d"))
     assert (row.voxels, row.only_in) == ((3, 3), (0, 0))
     assert {name: (d.max, d.mean) for name, d in row.differences.items()} == dict.fromkeys(
-        ["op", "vss", "sbd", "entropy", "evidence"], (0, 0)
+        ["op", *(measure.key for measure in measures()), "evidence"], (0, 0)
     )
 
 
@@ -311,7 +318,7 @@ def test_a_map_agrees_with_itself():
         ("drift_sum", 1, 0.4, {"sbd"}),
         ("evidence", 1, [2, 2], {"evidence"}),
         ("evidence", 2, [1, 3], {"evidence"}),
-        ("evidence", 2, [2, 2], {"evidence", "vss", "entropy"}),
+        ("evidence", 2, [2, 2], {"evidence", "vss", "entropy", "margin"}),
     ],
 )
 def test_a_difference_in_any_quantity_is_disagreement(column, row, value, quantities):

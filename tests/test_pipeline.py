@@ -114,7 +114,8 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
         assert key in first
     assert first["strata"][0]["sbd"] is None
     assert first["strata"][3] == {
-        "name": "OP>5", "share": 0.0, "voxels": 0, "vss": None, "sbd": None, "entropy": None, "sbd_voxels": 0
+        "name": "OP>5", "share": 0.0, "voxels": 0, "vss": None, "sbd": None, "entropy": None, "margin": None,
+        "sbd_voxels": 0,
     }  # fmt: skip
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["command"] == ["semstab-bench", "--x"]

@@ -308,7 +308,7 @@ def test_a_cell_in_print(column, cell, text):
 
 
 def test_the_rows_of_the_papers_scene_table_are_printed_as_there():
-    columns = table_of(study(record(voxels((1, 1, SURE)))), "scenes").columns
+    columns = table_of(study(record(voxels((1, 1, SURE)))), "scenes").columns[:7]
     row = ("Total / Mean", 705902, 1353903, 1.5134, 0.95668, 0.084538, 0.033598)
     text = [column.text(cell) for column, cell in zip(columns, row, strict=True)]
     assert text == ["Total / Mean", "705,902", "1,353,903", "1.51", "0.957", "0.0845", "0.0336"]
