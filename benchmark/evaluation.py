@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 from semstab.backends import FusionBackend, create, takes_option
 from semstab.config import Config
@@ -15,7 +14,7 @@ from semstab.frames import Frame
 from semstab.plan import Task, read
 from semstab.prefetch import prefetch
 from semstab.results import Unit
-from semstab.statistics import Analysis, analyse, compare_backbones, nulls
+from semstab.statistics import Analysis, BackboneComparison, analyse, compare_backbones
 from semstab.voxels import Events, VoxelTable
 
 
@@ -73,13 +72,13 @@ class Evaluation:
         self._tasks.append(task)
         self._maps[task.backbone] = table
 
-    def comparisons(self) -> list[dict[str, Any]]:
+    def comparisons(self) -> list[BackboneComparison]:
         """The backbones of the scene at hand beside each other; none where there are not two to compare."""
         backbones = {name: table for name, table in self._maps.items() if name != GROUND_TRUTH}
         if not comparable(backbones):
             return []
         truth = next(self._truth(task) for task in self._tasks if task.backbone != GROUND_TRUTH)
-        return [comparison(self._tasks[0].scene.name, backbones, truth)]
+        return [compare_backbones(backbones, truth=truth, scene=self._tasks[0].scene.name)]
 
     def _truth(self, task: Task) -> VoxelTable | None:
         """The map of the ground truth of the task's frames, fused once for all backbones of the scene."""
@@ -94,12 +93,6 @@ class Evaluation:
 def comparable(maps: Mapping[str, VoxelTable]) -> bool:
     """Whether these are two maps or more, in one label space."""
     return len(maps) > 1 and len({table.classes for table in maps.values()}) == 1
-
-
-def comparison(scene: str, maps: Mapping[str, VoxelTable], truth: VoxelTable | None) -> dict[str, Any]:
-    """Content for JSON of comparable maps of a scene."""
-    found: dict[str, Any] = nulls({"scene": scene} | compare_backbones(maps, truth=truth))
-    return found
 
 
 def _fused_truth(task: Task, config: Config) -> VoxelTable | None:

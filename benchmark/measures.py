@@ -6,16 +6,17 @@ Summaries, comparisons, tables, figures, Parquet, the terminal and the recording
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.information import entropy_bits, normalise
+from semstab.json_form import fields_of
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
@@ -176,3 +177,49 @@ def registered(measure: Measure) -> Iterator[None]:
         yield
     finally:
         del _REGISTER[measure.key]
+
+
+# --- Means ------------------------------------------------------------------------------------------------------------
+
+
+def mean(values: npt.NDArray[Any]) -> float:
+    """The mean of the values that are defined; NaN where none is."""
+    defined = values[~np.isnan(values)]
+    return float(defined.mean()) if defined.size else math.nan
+
+
+@dataclass(frozen=True)
+class MeasureMeans:
+    """The mean of every measure over a group of voxels, by its key; NaN where undefined.
+
+    voxels has, for the measures that do not exist at every OP, over how many the mean runs. In JSON these are entries
+    KEY and KEY_voxels of what the means belong to.
+    """
+
+    value: Mapping[str, float]
+    voxels: Mapping[str, int]
+
+    @classmethod
+    def over(cls, values: Mapping[Measure, Float64], op: Int32, where: npt.NDArray[np.bool_]) -> MeasureMeans:
+        """Of values (n,) of each measure over the voxels for which `where` (n,) holds."""
+        rare = {m.key: int(np.count_nonzero(where & (op >= m.lowest_op))) for m in values if m.lowest_op > 1}
+        return cls({measure.key: mean(value[where]) for measure, value in values.items()}, rare)
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.value[measure.key]
+
+    def of_all(self) -> list[float]:
+        """The mean of every measure, in their order."""
+        return [self[measure] for measure in measures()]
+
+    def json_content(self) -> dict[str, float]:
+        """Entries by key."""
+        return {**self.value, **{f"{key}_voxels": n for key, n in self.voxels.items()}}
+
+    @classmethod
+    def of_json_content(cls, content: Any) -> MeasureMeans:
+        """The entries of all measures."""
+        rare = [measure.key for measure in measures() if measure.lowest_op > 1]
+        counts = fields_of(content, {f"{key}_voxels": int for key in rare})
+        value = fields_of(content, {measure.key: float for measure in measures()})
+        return cls(value, {key: counts[f"{key}_voxels"] for key in rare})

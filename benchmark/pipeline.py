@@ -14,7 +14,6 @@ from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from semstab.plan import Plan, Task, make_plan, read, resolve
 from semstab.prefetch import Fetched, prefetch
 from semstab.results import STAGES, GroupResult, RunResult, Unit, UnitSummary
 from semstab.run_folder import FrameRow, RunFolder, group_key
-from semstab.statistics import nulls
+from semstab.statistics import BackboneComparison, MapStatistics
 from semstab.voxels import VoxelTable
 
 
@@ -81,7 +80,7 @@ def run(
     for observer in observers:
         observer.run_started(plan)
     groups: list[GroupResult] = []
-    comparisons: list[Mapping[str, Any]] = []
+    comparisons: list[BackboneComparison] = []
     geometry: dict[str, Verdict] = {}
     evaluation = Evaluation(config)
     for task in plan.tasks:
@@ -161,7 +160,7 @@ def _fuse(
     with watch("statistics"):
         analyses = evaluation.analyses(task, maps, tables)
     with watch("measure"):
-        said = {unit: analyses[unit].summary if unit in analyses else {} for unit in maps}
+        said = {unit: analyses[unit].summary if unit in analyses else None for unit in maps}
         summaries = {unit: unit_summary(task, config, tables[unit], unit, rows[unit], said[unit]) for unit in maps}
         alike = [unit for unit, backend in maps.items() if getattr(backend, "pointwise", True)]
         agreement = tuple(
@@ -262,7 +261,7 @@ def unit_summary(
     table: VoxelTable,
     unit: Unit,
     rows: list[FrameRow],
-    statistics: Mapping[str, Any],
+    statistics: MapStatistics | None,
 ) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what `semstab.statistics` says of the map."""
     return UnitSummary(
@@ -274,7 +273,7 @@ def unit_summary(
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms=_stages_ms(rows),
         left_out=sum(row.left_out for row in rows),
-        statistics=nulls(statistics),
+        statistics=statistics,
     )
 
 

@@ -8,8 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from semstab.json_form import INLINE, fields_of, to_json
-from semstab.measures import Measure, measures
+from semstab.json_form import INLINE, to_json
+from semstab.measures import Measure, MeasureMeans
+from semstab.statistics_model import BackboneComparison, MapStatistics
 
 SCHEMA = 1
 """Version of summary.json."""
@@ -81,30 +82,6 @@ class FrameReport:
 
 
 @dataclass(frozen=True)
-class MeasureMeans:
-    """The mean of every measure over a group of voxels, by its key; NaN where undefined.
-
-    voxels has, for the measures that do not exist at every OP, over how many the mean runs. In JSON these are entries
-    KEY and KEY_voxels of what the means belong to.
-    """
-
-    value: Mapping[str, float]
-    voxels: Mapping[str, int]
-
-    def json_content(self) -> dict[str, float]:
-        """Entries by key."""
-        return {**self.value, **{f"{key}_voxels": n for key, n in self.voxels.items()}}
-
-    @classmethod
-    def of_json_content(cls, content: Any) -> MeasureMeans:
-        """The entries of all measures."""
-        rare = [measure.key for measure in measures() if measure.lowest_op > 1]
-        counts = fields_of(content, {f"{key}_voxels": int for key in rare})
-        value = fields_of(content, {measure.key: float for measure in measures()})
-        return cls(value, {key: counts[f"{key}_voxels"] for key in rare})
-
-
-@dataclass(frozen=True)
 class Means:
     """Means over a group of voxels: a stratum, a class, the recurrent ones; `means[VSS]` is that of a measure.
 
@@ -117,7 +94,7 @@ class Means:
     means: MeasureMeans = field(metadata=INLINE)
 
     def __getitem__(self, measure: Measure) -> float:
-        return self.means.value[measure.key]
+        return self.means[measure]
 
     def defined(self, measure: Measure) -> int:
         """The voxels over which the measure's mean runs."""
@@ -143,7 +120,7 @@ class TableSummary:
     classes: tuple[Means, ...]
 
     def __getitem__(self, measure: Measure) -> float:
-        return self.means.value[measure.key]
+        return self.means[measure]
 
 
 @dataclass(frozen=True)
@@ -151,7 +128,7 @@ class UnitSummary:
     """One entry of 'runs' in summary.json.
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves; statistics is what `semstab.statistics.describe` says of the map, empty where
+    fusion because what they show moves; statistics is what `semstab.statistics.describe` says of the map, None where
     nothing was asked for.
     """
 
@@ -163,7 +140,7 @@ class UnitSummary:
     fuse_ms_per_frame: float
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     left_out: int = 0
-    statistics: Mapping[str, Any] = field(default_factory=dict)
+    statistics: MapStatistics | None = None
 
 
 @dataclass(frozen=True)
@@ -206,7 +183,7 @@ class RunResult:
     """
 
     groups: tuple[GroupResult, ...]
-    comparisons: tuple[Mapping[str, Any], ...] = ()
+    comparisons: tuple[BackboneComparison, ...] = ()
 
     @property
     def runs(self) -> tuple[UnitSummary, ...]:

@@ -82,11 +82,10 @@ def _verdict_lines(result: RunResult) -> Iterator[str]:
     """The verdict on each backbone, scene by scene, from the fullest statistics that a backend of the run has."""
     several = len(_scenes(result.runs)) > 1
     for group in result.groups:
-        judged = [run for run in group.runs if run.statistics]
+        judged = [run.statistics for run in group.runs if run.statistics is not None]
         if judged:
-            fullest = max(judged, key=lambda run: sum(section is not None for section in run.statistics.values()))
-            scene = f"{fullest.unit.scene}, " if several else ""
-            yield f"{scene}{fullest.statistics['verdict']['line']}\n"
+            scene = f"{group.runs[0].unit.scene}, " if several else ""
+            yield f"{scene}{max(judged, key=lambda found: found.sections).verdict.line}\n"
 
 
 def _once(run: UnitSummary) -> int:

@@ -19,7 +19,7 @@ from semstab.config import Config
 from semstab.errors import ConfigError
 from semstab.measures import VSS, Measure, measures, register, registered
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import histogram
+from semstab.plots.histograms import histograms
 from semstab.plots.judgement import statistics_figures
 from semstab.plots.maps import draw_stability
 from semstab.plots.sweeps import draw_sweep
@@ -132,7 +132,7 @@ def titles(figure) -> list[str]:
 def test_figures_show_it(study) -> None:
     result, _ = study
     table = result.select()[0].table()
-    found = {"a": histogram(table)}
+    found = {"a": histograms(table)}
     swept = {"a": levels(result, "voxel_size", "a")}
     panels = (
         draw_ecdf(found, informative(found.values())),

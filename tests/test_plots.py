@@ -23,7 +23,7 @@ from semstab.measures import SBD_MAX, VSS, measures
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
 from semstab.plots import figures, topdown
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import BINS, OP_BOUNDS, histogram, op_position, together
+from semstab.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
 from semstab.plots.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.plots.style import COLUMN, DPI, PAGE
 from semstab.plots.sweeps import draw_sweep
@@ -67,7 +67,7 @@ def test_the_bins_of_op_are_single_values_and_then_widen():
 @given(SEQUENCES)
 def test_histograms_say_what_the_voxels_say(sequence):
     table = fused(sequence)
-    found = histogram(table)
+    found = histograms(table)
     for measure, values in ((found["vss"], 1 - vss(table)), (found["sbd"], sbd(table))):
         defined = ~np.isnan(values)
         for k, seen in enumerate(range(1, 9)):
@@ -104,7 +104,7 @@ def test_the_largest_drift_is_that_of_two_frames_that_contradict_each_other():
 def test_histograms_add_up():
     parts = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1)), voxels((2, 4, SPLIT, 0.2), (7, 2, SURE))
     whole = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1), (2, 4, SPLIT, 0.2), (7, 2, SURE))
-    added, direct = together(map(histogram, parts)), histogram(whole)
+    added, direct = together(map(histograms, parts)), histograms(whole)
     assert set(added) == {measure.key for measure in measures()}
     for key, found in added.items():
         assert np.array_equal(found.counts, direct[key].counts)
@@ -112,12 +112,12 @@ def test_histograms_add_up():
 
 
 def test_the_ecdf_of_recurrent_voxels_leaves_the_others_out():
-    measure = histogram(voxels((6, 1, SURE), (3, 3, SURE), (1, 3, SPLIT)))["vss"]
+    measure = histograms(voxels((6, 1, SURE), (3, 3, SURE), (1, 3, SPLIT)))["vss"]
     assert (measure.ecdf()[0], measure.ecdf(3)[0], measure.ecdf(3)[BINS // 4]) == (0.9, 0.75, 1.0)
 
 
 def test_the_axes_of_the_ecdfs_end_where_nearly_all_voxels_are():
-    ends = informative([histogram(voxels((99, 2, SURE, 0.1), (1, 2, [1, 1, 0], 0.3)))])
+    ends = informative([histograms(voxels((99, 2, SURE, 0.1), (1, 2, [1, 1, 0], 0.3)))])
     assert ends["vss"] == 0.06
     assert ends["sbd"] == pytest.approx(0.1, abs=SBD_MAX / BINS)
 
@@ -258,7 +258,7 @@ def test_recurrent_values_of_few_voxels_are_not_drawn():
 
 
 def test_curves_against_op_have_the_means_of_the_voxels():
-    found = histogram(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
+    found = histograms(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
     stability, drift, *_, counts = draw_persistence({"m": found}).axes
     mean, few = stability.get_lines()
     assert mean.get_xdata().tolist() == pytest.approx([1, 2, 4])
@@ -269,7 +269,7 @@ def test_curves_against_op_have_the_means_of_the_voxels():
 
 
 def test_an_ecdf_has_a_curve_a_scene_and_one_of_the_recurrent_voxels():
-    scenes = {name: histogram(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
+    scenes = {name: histograms(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
     disagreement, *_ = draw_ecdf(scenes, informative(scenes.values())).axes
     at_zero = [line.get_ydata()[0] for line in disagreement.get_lines()]
     assert at_zero == pytest.approx([0.5, 0.25, 0.0])

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import DataError
 from semstab.measures import measures
+from semstab.metrics.matching import shared_rows
 from semstab.results import Agreement, Deviation, Unit
 from semstab.voxels import VoxelTable
 
@@ -26,12 +26,7 @@ def compare(
     one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
     Raises DataError where the maps differ in K or voxel size.
     """
-    if (a.K, a.voxel_size) != (b.K, b.voxel_size):
-        raise DataError(
-            f"maps of {a.K} classes in voxels of {a.voxel_size:g} m and of {b.K} in {b.voxel_size:g} m"
-            " cannot be compared; fuse both alike"
-        )
-    in_a, in_b = _shared_rows(a, b)
+    in_a, in_b = shared_rows(a, b)
     quantities: dict[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]] = {
         "op": (a.op, b.op),
         **{measure.key: (measure.of(a), measure.of(b)) for measure in measures()},
@@ -50,14 +45,6 @@ def compare(
         differences=differences,
         agrees=same_voxels and same_values,
     )
-
-
-def _shared_rows(a: VoxelTable, b: VoxelTable) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Rows of the voxels that both tables hold."""
-    index = np.concatenate([a.index, b.index])
-    order = np.lexsort(index.T[::-1])  # stable: of two equal voxels a's comes first
-    twin = np.flatnonzero((index[order][1:] == index[order][:-1]).all(axis=1))
-    return order[twin], order[twin + 1] - len(a)
 
 
 def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Deviation:

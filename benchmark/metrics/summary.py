@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from semstab.measures import dominant, measures
-from semstab.results import RECURRENT, Means, MeasureMeans, TableSummary
+from semstab.measures import MeasureMeans, dominant, mean, measures
+from semstab.results import RECURRENT, Means, TableSummary
 from semstab.voxels import VoxelTable
 
 STRATA = (1, 2, 5)
@@ -26,13 +26,9 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     label = dominant(table)
     names = table.classes or tuple(str(k) for k in range(table.K))
 
-    def of(where: npt.NDArray[np.bool_]) -> MeasureMeans:
-        rare = {m.key: int(np.count_nonzero(where & (table.op >= m.lowest_op))) for m in values if m.lowest_op > 1}
-        return MeasureMeans({measure.key: _mean(value[where]) for measure, value in values.items()}, rare)
-
     def means(name: str, where: npt.NDArray[np.bool_]) -> Means:
         n = int(np.count_nonzero(where))
-        return Means(name, n / len(table) if len(table) else math.nan, n, of(where))
+        return Means(name, n / len(table) if len(table) else math.nan, n, MeasureMeans.over(values, table.op, where))
 
     observations = int(table.op.sum(dtype=np.int64))
     return TableSummary(
@@ -42,7 +38,7 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
         observations=observations,
         voxels=len(table),
         mean_op=observations / len(table) if len(table) else math.nan,
-        means=of(np.ones(len(table), dtype=np.bool_)),
+        means=MeasureMeans.over(values, table.op, np.ones(len(table), dtype=np.bool_)),
         strata=tuple(means(name, (table.op >= low) & (table.op <= high)) for name, low, high in strata(edges)),
         recurrent=means(f"OP>={RECURRENT}", table.op >= RECURRENT),
         classes=tuple(means(name, label == k) for k, name in enumerate(names)),
@@ -75,14 +71,9 @@ def pool(groups: Sequence[Means], voxels: int) -> Means:
 
 def macro_mean(values: Sequence[float]) -> float:
     """The mean over scenes, each counting once, of those where the value is defined; NaN where none is."""
-    return _mean(np.array(values, dtype=np.float64))
+    return mean(np.array(values, dtype=np.float64))
 
 
 def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
     total = sum(weights)
     return sum(v * w for v, w in zip(values, weights, strict=True) if w) / total if total else math.nan
-
-
-def _mean(values: npt.NDArray[np.float64]) -> float:
-    defined = values[~np.isnan(values)]
-    return float(defined.mean()) if defined.size else math.nan

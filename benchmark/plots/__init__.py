@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from semstab.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
 from semstab.files import keep_only
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import Histogram, histogram, together
+from semstab.plots.histograms import Histograms, histograms, together
 from semstab.plots.judgement import statistics_figures
 from semstab.plots.maps import Overview, draw_overview, draw_stability
 from semstab.plots.style import Figure
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 __all__ = ["Figure", "figures", "write_figures"]
-
-Histograms = Mapping[str, Mapping[str, Histogram]]
-"""By backbone and scene."""
 
 
 def write_figures(result: StudyResult, folder: str | Path) -> list[Path]:
@@ -80,15 +77,16 @@ def _distributions(kept: list[Record]) -> Iterator[Figure]:
         return
 
     @functools.cache
-    def histograms() -> Histograms:
+    def of_all() -> dict[str, dict[str, Histograms]]:
+        """By backbone and scene."""
         return {
-            backbone: {record.unit.scene: histogram(record.table()) for record in records}
+            backbone: {record.unit.scene: histograms(record.table()) for record in records}
             for backbone, records in by_backbone(kept).items()
         }
 
     def ecdf(backbone: str) -> Canvas:
-        ends = informative(found for scenes in histograms().values() for found in scenes.values())
-        return draw_ecdf(histograms()[backbone], ends)
+        ends = informative(found for scenes in of_all().values() for found in scenes.values())
+        return draw_ecdf(of_all()[backbone], ends)
 
     for backbone in by_backbone(kept):
         yield Figure(
@@ -107,7 +105,7 @@ def _distributions(kept: list[Record]) -> Iterator[Figure]:
         "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
         " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
         "For each backbone, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
-        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in histograms().items()}),
+        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in of_all().items()}),
     )
 
 

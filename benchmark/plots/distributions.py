@@ -10,7 +10,7 @@ import numpy as np
 
 from semstab.averages import ENOUGH
 from semstab.measures import measures
-from semstab.plots.histograms import Histogram, MeasureByOP, lacking, op_position, together
+from semstab.plots.histograms import Histograms, MeasureByOP, lacking, op_position, together
 from semstab.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, mark_panel
 from semstab.results import RECURRENT
 
@@ -24,7 +24,7 @@ INFORMATIVE = 0.99
 """The axes of the ECDFs end where this share of the voxels of every curve is reached."""
 
 
-def draw_ecdf(scenes: Mapping[str, Histogram], ends: Mapping[str, float]) -> Figure:
+def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Figure:
     """The ECDF of how much each measure lacks in each scene, and in all recurrent voxels; ends are those of x axes."""
     shown = measures()
     figure = canvas(PAGE, 2.4 * math.ceil(len(shown) / 2))
@@ -51,7 +51,7 @@ def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: Meas
         axes.step(everything.values, recurrent, "k--", where="post", linewidth=1.0, label="OP ≥ 3, all scenes")
 
 
-def informative(histograms: Iterable[Histogram]) -> dict[str, float]:
+def informative(units: Iterable[Histograms]) -> dict[str, float]:
     """Where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
 
     def end(found: MeasureByOP) -> float:
@@ -59,13 +59,13 @@ def informative(histograms: Iterable[Histogram]) -> dict[str, float]:
         return float(found.values[reached.argmax()]) if reached.any() else found.largest
 
     ends: dict[str, float] = {}
-    for scene in histograms:
+    for scene in units:
         for key, found in scene.items():
             ends[key] = max(ends.get(key, 0.06 * found.largest), end(found))
     return ends
 
 
-def draw_persistence(backbones: Mapping[str, Histogram]) -> Figure:
+def draw_persistence(backbones: Mapping[str, Histograms]) -> Figure:
     """Each measure against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -90,7 +90,7 @@ def draw_persistence(backbones: Mapping[str, Histogram]) -> Figure:
     return figure
 
 
-def _draw_column(rows: Panels, found: Histogram, shade: str) -> None:
+def _draw_column(rows: Panels, found: Histograms, shade: str) -> None:
     voxels = next(iter(found.values())).voxels
     present = voxels > 0
     x, few = op_position()[present], voxels[present] < ENOUGH

@@ -82,7 +82,7 @@ class MeasureByOP:
         return np.where(self.voxels > 0, self.values[reached.argmax(axis=1)], np.nan)
 
 
-Histogram = Mapping[str, MeasureByOP]
+Histograms = Mapping[str, MeasureByOP]
 """Of a unit's voxels, or of several units' together: each measure by its key."""
 
 
@@ -91,15 +91,15 @@ def lacking(measure: Measure, value: Float64) -> Float64:
     return value if measure.better == "lower" else measure.largest - value
 
 
-def histogram(table: VoxelTable) -> Histogram:
-    """The histogram of a unit."""
+def histograms(table: VoxelTable) -> Histograms:
+    """The histograms of a unit."""
     bins = np.searchsorted(OP_BOUNDS, op(table), side="right") - 1
     return {m.key: MeasureByOP.of(lacking(m, m.of(table)), bins, m.largest) for m in measures()}
 
 
-def together(histograms: Iterable[Histogram]) -> Histogram:
+def together(units: Iterable[Histograms]) -> Histograms:
     """The voxels of several units pooled."""
-    return reduce(lambda a, b: {key: one + b[key] for key, one in a.items()}, histograms)
+    return reduce(lambda a, b: {key: one + b[key] for key, one in a.items()}, units)
 
 
 def op_position() -> Float64:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from semstab.plots.distributions import mark_op
 from semstab.plots.histograms import OP_BOUNDS, op_position
 from semstab.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, mark_panel
 from semstab.plots.sweeps import draw_line, mark_values
-from semstab.statistics import Estimate
+from semstab.statistics_model import Estimate, Reliability
 from semstab.voxels import VoxelTable
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _draw_drift(axes: Axes, found: DriftByOP, shade: str) -> None:
 # --- Calibration ------------------------------------------------------------------------------------------------------
 
 
-def draw_reliability(backbones: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def draw_reliability(backbones: Mapping[str, Sequence[Reliability]]) -> Figure:
     """Accuracy against the largest belief, and how many voxels have it; the bins of several scenes are pooled."""
     figure = canvas(COLUMN, 3.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -137,13 +137,13 @@ def draw_reliability(backbones: Mapping[str, Sequence[Mapping[str, Any]]]) -> Fi
     return figure
 
 
-def _pooled_bins(bins: Sequence[Mapping[str, Any]]) -> tuple[Float64, Float64, Float64, Float64]:
+def _pooled_bins(bins: Sequence[Reliability]) -> tuple[Float64, Float64, Float64, Float64]:
     """Voxels, mean confidence and accuracy, and the middle of each bin that has voxels."""
     sums: dict[float, Float64] = {}
     for row in bins:
-        if row["voxels"]:
-            own = row["voxels"] * np.array([1.0, row["confidence"], row["accuracy"]])
-            middle = (row["low"] + row["high"]) / 2
+        if row.voxels:
+            own = row.voxels * np.array([1.0, row.confidence, row.accuracy])
+            middle = (row.low + row.high) / 2
             sums[middle] = sums.get(middle, np.zeros(3)) + own
     middles = np.array(sorted(sums))
     voxels, confidence, accuracy = np.array([sums[middle] for middle in middles]).reshape(-1, 3).T

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from semstab.metrics import vss
+from semstab.metrics.matching import shared_rows
 from semstab.recording.layout import DIFFERENCE
 from semstab.recording.voxel_maps import thinned
 from semstab.voxels import VoxelTable
@@ -32,7 +33,7 @@ def log_difference(
     Returns how many there are, in words. They are of the final maps, so they are logged for all times.
     """
     first, second = tables.values()
-    in_first, in_second = matched(first, second)
+    in_first, in_second = shared_rows(first, second)
     change = np.abs(vss(first)[in_first] - vss(second)[in_second])
     differs = change > tolerance
     parts = {
@@ -57,11 +58,3 @@ def log_difference(
         f"{len(parts['only_first']):,} voxels in {one} only, {len(parts['only_second']):,} in {other} only; of"
         f" {len(in_first):,} in both VSS differs in {int(differs.sum()):,}, by {change.max(initial=0.0):.2g} at most"
     )
-
-
-def matched(first: VoxelTable, second: VoxelTable) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Rows of two tables that are the same voxel, ascending in both."""
-    low = np.minimum(first.index.min(axis=0), second.index.min(axis=0)).astype(np.int64)
-    a, b = (np.ascontiguousarray(table.index - low) @ (1 << 42, 1 << 21, 1) for table in (first, second))
-    _, in_first, in_second = np.intersect1d(a, b, assume_unique=True, return_indices=True)
-    return in_first, in_second

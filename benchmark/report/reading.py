@@ -53,13 +53,13 @@ def _recurrent(backbone: str, voxels: Pooled) -> Iterator[str]:
 
 def _verdict(records: Sequence[Record]) -> Iterator[str]:
     """The verdict on a backbone; of several scenes, in how many each level was reached."""
-    judged = [record for record in records if record.statistics]
+    judged = [record.statistics.verdict for record in records if record.statistics is not None]
     if len(judged) == 1:
-        yield f"{judged[0].statistics['verdict']['line']}."
+        yield f"{judged[0].line}."
     elif judged:
-        levels = Counter(record.statistics["verdict"]["level"] for record in judged)
+        levels = Counter(verdict.level for verdict in judged)
         parts = (f"{level} in {n} scene{'' if n == 1 else 's'}" for level, n in levels.items())
-        yield f"Verdict on {judged[0].unit.backbone}: {', '.join(parts)}."
+        yield f"Verdict on {records[0].unit.backbone}: {', '.join(parts)}."
 
 
 def _ranking(result: StudyResult) -> Iterator[str]:

@@ -5,25 +5,24 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.measures import Quantity, dominant, measures
+from semstab.metrics.matching import require_same_grid, shared_rows
 from semstab.results import RECURRENT
 from semstab.statistics.agreement import ALPHA, PSA, alpha_columns, alpha_of, psa, ratio_of
 from semstab.statistics.blocks import (
     LEAST_BLOCKS,
     REPLICATES,
     BlockBootstrap,
-    Estimate,
     Statistic,
     spatial_blocks,
 )
 from semstab.statistics.correctness import ACCURACY, join_truth
-from semstab.statistics.matching import require_same_grid, shared_rows
+from semstab.statistics_model import Estimate, MapCoverage, Paired, PairedDifference, Rank, Ranking
 from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
@@ -33,20 +32,6 @@ EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
 """Upper edges of the strata of OP that comparisons are standardised by; OP = 1 is left out."""
 
 FLIPS = 9999
-
-
-@dataclass(frozen=True)
-class MapCoverage:
-    """What a backbone's map covers. `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
-
-    backbone: str
-    voxels: int
-    observations: int
-    mean_op: float
-    repeated: int
-    recurrent: int
-    common_share: float
-    alone: int
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
@@ -138,60 +123,6 @@ def _stratum(table: VoxelTable, edges: Sequence[int]) -> npt.NDArray[np.int64]:
 
 
 # --- On the same places -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """A measure of backbone a minus that of b on the voxels that all saw twice or more.
-
-    p_value  of the paired sign-flip test over blocks, for measures with one value a voxel; p_holm corrects it for the
-             number of pairs (Holm 1979)
-    """
-
-    measure: str
-    a: str
-    b: str
-    difference: Estimate
-    p_value: float
-    p_holm: float
-
-
-@dataclass(frozen=True)
-class Rank:
-    """A backbone's place, 1 being the best, with the range that holds 95 % of the resamples.
-
-    best is the share of the resamples in which it is first.
-    """
-
-    backbone: str
-    value: float
-    rank: int
-    low: int
-    high: int
-    best: float
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """The backbones by one measure on common voxels, the best first."""
-
-    measure: str
-    ranks: tuple[Rank, ...]
-
-
-@dataclass(frozen=True)
-class Paired:
-    """Backbones on the voxels that every one of them observed at least twice.
-
-    values  what is `compared`, by its key and backbone
-    """
-
-    voxels: int
-    blocks: int
-    block_size: float
-    values: Mapping[str, Mapping[str, Estimate]]
-    differences: tuple[PairedDifference, ...]
-    rankings: tuple[Ranking, ...]
 
 
 def repeated_rows(tables: Tables) -> list[npt.NDArray[np.int64]]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from semstab.json_form import INLINE, from_json, to_json
 from semstab.results import Agreement, GroupResult, RunResult, Unit, UnitSummary
+from semstab.statistics_model import BackboneComparison, MapStatistics
 from semstab.voxels import VoxelTable
 
 SCHEMA = 1
@@ -90,8 +91,8 @@ class Record:
     voxels: Path | None = None
 
     @property
-    def statistics(self) -> Mapping[str, Any]:
-        """What `semstab.statistics` says of the map, as JSON content; empty in studies of earlier versions."""
+    def statistics(self) -> MapStatistics | None:
+        """What `semstab.statistics` says of the map."""
         return self.summary.statistics
 
     @property
@@ -149,7 +150,7 @@ class StudyResult:
     up: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
-    comparisons: tuple[Mapping[str, Any], ...] = ()
+    comparisons: tuple[BackboneComparison, ...] = ()
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None
@@ -225,7 +226,7 @@ class StudyResult:
             up={scene: (axis[0], axis[1], axis[2]) for scene, axis in content["up"].items()},
             manifest=manifest,
             regions=from_json(tuple[RegionFlicker, ...], content["regions"], where),
-            comparisons=tuple(content.get("comparisons", ())),  # studies of earlier versions have none
+            comparisons=from_json(tuple[BackboneComparison, ...], content["comparisons"], where),
         )
 
 

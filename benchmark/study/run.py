@@ -13,11 +13,12 @@ from typing import Any
 from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import DataError
-from semstab.evaluation import comparable, comparison
+from semstab.evaluation import comparable
 from semstab.json_form import from_json
 from semstab.manifest import manifest
 from semstab.metrics import compare
 from semstab.results import Agreement
+from semstab.statistics import BackboneComparison, compare_backbones
 from semstab.study.config import StudyConfig
 from semstab.study.executors import Executor, InProcess
 from semstab.study.folder import StudyFolder
@@ -213,7 +214,7 @@ def _agreement(config: StudyConfig, records: Sequence[Record]) -> Iterator[Agree
                 yield compare(table, other.table(), (base.unit, other.unit), tolerance=config.tolerance)
 
 
-def _comparisons(records: Sequence[Record]) -> Iterator[Mapping[str, Any]]:
+def _comparisons(records: Sequence[Record]) -> Iterator[BackboneComparison]:
     """The base units of each scene beside each other; accuracy where the ground truth is one of them."""
     base = [record for record in records if record.variation.sweep == BASE]
     for scene in dict.fromkeys(record.unit.scene for record in base):
@@ -221,7 +222,7 @@ def _comparisons(records: Sequence[Record]) -> Iterator[Mapping[str, Any]]:
         truth = maps.pop(GROUND_TRUTH, None)
         if comparable(maps):
             known = truth is not None and comparable(maps | {GROUND_TRUTH: truth})
-            yield comparison(scene, maps, truth if known else None)
+            yield compare_backbones(maps, truth=truth if known else None, scene=scene)
 
 
 def _up_axes(cells: Sequence[Cell], contents: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[float, float, float]]:

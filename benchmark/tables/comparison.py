@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from semstab.statistics import estimate_at, number_at
 from semstab.statistics.comparison import compared
+from semstab.statistics_model import BackboneComparison, MapCoverage
 from semstab.study.results import StudyResult
+from semstab.tables.statistics import INTERVALS
 from semstab.tables.table import Column, Group, Row, Table
 
 _COMMON = "On the voxels that every backbone saw twice or more."
-_INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
 
 
 def comparison(result: StudyResult) -> list[Table]:
@@ -29,18 +26,15 @@ def _differences(result: StudyResult) -> Table:
     )
     caption = (
         f"{_COMMON} p: of a paired test that flips the sign of a block's difference, corrected for the number of pairs."
-        f" {_INTERVALS}"
+        f" {INTERVALS}"
     )
-    groups = tuple(Group(found["scene"], _difference_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
 
 
-def _difference_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
+def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
-    return tuple(
-        (row["a"], row["b"], words[row["measure"]], estimate_at(row, "difference"), number_at(row, "p_holm"))
-        for row in found["paired"]["differences"]
-    )
+    return tuple((row.a, row.b, words[row.measure], row.difference, row.p_holm) for row in found.paired.differences)
 
 
 def _ranking(result: StudyResult) -> Table:
@@ -55,30 +49,27 @@ def _ranking(result: StudyResult) -> Table:
     )
     caption = (
         f"Same places: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
-        f" strata of OP weighted by those of all maps together. {_INTERVALS}"
+        f" strata of OP weighted by those of all maps together. {INTERVALS}"
     )
-    groups = tuple(Group(found["scene"], _ranking_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
     return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
 
 
-def _ranking_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
-    rankings = {ranking["measure"]: ranking["ranks"] for ranking in found["paired"]["rankings"]}
-    rows: list[Row] = []
-    for quantity in compared(truth=True):
-        for rank in rankings.get(quantity.key, ()):
-            backbone = rank["backbone"]
-            rows.append(
-                (
-                    quantity.word,
-                    rank["rank"],
-                    backbone,
-                    f"{rank['low']} to {rank['high']}",
-                    100 * number_at(rank, "best"),
-                    estimate_at(found, "paired", "values", quantity.key, backbone),
-                    estimate_at(found, "standardised", "values", quantity.key, backbone),
-                )
-            )
-    return tuple(rows)
+def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    quantities = {quantity.key: quantity for quantity in compared(truth=True)}
+    return tuple(
+        (
+            quantities[ranking.measure].word,
+            rank.rank,
+            rank.backbone,
+            f"{rank.low} to {rank.high}",
+            100 * rank.best,
+            found.paired.of(quantities[ranking.measure])[rank.backbone],
+            found.standardised.of(quantities[ranking.measure], rank.backbone),
+        )
+        for ranking in found.paired.rankings
+        for rank in ranking.ranks
+    )
 
 
 def _coverage(result: StudyResult) -> Table:
@@ -92,22 +83,17 @@ def _coverage(result: StudyResult) -> Table:
         Column("alone", "in no other", 0),
     )
     caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
-    groups = tuple(
-        Group(
-            found["scene"],
-            tuple(
-                (
-                    row["backbone"],
-                    row["voxels"],
-                    number_at(row, "mean_op"),
-                    row["repeated"],
-                    row["recurrent"],
-                    100 * number_at(row, "common_share"),
-                    row["alone"],
-                )
-                for row in found["coverage"]
-            ),
-        )
-        for found in result.comparisons
-    )
+    groups = tuple(Group(found.scene, tuple(map(_coverage_row, found.coverage))) for found in result.comparisons)
     return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
+
+
+def _coverage_row(row: MapCoverage) -> Row:
+    return (
+        row.backbone,
+        row.voxels,
+        row.mean_op,
+        row.repeated,
+        row.recurrent,
+        100 * row.common_share,
+        row.alone,
+    )

@@ -8,7 +8,7 @@ from semstab.averages import Pooled, pooled
 from semstab.measures import measures
 from semstab.results import Agreement
 from semstab.study.results import BACKENDS, Record, StudyResult
-from semstab.tables.stability import SBD_OVER, means, of_measures, settings
+from semstab.tables.stability import SBD_OVER, of_measures, settings
 from semstab.tables.table import Column, Group, Row, Table
 
 DIFFERENCE = "Difference to the first"
@@ -80,7 +80,7 @@ def _row(backend: str, mean: Pooled, base: Pooled) -> Row:
         backend,
         mean.voxels,
         mean.mean_op,
-        *means(mean.every),
+        *mean.every.means.of_all(),
         100 * mean.recurrent.share,
         mean.fuse_ms_per_frame,
         mean.voxels - base.voxels,

@@ -21,11 +21,6 @@ def of_measures(*, compared: bool = False, prefix: str = "", over: str = "") -> 
     return [Column.of(measure, compared=compared, prefix=prefix, over=over) for measure in measures()]
 
 
-def means(row: TableSummary | Means) -> list[float]:
-    """The mean of each measure, in the order of the columns."""
-    return [row[measure] for measure in measures()]
-
-
 def scenes(result: StudyResult) -> list[Table]:
     """The multi-scene table: each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability)."""
     records = result.select()
@@ -113,7 +108,7 @@ def settings(records: Sequence[Record]) -> str:
 
 def _scene_row(record: Record) -> Row:
     table = record.summary.table
-    return record.unit.scene, table.voxels, table.points, table.mean_op, *means(table)
+    return record.unit.scene, table.voxels, table.points, table.mean_op, *table.means.of_all()
 
 
 def _scene_total(records: Sequence[Record]) -> Row:
@@ -133,12 +128,12 @@ def _macro(tables: Sequence[TableSummary]) -> list[float]:
 
 
 def _means_row(row: Means) -> Row:
-    return row.name, row.voxels, 100 * row.share, *means(row)
+    return row.name, row.voxels, 100 * row.share, *row.means.of_all()
 
 
 def _class_row(row: Means) -> Row:
     note = "" if row.voxels >= ENOUGH else "rare" if row.voxels else "absent"
-    return row.name, row.voxels, *means(row), note
+    return row.name, row.voxels, *row.means.of_all(), note
 
 
 def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
