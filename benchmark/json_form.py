@@ -18,7 +18,6 @@ from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_o
 from semstab.errors import DataError, one_line
 
 T = TypeVar("T")
-Reader = Callable[[Any], Any]
 
 INLINE: Mapping[str, bool] = types.MappingProxyType({"inline": True})
 """Metadata of a field whose own fields stand among those of its parent: `unit: Unit = field(metadata=INLINE)`."""
@@ -99,7 +98,7 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
     the field where the content is not that of a `cls`.
     """
     try:
-        return cast(T, _reader(cast(Any, cls))(content))
+        return cast(T, _read(cls, content))
     except _MisfitError as misfit:
         line = misfit.line()
     except RecursionError:
@@ -110,9 +109,9 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
 class _MisfitError(Exception):
     """Content that is not what the types say; each level that it leaves adds its step to the path."""
 
-    def __init__(self, message: str) -> None:
+    def __init__(self, message: str, *steps: str) -> None:
         super().__init__(message)
-        self.steps: list[str] = []
+        self.steps = list(steps)
 
     def line(self) -> str:
         path = "".join(reversed(self.steps)).removeprefix(".") or "content"
@@ -127,175 +126,112 @@ def _expected(what: str, content: Any) -> _MisfitError:
     return _MisfitError(f"should be {what}, is {reprlib.repr(content)}")
 
 
-@functools.cache
-def _reader(hint: Any) -> Reader:
-    """What reads content as a `hint`."""
-    if hint in _PLAIN:
-        return _PLAIN[hint]
-    if (origin := get_origin(hint)) in _GENERIC:
-        return _GENERIC[origin](get_args(hint))
-    if isinstance(hint, type) and issubclass(hint, OwnForm):
-        return _built(hint.of_json_content)
-    if dataclasses.is_dataclass(hint):
-        return _dataclass(hint)
-    raise TypeError(f"{hint} has no JSON form")
+def _read(hint: Any, content: Any) -> Any:
+    """Content as a `hint`."""
+    if hint is float:
+        return _number(content)
+    if hint in _EXACT:
+        return _exactly(hint, content)
+    origin, arguments = _parsed(hint)
+    if origin in _GENERIC:
+        return _GENERIC[origin](arguments, content)
+    return content if hint is Any else _object(hint, content)
 
 
-def _float(content: Any) -> float:
-    if type(content) is float:
+_parsed = functools.cache(lambda hint: (get_origin(hint), get_args(hint)))
+
+
+def _at(step: str, hint: Any, content: Any) -> Any:
+    """What stands at that step of the path."""
+    try:
+        return _read(hint, content)
+    except _MisfitError as misfit:
+        misfit.steps.append(step)
+        raise
+
+
+_EXACT: Mapping[Any, str] = {
+    int: "a whole number", str: "text", bool: "true or false", type(None): "null", list: "a list", dict: "an object",
+}  # fmt: skip
+
+
+def _exactly(kind: Any, content: Any) -> Any:
+    if type(content) is kind:
+        return content
+    raise _expected(_EXACT[kind], content)
+
+
+def _number(content: Any) -> float:
+    """An int stays as it was written."""
+    if type(content) is float or (type(content) is int and abs(content) < 2**1023):
         return content
     if content is None:
         return math.nan
-    if type(content) is int and abs(content) < 2**1023:
-        return content  # as it was written
     raise _expected("a number", content)
 
 
-def _exactly(kind: type[Any], what: str) -> Reader:
-    def read(content: Any) -> Any:
-        if type(content) is kind:
-            return content
-        raise _expected(what, content)
-
-    return read
+def _one_of(values: tuple[Any, ...], content: Any) -> Any:
+    if any(type(content) is type(value) and content == value for value in values):
+        return content
+    raise _expected(f"one of {', '.join(map(repr, values))}", content)
 
 
-_text = _exactly(str, "text")
-
-_PLAIN: Mapping[Any, Reader] = {
-    float: _float,
-    int: _exactly(int, "a whole number"),
-    str: _text,
-    bool: _exactly(bool, "true or false"),
-    type(None): _exactly(type(None), "null"),
-    Path: lambda content: Path(_text(content)),
-    Any: lambda content: content,
-}
+def _optional(arguments: tuple[Any, ...], content: Any) -> Any:
+    """X | None."""
+    (hint,) = (argument for argument in arguments if argument is not type(None))
+    return None if content is None else _read(hint, content)
 
 
-def _one_of(values: tuple[Any, ...]) -> Reader:
-    def read(content: Any) -> Any:
-        if any(type(content) is type(value) and content == value for value in values):
-            return content
-        raise _expected(f"one of {', '.join(map(repr, values))}", content)
-
-    return read
+def _sequence(arguments: tuple[Any, ...], content: Any) -> list[Any]:
+    items = _exactly(list, content)
+    return [_at(f"[{i}]", arguments[0], item) for i, item in enumerate(items)]
 
 
-def _optional(arguments: tuple[Any, ...]) -> Reader:
-    others = [argument for argument in arguments if argument is not type(None)]
-    if len(others) != 1 or len(others) == len(arguments):
-        raise TypeError(f"{arguments}: a union that has no JSON form")
-    reader = _reader(others[0])
-    return lambda content: None if content is None else reader(content)
-
-
-def _list(arguments: tuple[Any, ...]) -> Reader:
-    reader = _reader(arguments[0])
-
-    def read(content: Any) -> Any:
-        if type(content) is not list:
-            raise _expected("a list", content)
-        return _items(content, [reader] * len(content))
-
-    return read
-
-
-def _tuple(arguments: tuple[Any, ...]) -> Reader:
+def _tuple(arguments: tuple[Any, ...], content: Any) -> tuple[Any, ...]:
     if arguments[1:] == (...,):
-        read_list = _list(arguments)
-        return lambda content: tuple(read_list(content))
-    readers = [_reader(argument) for argument in arguments]
-
-    def read(content: Any) -> Any:
-        if type(content) is not list or len(content) != len(readers):
-            raise _expected(f"a list of {len(readers)}", content)
-        return tuple(_items(content, readers))
-
-    return read
+        return tuple(_sequence(arguments, content))
+    if len(_exactly(list, content)) != len(arguments):
+        raise _expected(f"a list of {len(arguments)}", content)
+    return tuple(_at(f"[{i}]", hint, item) for i, (hint, item) in enumerate(zip(arguments, content, strict=True)))
 
 
-def _items(content: list[Any], readers: list[Reader]) -> list[Any]:
-    values: list[Any] = []
-    try:
-        for item, reader in zip(content, readers, strict=True):
-            values.append(reader(item))
-    except _MisfitError as misfit:
-        misfit.steps.append(f"[{len(values)}]")
-        raise
-    return values
+def _mapping(arguments: tuple[Any, ...], content: Any) -> dict[str, Any]:
+    entries = _exactly(dict, content)
+    return {key: _at(f".{key}", arguments[1], item) for key, item in entries.items()}
 
 
-def _mapping(arguments: tuple[Any, ...]) -> Reader:
-    reader = _reader(arguments[1])
-
-    def read(content: Any) -> Any:
-        values = {}
-        for key, item in _entries(content).items():
-            try:
-                values[key] = reader(item)
-            except _MisfitError as misfit:
-                misfit.steps.append(f".{key}")
-                raise
-        return values
-
-    return read
-
-
-_GENERIC: Mapping[Any, Callable[[tuple[Any, ...]], Reader]] = {
-    Literal: _one_of,
-    Union: _optional,
-    types.UnionType: _optional,
-    tuple: _tuple,
-    list: _list,
-    Mapping: _mapping,
+_GENERIC: Mapping[Any, Callable[[tuple[Any, ...], Any], Any]] = {
+    Literal: _one_of, Union: _optional, types.UnionType: _optional, tuple: _tuple, list: _sequence, Mapping: _mapping,
     dict: _mapping,
-}
+}  # fmt: skip
 
 
-def _entries(content: Any) -> dict[str, Any]:
-    if type(content) is not dict:
-        raise _expected("an object", content)
-    return content
+def _object(cls: Any, content: Any) -> Any:
+    """A class; that it refuses what it is made of is a misfit, too."""
+    try:
+        if issubclass(cls, OwnForm):
+            return cls.of_json_content(content)
+        if cls is Path:
+            return Path(_exactly(str, content))
+        own, inline, optional = _fields(cls)
+        return cls(**{name: _read(hint, content) for name, hint in inline.items()}, **fields_of(content, own, optional))
+    except (ValueError, TypeError) as error:
+        raise _MisfitError(f"{type(error).__name__}: {error}") from error
 
 
 def fields_of(content: Any, hints: Mapping[str, Any], optional: Collection[str] = ()) -> dict[str, Any]:
     """The entries of a JSON object that are asked for, each read as its type; `optional` ones may be missing."""
-    entries, values = _entries(content), {}
-    for name, hint in hints.items():
-        try:
-            if name in entries:
-                values[name] = _reader(hint)(entries[name])
-            elif name not in optional:
-                raise _MisfitError("is missing")
-        except _MisfitError as misfit:
-            misfit.steps.append(f".{name}")
-            raise
-    return values
+    entries = _exactly(dict, content)
+    if missing := [name for name in hints if name not in entries and name not in optional]:
+        raise _MisfitError("is missing", f".{missing[0]}")
+    return {name: _at(f".{name}", hint, entries[name]) for name, hint in hints.items() if name in entries}
 
 
-def _dataclass(cls: Any) -> Reader:
+@functools.cache
+def _fields(cls: Any) -> tuple[dict[str, Any], dict[str, Any], set[str]]:
+    """The types of a dataclass's own fields and of its inline ones, and which fields may be missing."""
     types_of, known = get_type_hints(cls), [field for field in dataclasses.fields(cls) if field.init]
-    own = {field.name: types_of[field.name] for field in known if "inline" not in field.metadata}
     inline = {field.name: types_of[field.name] for field in known if "inline" in field.metadata}
+    own = {field.name: types_of[field.name] for field in known if field.name not in inline}
     missing = dataclasses.MISSING
-    optional = {field.name for field in known if field.default is not missing or field.default_factory is not missing}
-    make = _built(lambda values: cls(**values))
-
-    def read(content: Any) -> Any:
-        values = {name: _reader(hint)(content) for name, hint in inline.items()}
-        return make(values | fields_of(content, own, optional))
-
-    return read
-
-
-def _built(make: Reader) -> Reader:
-    """What a class makes of its content; that it refuses it is a misfit, too."""
-
-    def read(content: Any) -> Any:
-        try:
-            return make(content)
-        except (ValueError, TypeError) as error:
-            raise _MisfitError(f"{type(error).__name__}: {error}") from error
-
-    return read
+    return own, inline, {f.name for f in known if f.default is not missing or f.default_factory is not missing}
