@@ -215,7 +215,7 @@ class RuleOutcome:
     """What a rule of fusion makes of a map; relabelled_share is the part of the voxels that get another class."""
 
     rule: str
-    means: RuleMeans = field(metadata=INLINE)
+    values: RuleMeans = field(metadata=INLINE)
     relabelled_share: float
 
 

@@ -142,7 +142,7 @@ def _rules(outcomes: Sequence[RuleOutcome], *, known: bool) -> list[str]:
     """How right each rule is only where that is known."""
     keys = ("rule", *(measure.key for measure in measures()), "relabelled_share", ACCURACY.key, ECE.key)
     rows: list[Sequence[Cell]] = [
-        (r.rule, *r.means.means.of_all(), r.relabelled_share, r.means.accuracy, r.means.ece) for r in outcomes
+        (r.rule, *r.values.means.of_all(), r.relabelled_share, r.values.accuracy, r.values.ece) for r in outcomes
     ]
     return _table(keys, rows) if known else _table(keys[:-2], [row[:-2] for row in rows])
 

@@ -94,7 +94,7 @@ def _quadrants(result: StudyResult) -> list[Table]:
 def rules(result: StudyResult) -> list[Table]:
     """Other rules of fusion applied to the same log of observations, macro means over scenes."""
     judged = {
-        name: _by_rule([found.fusion_rules for _, found in rows if found.fusion_rules is not None])
+        name: grouped((row for _, found in rows for row in found.fusion_rules or ()), lambda row: row.rule)
         for name, rows in judged_records(result).items()
     }
     judged = {name: rows for name, rows in judged.items() if rows}
@@ -131,7 +131,7 @@ def _quadrant(take: Callable[[Quadrants], float | Estimate]) -> Number:
 def _stratum_rows(strata: Sequence[Sequence[Correctness]]) -> tuple[Row, ...]:
     return tuple(
         (name, sum(row.voxels for row in rows), *_right(rows))
-        for name, rows in grouped(row for unit in strata for row in unit).items()
+        for name, rows in grouped((row for unit in strata for row in unit), lambda row: row.name).items()
     )
 
 
@@ -141,20 +141,13 @@ def _right(rows: Sequence[Correctness | RuleMeans]) -> list[float]:
     return [macro_mean(column) for column in zip(*values, strict=True)]
 
 
-def _by_rule(units: Sequence[Sequence[RuleOutcome]]) -> dict[str, list[RuleOutcome]]:
-    found: dict[str, list[RuleOutcome]] = {}
-    for row in (row for unit in units for row in unit):
-        found.setdefault(row.rule, []).append(row)
-    return found
-
-
 def _rule_rows(by_rule: Mapping[str, Sequence[RuleOutcome]]) -> tuple[Row, ...]:
     return tuple(
         (
             rule,
-            *(macro_mean([row.means[measure] for row in rows]) for measure in measures()),
+            *(macro_mean([row.values[measure] for row in rows]) for measure in measures()),
             100 * macro_mean([row.relabelled_share for row in rows]),
-            *_right([row.means for row in rows]),
+            *_right([row.values for row in rows]),
         )
         for rule, rows in by_rule.items()
     )
@@ -173,7 +166,7 @@ def _order_by_rule(judged: Mapping[str, Mapping[str, Sequence[RuleOutcome]]]) ->
         by_rule: dict[str, dict[str, float]] = {}
         for backbone, rules_of in judged.items():
             for rule, rows in rules_of.items():
-                by_rule.setdefault(rule, {})[backbone] = macro_mean([take(row.means) for row in rows])
+                by_rule.setdefault(rule, {})[backbone] = macro_mean([take(row.values) for row in rows])
         changed += [quantity.word] if len({_order(values) for values in by_rule.values()}) > 1 else []
     verb = f"changes by {' and by '.join(changed)}" if changed else "is the same"
     return f" From rule to rule the order of the backbones {verb}."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from semstab.averages import by_backbone
 from semstab.measures import ENTROPY, VSS
@@ -21,6 +21,7 @@ REPEATED = Column("repeated_voxels", "Voxels", 0)
 INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
 SEEN_TWICE = "Over the voxels seen twice or more."
 
+T = TypeVar("T")
 Number = Callable[[MapStatistics], float | Estimate]
 
 
@@ -213,26 +214,16 @@ def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
     return [macro_mean([_value(cell) for cell in column]) for column in zip(*rows, strict=True)]
 
 
-class Named(Protocol):
-    """A row of a list in the units' statistics, which goes by a name."""
-
-    @property
-    def name(self) -> str:
-        """Of the row."""
-
-
-N = TypeVar("N", bound=Named)
-
-
-def grouped(rows: Iterable[N]) -> dict[str, list[N]]:
+def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
     """The rows of several units by their name, in order of appearance."""
-    found: dict[str, list[N]] = {}
+    found: dict[str, list[T]] = {}
     for row in rows:
-        found.setdefault(row.name, []).append(row)
+        found.setdefault(name(row), []).append(row)
     return found
 
 
 def _class_rows(judged: Sequence[tuple[Record, MapStatistics]]) -> tuple[Row, ...]:
+    by_name = grouped((row for _, found in judged for row in found.agreement.classes), lambda row: row.name)
     return tuple(
         (
             name,
@@ -240,7 +231,7 @@ def _class_rows(judged: Sequence[tuple[Record, MapStatistics]]) -> tuple[Row, ..
             macro_mean([row.kappa for row in rows]),
             macro_mean([row.alpha for row in rows]),
         )
-        for name, rows in grouped(row for _, found in judged for row in found.agreement.classes).items()
+        for name, rows in by_name.items()
     )
 
 
