@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from semstab.comparison_model import BackboneComparison
 from semstab.json_form import INLINE, to_json
 from semstab.measures import Measure, MeasureMeans
-from semstab.statistics_model import BackboneComparison, MapStatistics
+from semstab.statistics_model import MapStatistics
 
 SCHEMA = 1
 """Version of summary.json."""

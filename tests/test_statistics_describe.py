@@ -11,6 +11,7 @@ import tiny_scene
 from simulated_events import grid, log_of
 
 import semstab
+from semstab.comparison_model import BackboneComparison
 from semstab.config import Config
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json, write_json
@@ -20,7 +21,7 @@ from semstab.statistics import Estimate, analyse, compare_backbones, describe, e
 from semstab.statistics.__main__ import main
 from semstab.statistics.agreement import PSA
 from semstab.statistics.text import comparison_lines, lines
-from semstab.statistics_model import UNDEFINED, BackboneComparison, MapStatistics
+from semstab.statistics_model import UNDEFINED, MapStatistics
 from semstab.voxels import VoxelTable
 
 SIDE, F = 24, 8

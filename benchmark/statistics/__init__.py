@@ -4,6 +4,7 @@ Pure functions of a VoxelTable and its Events. `describe` says everything about 
 several; docs/metrics.md derives each measure.
 """
 
+from semstab.comparison_model import BackboneComparison
 from semstab.statistics.agreement import class_agreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
@@ -32,7 +33,6 @@ from semstab.statistics.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.verdict import verdict
 from semstab.statistics_model import (
-    BackboneComparison,
     ClassAgreement,
     Correctness,
     Estimate,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from semstab.comparison_model import BackboneComparison, RuleComparison, Standardised
 from semstab.errors import ConfigError
 from semstab.measures import Measure, Quantity, measures
 from semstab.metrics.matching import require_same_map
@@ -22,7 +23,7 @@ from semstab.statistics.comparison import (
     voxelwise,
 )
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
-from semstab.statistics_model import BackboneComparison, RuleComparison, RuleMeans, Standardised
+from semstab.statistics_model import RuleMeans
 from semstab.voxels import Events, VoxelTable
 
 SCHEMA = 1

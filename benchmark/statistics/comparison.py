@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from semstab.comparison_model import MapCoverage, Paired, PairedDifference, Rank, Ranking
 from semstab.errors import ConfigError
 from semstab.measures import Quantity, dominant, measures
 from semstab.metrics.matching import require_same_grid, shared_rows
@@ -22,7 +23,7 @@ from semstab.statistics.blocks import (
     spatial_blocks,
 )
 from semstab.statistics.correctness import ACCURACY, join_truth
-from semstab.statistics_model import Estimate, MapCoverage, Paired, PairedDifference, Rank, Ranking
+from semstab.statistics_model import Estimate
 from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from semstab.comparison_model import BackboneComparison
 from semstab.json_form import INLINE, from_json, to_json
 from semstab.results import Agreement, GroupResult, RunResult, Unit, UnitSummary
-from semstab.statistics_model import BackboneComparison, MapStatistics
+from semstab.statistics_model import MapStatistics
 from semstab.voxels import VoxelTable
 
 SCHEMA = 1

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from semstab.comparison_model import BackboneComparison, MapCoverage
 from semstab.statistics.comparison import compared
-from semstab.statistics_model import BackboneComparison, MapCoverage
 from semstab.study.results import StudyResult
 from semstab.tables.statistics import INTERVALS
 from semstab.tables.table import Column, Group, Row, Table
