@@ -66,7 +66,9 @@ def _writer(kind: Any) -> Callable[[Any], Any]:
 
 
 _WRITERS: Mapping[Any, Callable[[Any], Any]] = {
-    float: lambda value: value if math.isfinite(value) else None,
+    float: lambda value: float(value) if math.isfinite(value) else None,
+    int: int,
+    str: str.__str__,
     Mapping: lambda value: {str(key): to_json(item) for key, item in value.items()},
     tuple: lambda value: [to_json(item) for item in value],
     list: lambda value: [to_json(item) for item in value],

@@ -1,3 +1,4 @@
+import http
 import json
 import math
 from collections.abc import Mapping
@@ -92,6 +93,16 @@ def test_numpy_becomes_plain() -> None:
     written = to_json({"a": np.float32(0.5), "b": np.int64(3), "c": np.array([1.0, np.nan]), "d": np.bool_(True)})
     assert written == {"a": 0.5, "b": 3, "c": [1.0, None], "d": True}
     assert [type(value) for value in (written["b"], written["d"])] == [int, bool]
+
+
+class Version(str):
+    """As torch.__version__ is."""
+
+
+def test_kinds_of_text_and_of_numbers_become_plain() -> None:
+    written = to_json([Version("2.1"), http.HTTPStatus.OK])
+    assert written == ["2.1", 200]
+    assert [type(value) for value in written] == [str, int]
 
 
 def test_a_missing_field_has_its_default_and_an_unknown_one_is_ignored() -> None:
