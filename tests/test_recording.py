@@ -26,11 +26,11 @@ from semstab.engine.units import Plan, PlannedUnit
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
-from semstab.recording import MEASURES, SERIES, Recording, background, observer, tracker, voxel_maps
+from semstab.measures import SBD_MAX, measures
+from semstab.recording import SERIES, Recording, background, looks, observer, tracker, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
-from semstab.recording.voxel_maps import SBD_MAX, TITLES
 from semstab.records import Record, Result, Variation
 from semstab.results import Unit, UnitSummary
 from semstab.settings import load_config
@@ -88,7 +88,7 @@ def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]
 
 
 def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
-    """What a map shows at last, voxels sorted: indices, and each of TITLES by the name of its view."""
+    """What a map shows at last, voxels sorted: indices, and each of `looks` by the name of its view."""
     chunks = []
     for at in sorted(at for at in rows if at.startswith(f"{path}/")):
         shown: dict[str, Any] = {}
@@ -101,7 +101,7 @@ def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
     index = [tuple(cell) for shown in chunks for cell in shown["VoxelGridMap:voxel_indices"]]
     order = sorted(range(len(index)), key=index.__getitem__)
     assert len(set(index)) == len(index)
-    components = {name: f"{name}:values" for name in MEASURES}
+    components = {name: f"{name}:values" for name, look in looks().items() if look.range}
     components |= {"class": "VoxelGridMap:colors", "category": "category:colors"}
     found: dict[str, Any] = {"voxel_indices": [index[i] for i in order]}
     for name, component in components.items():
@@ -167,8 +167,9 @@ def test_the_final_voxels_are_those_of_the_run(run, backbone) -> None:
     assert voxels["frame"] == 2
     np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
     np.testing.assert_allclose(voxels["voxel_size"], [[0.25] * 3])
-    for name in MEASURES:  # SBD of a voxel seen once is NaN
-        np.testing.assert_allclose(voxels[name], getattr(metrics, name)(table), rtol=1e-6)
+    for measure in measures():  # SBD of a voxel seen once is NaN
+        np.testing.assert_allclose(voxels[measure.key], measure.of(table), rtol=1e-6)
+    np.testing.assert_array_equal(voxels["op"], table.op)
     expected = voxel_maps.packed(metrics.CATEGORY_COLORS)[metrics.categories(table)]
     np.testing.assert_array_equal(voxels["category"], expected)
 
@@ -189,7 +190,7 @@ def test_the_largest_sbd_has_the_last_colour() -> None:
 
 
 def test_the_blueprint_shows_every_series_and_every_backbone(run) -> None:
-    maps = {f"{backbone}: {title}" for backbone in "ab" for title in TITLES.values()}
+    maps = {f"{backbone}: {title}" for backbone in "ab" for title in (look.title for look in looks().values())}
     pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", "drift of this frame")}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
@@ -201,7 +202,7 @@ def test_every_map_has_an_eye_that_looks_down_on_it(run) -> None:
     blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when there is a map to look at
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
     assert len(blueprints) == 2
-    assert len(eyes) == 2 * len(TITLES)  # of two backbones, each a view for the class, the measures, the category
+    assert len(eyes) == 2 * len(looks())  # of two backbones, each a view for the class, the measures, the category
     table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
     for eye in eyes:
         assert eye["EyeControls3D:position"][0][1] < table.centers[:, 1].min()  # from above: up is -y
@@ -217,9 +218,9 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
             for row in rows
             if "ViewBlueprint:display_name" in row
         }
-        for name, title in TITLES.items():
+        for name, shown in looks().items():
             for chunk in chunks:
-                at = f"{views[f'a: {title}']}/ViewContents/overrides{chunk}/visualizers/"
+                at = f"{views[f'a: {shown.title}']}/ViewContents/overrides{chunk}/visualizers/"
                 instructions = [row for row in rows if row["rerun.entity"].startswith(at)]
                 sources = {
                     mapping["target"]: mapping["source_component"]
@@ -232,9 +233,9 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
                     assert sources == {"VoxelGridMap:colors": "category:colors"}
                 else:
                     assert sources == {"VoxelGridMap:values": f"{name}:values", "VoxelGridMap:colors": None}
-                    defaults = f"{views[f'a: {title}']}/defaults"
+                    defaults = f"{views[f'a: {shown.title}']}/defaults"
                     (look,) = (row for row in rows if row["rerun.entity"] == defaults)
-                    np.testing.assert_allclose(look["VoxelGridMap:value_range"], [MEASURES[name].range], rtol=1e-6)
+                    np.testing.assert_allclose(look["VoxelGridMap:value_range"], [shown.range], rtol=1e-6)
 
 
 def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkeypatch) -> None:
@@ -249,8 +250,8 @@ def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkey
              and "/map/" in row["rerun.entity"]})
         for rows in read_blueprints(path)
     ]  # fmt: skip
-    assert min(known) == len(TITLES) - 1
-    assert max(known) == (len(TITLES) - 1) * voxel_maps.CHUNKS
+    assert min(known) == len(looks()) - 1
+    assert max(known) == (len(looks()) - 1) * voxel_maps.CHUNKS
     assert len(grid(read(path), r"/floor\ 1/map/net\/x/numpy")["voxel_indices"]) == len(table)
 
 
@@ -300,7 +301,7 @@ def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> N
             assert entities
             assert all(series(again, at) == series(first, at) for at in entities)
     was, now = (grid(rows, "/wall/map/a/numpy") for rows in (first, again))
-    assert {*TITLES} < {*was}
+    assert {*looks()} < {*was}
     assert [repr(was[key]) for key in was] == [repr(now[key]) for key in was]
 
 

@@ -23,10 +23,11 @@ from semstab.engine.series import to_csv
 from semstab.engine.stream import Stream, UnitMap
 from semstab.errors import DataError
 from semstab.files import atomic_path, write_text
-from semstab.metrics import dominant, entropy, macro_mean, sbd, summarise, vss
+from semstab.measures import dominant, measures
+from semstab.metrics import macro_mean, summarise
 from semstab.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
 from semstab.results import STAGES, UnitSummary, slug
-from semstab.statistics import Analysis, nulls
+from semstab.statistics import Analysis
 from semstab.stopwatch import Stopwatch
 from semstab.task import Task, read
 from semstab.up_axis import estimate_up
@@ -94,7 +95,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
-        statistics={} if found is None else nulls(found.summary),
+        statistics=None if found is None else found.summary,
     )
 
 
@@ -136,8 +137,8 @@ def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]
 
 def save_voxels(table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
-    measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
-    table.save(path, measures | dict(columns or {}))
+    own = {measure.key: measure.of(table) for measure in measures()}
+    table.save(path, {**own, "label": dominant(table), **(columns or {})})
 
 
 def _save_text(text: str, path: Path) -> None:

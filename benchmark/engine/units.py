@@ -26,6 +26,7 @@ from semstab.config import (
 from semstab.datasets import Scene, open_dataset
 from semstab.engine.jobs import Request
 from semstab.errors import ConfigError
+from semstab.measures import measures
 from semstab.records import REGIONS, Variation
 from semstab.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
@@ -317,7 +318,8 @@ def identity(config: Config, task: Task) -> str:
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:
     settings = config.model_dump(mode="json", include={*IN_KEYS} - {*without})
-    text = json.dumps([FORMAT, settings, content], sort_keys=True)
+    measured = [measure.key for measure in measures()]
+    text = json.dumps([FORMAT, measured, settings, content], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 

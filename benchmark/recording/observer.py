@@ -20,6 +20,7 @@ from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned
 from semstab.frames import Frame
+from semstab.measures import measures
 from semstab.metrics import compensated_flicker
 from semstab.recording import drift_colors, legend, series
 from semstab.recording.background import Background
@@ -396,7 +397,8 @@ def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
 
 def _final(summary: UnitSummary) -> str:
     unit, table = summary.unit, summary.table
+    means = (f"{m.symbol} {table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
     return (
-        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, VSS {table.vss:.3f},"
-        f" SBD {table.sbd:.4f} bits, H {table.entropy:.4f} (K = {table.K})"
+        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, {', '.join(means)}"
+        f" (K = {table.K})"
     )
