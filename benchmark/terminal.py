@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from semstab.config import BACKENDS
@@ -27,7 +28,12 @@ def print_summary(result: Result, console: Console) -> None:
         console.print(_agreement_table(result.agreement))
     console.print(_stages_line(shown), soft_wrap=True)
     for line in _verdict_lines(result):
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, markup=False)
+    for run in shown:
+        if run.frames_left_out:
+            text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
+            text += f" {run.frames + run.frames_left_out} selected frames were left out: they lack a file or a pose"
+            console.print(text, soft_wrap=True, markup=False)
     once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
     console.print(
         f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
@@ -65,14 +71,14 @@ def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
 
 
 def _scene_table(runs: Sequence[UnitSummary]) -> Table:
-    numbers = ("voxels", "mean\nOP", *_headers(), "flicker\n%", "OP>=3\n%", "ms a\nframe")
-    table = _table(_title(runs), ("scene",), numbers)
+    numbers = ("voxels", "mean\nOP", *_headers(), "flicker\n%", "OP>=3\n%")
+    table = _table(escape(_title(runs)), ("scene",), numbers)
     for backbone, rows in _by_backbone(runs):
-        table.add_row(backbone, style="bold")
+        table.add_row(escape(backbone), style="bold")
         for run in rows:
-            table.add_row(f"  {run.unit.scene}", *_scene_cells([run]))
+            table.add_row(escape(f"  {run.unit.scene}"), *_scene_cells([run]))
         if len(rows) > 1:
-            table.add_row("  total / mean", *_scene_cells(rows))
+            table.add_row("  total/mean", *_scene_cells(rows))
     return table
 
 
@@ -85,7 +91,6 @@ def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
         *(_number(macro_mean([table[m] for table in tables]), m.digits[0]) for m in measures()),
         _number(macro_mean([run.flicker_percent for run in runs]), 2),
         _number(100 * macro_mean([table.recurrent.share for table in tables]), 2),
-        _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1),
     ]
 
 
@@ -93,7 +98,7 @@ def _strata_table(runs: Sequence[UnitSummary]) -> Table:
     title = "by observation persistence" + (", all scenes pooled" if len(_scenes(runs)) > 1 else "")
     table = _table(title, ("persistence",), ("voxels", "%", *_headers()))
     for backbone, rows in _by_backbone(runs):
-        table.add_row(backbone, style="bold")
+        table.add_row(escape(backbone), style="bold")
         voxels = sum(run.table.voxels for run in rows)
         for strata in zip(*(run.table.strata for run in rows), strict=True):
             table.add_row(*_stratum_cells(pool(strata, voxels)))
@@ -121,7 +126,8 @@ def _stages_line(runs: Sequence[UnitSummary]) -> str:
     means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
     decode = means.pop("decode")
     known = [f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)]
-    return f"ms a frame: {', '.join(known)}; beside them decode {_number(decode, 1)}\n"
+    fusion = _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1)
+    return f"ms a frame: fusion {fusion} ({', '.join(known)}); beside them decode {_number(decode, 1)}\n"
 
 
 def _agreement_table(agreement: Sequence[Agreement]) -> Table:
@@ -131,12 +137,12 @@ def _agreement_table(agreement: Sequence[Agreement]) -> Table:
     title = f"agreement: largest differences of a voxel ({', '.join([*short, 'e evidence'])})"
     table = _table(title, ("scene, backbone",), numbers)
     for pair in dict.fromkeys(row.backends for row in agreement):
-        table.add_row(" · ".join(pair), style="bold")
+        table.add_row(escape(" · ".join(pair)), style="bold")
         for row in (row for row in agreement if row.backends == pair):
             largest = [row.differences[name].max for name in symbols]
             differences = [f"{difference:.0e}" if difference else "0" for difference in largest]
             verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
-            table.add_row(f"  {row.scene}, {row.backbone}", f"{sum(row.only_in):,}", *differences, verdict)
+            table.add_row(escape(f"  {row.scene}, {row.backbone}"), f"{sum(row.only_in):,}", *differences, verdict)
     return table
 
 

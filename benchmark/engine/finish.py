@@ -95,6 +95,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
+        frames_left_out=task.left_out,
         statistics=None if found is None else found.summary,
     )
 

@@ -1,0 +1,187 @@
+"""A run is the smallest study: the same numbers, files and options, whichever command or process does the work."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_scene
+import tiny_study
+import yaml
+from compare_summaries import differences
+from test_recording import read
+
+import semstab
+from semstab.config import BACKENDS
+from semstab.engine import LocalProcesses, load_result
+from semstab.metrics import compare
+from semstab.recording import Recording, Target
+from semstab.settings import load_config, load_study
+
+COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+TIMES = {"decode_ms", "wait_ms", "fuse_ms", "association_ms", "update_ms"}
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_scene.write(tmp_path / "data" / "wall", frames=6)
+
+
+def settings(root, **more):
+    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
+    return {"dataset": dataset, "backends": ["numba", "numpy"], "check": None, "voxel_size": 0.25, **more}
+
+
+def bench(*words, cwd, code=0):
+    environment = os.environ | {"COLUMNS": "80"}
+    done = subprocess.run(
+        [COMMAND, *map(str, words)], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == code, done.stderr
+    return done
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def series(file):
+    rows = csv.DictReader(file.read_text().splitlines())
+    return [{key: cell for key, cell in row.items() if key not in TIMES} for row in rows]
+
+
+def same(one, other):
+    """Summaries, voxels and time series of two folders are the same, but for times and the name."""
+    assert differences(summary(one) | {"name": ""}, summary(other) | {"name": ""}, tolerance=0) == []
+    for a, b in zip(load_result(one).records, load_result(other).records, strict=True):
+        assert (a.key, a.variation) == (b.key, b.variation)
+        if a.voxels_file is not None:
+            assert compare(a.table(), b.table(), (a.unit, b.unit), tolerance=0).agrees
+            assert series(a.series) == series(b.series)
+    files = [sorted(str(file.relative_to(folder)) for file in folder.rglob("*")) for folder in (one, other)]
+    assert files[0] == files[1]
+
+
+def test_a_run_equals_the_study_without_sweeps_voxel_for_voxel(root, tmp_path) -> None:
+    content = settings(root, statistics=True)
+    file = tmp_path / "wall.yaml"
+    file.write_text(yaml.safe_dump(content))
+    bench("--config", file, "--rerun", "off", "--out", "run", "-q", cwd=tmp_path)
+    bench("study", file, "--out", "study", "-q", cwd=tmp_path)
+    same(tmp_path / "run", tmp_path / "study")
+
+
+def test_every_folder_has_tables_figures_and_a_report_unless_told_otherwise(root, tmp_path) -> None:
+    data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--rerun", "off")
+    out = bench(*data, "--out", "run", cwd=tmp_path).stdout
+    run = tmp_path / "run"
+    assert "report: run/report.html" in out
+    assert {"scenes.csv", "persistence.md", "verdicts.tex"} <= {file.name for file in (run / "tables").iterdir()}
+    assert {"persistence.png", "persistence.svg"} <= {file.name for file in (run / "figures").iterdir()}
+    assert 'id="table-scenes"' in (run / "report.html").read_text()
+    out = bench(*data, "--out", "bare", "--report", "off", cwd=tmp_path).stdout
+    assert "report" not in out
+    assert {path.name for path in (tmp_path / "bare").iterdir()} == {
+        "config.yaml", "manifest.json", "summary.json", "units", "voxels", "frames", "overview"
+    }  # fmt: skip
+    refused = bench(*data, "--report", "maybe", cwd=tmp_path, code=2)
+    assert refused.stderr == "error: --report maybe: write on or off\n"
+
+
+def test_a_run_in_several_processes_is_the_same_run(root, tmp_path) -> None:
+    config = load_config(overrides=settings(root))
+    semstab.engine.run(config, out=tmp_path / "one")
+    result = semstab.engine.run(config, out=tmp_path / "two", executor=LocalProcesses(2))
+    assert result.manifest["units"]["executor"] == "2 local processes"
+    same(tmp_path / "one", tmp_path / "two")
+
+
+def test_the_command_takes_jobs_and_says_what_does_not_go_together(root, tmp_path) -> None:
+    data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--report", "off")
+    bench(*data, "--jobs", "2", "--out", "run", "-q", cwd=tmp_path)
+    assert (tmp_path / "run/recording.rrd").exists()
+    assert not (tmp_path / "run/recording").exists()
+    refused = bench(*data, "--jobs", "2", "--rerun", "spawn", "--out", "live", cwd=tmp_path, code=2)
+    assert "a viewer follows a run in one process; leave out --jobs and --scheduler" in refused.stderr
+    refused = bench(*data, "--jobs", "2", "--scheduler", "tcp://x:1", cwd=tmp_path, code=2)
+    assert "--jobs and --scheduler: the scheduler's workers do the work" in refused.stderr
+
+
+def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_units(root, tmp_path) -> None:
+    content = settings(root, sweeps={"voxel_size": [0.5]}, name="tiny")
+    out = tmp_path / "study"
+    semstab.engine.run_study(
+        load_config(overrides=content), out, observers=[Recording(Target(out / "recording.rrd"), run=out)]
+    )
+    slugs = {f"wall__{backbone}__{backend}" for backbone in "ab" for backend in ("numba", "numpy")}
+    assert {file.stem for file in (out / "frames").iterdir()} == slugs
+    result = load_result(out)
+    (base, *_) = result.select()
+    rows = series(base.series)
+    assert len(rows) == 6
+    assert int(rows[-1]["map_voxels"]) == base.summary.table.voxels
+    logged = set(read(out / "recording.rrd"))
+    for backbone in "ab":
+        assert f"/wall/series/map_vss/{backbone}/numba" in logged
+        assert f"/wall/series/map_vss/{backbone}/numpy" in logged
+        assert f"/wall/camera/{backbone}/labels" in logged
+    assert [record.unit.backend for record in result.select(BACKENDS)] == ["numpy", "numpy"]
+
+
+def test_a_recording_of_several_processes_has_what_one_process_records(root, tmp_path) -> None:
+    config = load_config(overrides=settings(root))
+    found = []
+    for name, executor in (("one", None), ("two", LocalProcesses(2))):
+        out = tmp_path / name
+        recording = Recording(Target(out / "recording.rrd"), run=out)
+        semstab.engine.run(config, out=out, executor=executor, observers=[recording])
+        found.append(set(read(out / "recording.rrd")))
+    one, two = found
+    assert one == two
+
+
+def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> None:
+    """What a unit has is part of its key."""
+    from semstab.measures import Measure, registered
+
+    config, out = load_config(overrides=settings(root, backends=["numpy"])), tmp_path / "run"
+    semstab.engine.run(config, out=out)
+    ones = Measure(key="ones", title="Ones", better="higher", of=lambda table: np.ones(len(table.op)), range=(0, 1))
+    with registered(ones):
+        result = semstab.engine.run(config, out=out)
+        assert result.manifest["units"] == {
+            "units": 2, "kept": 0, "computed": 2, "failed": 0, "executor": "in this process"
+        }  # fmt: skip
+        assert result.runs[0].table[ones] == 1.0
+
+
+def test_a_study_file_says_what_it_is_a_run_of(tmp_path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump({"sweeps": {"pixel_stride": [2]}, "scenes": ["scene0"]}))
+    assert load_study(file).model_copy(update={"name": "run", "check": "numpy"}) == load_config(file)
+    assert tiny_study.configure(tmp_path).check is None
+
+
+def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monkeypatch) -> None:
+    from semstab.backends.numpy_reference import NumpyReference
+
+    def broken(self, frame):
+        raise ZeroDivisionError("by\nzero")
+
+    monkeypatch.setattr(NumpyReference, "integrate", broken)
+    out = tmp_path / "run"
+    with pytest.raises(ZeroDivisionError):
+        semstab.engine.run(load_config(overrides=settings(root, backbones=["a"])), out=out)
+    log = (out / "failures.log").read_text()
+    assert log.startswith("ZeroDivisionError: by zero\nTraceback")
+    assert load_result(out).failures[0].message == "ZeroDivisionError: by zero"
+    assert [run.unit.backend for run in load_result(out).runs] == ["numba"]
+    monkeypatch.undo()
+    semstab.engine.run(load_config(overrides=settings(root, backbones=["a"])), out=out)
+    assert not (out / "failures.log").exists()
