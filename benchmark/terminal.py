@@ -26,7 +26,7 @@ def print_summary(result: Result, console: Console) -> None:
     console.print(_strata_table(shown))
     if result.agreement:
         console.print(_agreement_table(result.agreement))
-    console.print(_stages_line(shown), soft_wrap=True)
+    console.print(_stages_line(shown))
     for line in _verdict_lines(result):
         console.print(line, highlight=False, markup=False)
     for run in shown:
