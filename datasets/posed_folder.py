@@ -63,8 +63,7 @@ class PosedFolder(FileDataset[PosedOptions]):
             FrameSource(
                 name=name,
                 depth=depth.get(name) or folder / f"depth/{name}{suffix}",
-                pose=(pose := poses.get(name) or folder / f"pose/{name}.txt"),
-                pose_file=pose,
+                pose_file=poses.get(name) or folder / f"pose/{name}.txt",
                 camera=camera,
                 color=colors.get(name) or folder / f"color/{name}{COLOR_SUFFIXES[0]}",
             )

@@ -13,15 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from semstab.datasets.files.options import (
-    CameraAxes,
-    DepthScale,
-    FileOptions,
-    FourIntrinsics,
-    PoseConvention,
-    Positive,
-    UpAxis,
-)
+from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, Positive, UpAxis
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import inside
@@ -46,8 +38,6 @@ class TumOptions(FileOptions):
     """What the format says, and may be said otherwise."""
 
     depth_scale: DepthScale = 5000
-    pose_convention: PoseConvention = "camera_to_world"
-    camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = "z"
     intrinsics: FourIntrinsics = None
     max_difference: Positive = Field(0.02, description="seconds by which things of one frame may differ")

@@ -204,7 +204,8 @@ def _placed(sequence: ImageSequence, picture: _Picture, prediction: Prediction) 
     if frame is None:
         return prediction
     assert frame.labels is not None
-    return Prediction(frame.labels, fitted(None, prediction.scores, frame.shape, picture.name)[1])
+    scores = None if prediction.scores is None else fitted(prediction.scores, frame.shape, picture.name)
+    return Prediction(frame.labels, scores)
 
 
 def _folders(backbone: Backbone, out: Path, options: SequenceOptions) -> list[PredictionFolder]:

@@ -33,7 +33,7 @@ from semstab.datasets.scene import GROUND_TRUTH, Scene
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
 from semstab.datasets.views.ray_depth import planar
-from semstab.datasets.views.resampling import Labels, Scores, fit_labels, fit_scores
+from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
 from semstab.datasets.views.same_view import fitted
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame, Intrinsics
@@ -52,9 +52,9 @@ class FrameSource:
 
     name          what path templates call it
     depth         the file
-    pose          (4, 4) in the dataset's convention, or the file that holds it
-    pose_file     what errors of the pose name
+    pose_file     the file that holds its pose, or all poses
     camera        of the depth image
+    pose          (4, 4) in the dataset's convention, where it is not in a file of its own
     label_camera  of the images that label maps belong to, where that is another one
     color         the file that it has, or would have; None where that is not known
     depth_scale   units in a metre, where the dataset's own files say so
@@ -63,9 +63,9 @@ class FrameSource:
 
     name: str
     depth: Path
-    pose: Poses | Path
     pose_file: Path
     camera: Camera
+    pose: Poses | None = None
     label_camera: Camera | None = None
     color: Path | None = None
     depth_scale: float | None = None
@@ -127,7 +127,7 @@ class FileScene(Scene):
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
-        files = [frame.depth, *([frame.pose] if isinstance(frame.pose, Path) else [])]
+        files = [frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._source(name).missing(frame.name)]
         if color and self._color_file(frame) is None:
@@ -186,7 +186,8 @@ class FileScene(Scene):
         """
         depth = self.depth(index)
         where = str(self._frame(index).color or self.image_name(index))
-        labels, scores = self._fitted(index, labels, scores, depth.shape, where)
+        labels = None if labels is None else self._fitted(index, labels, depth.shape, where)
+        scores = None if scores is None else self._fitted(index, scores, depth.shape, where)
         return self._framed(index, depth, labels, scores, color=False)
 
     def depth(self, index: int) -> npt.NDArray[np.float32]:
@@ -288,8 +289,7 @@ class FileScene(Scene):
         if void := self.options.void_ids.get(backbone):
             ignore = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
             labels = np.where(np.isin(labels, void), labels.dtype.type(ignore), labels)
-        fitting: Labels = self._stored(index, labels, None, shape, str(path), "labels are")[0]
-        return fitting
+        return self._stored(index, labels, shape, path, "labels are")
 
     def _scores(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Scores:
         scores = read_scores(path, self.options.scores_layout or "KHW", (shape[0], shape[1]), self._read)
@@ -298,33 +298,27 @@ class FileScene(Scene):
             ids = range(scores.shape[2]) if space is None else space.ids
             ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
             scores = np.where(ignored[..., None], scores.dtype.type(0), scores)
-        fitting: Scores = self._stored(index, None, scores, shape, str(path), "scores are")[1]
-        return fitting
+        return self._stored(index, scores, shape, path, "scores are")
 
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
         """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
         mask = read_mask(path, self._read).astype(np.uint8)
-        masked: npt.NDArray[np.bool_] = self._stored(index, mask, None, shape, str(path), "the mask is")[0] == 1
+        masked: npt.NDArray[np.bool_] = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
-    def _stored(
-        self, index: int, labels: Any, scores: Any, shape: tuple[int, ...], where: str, what: str
-    ) -> tuple[Any, Any]:
+    def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
         """What a file holds, at the depth's pixels; where it must have them, `Frame` says that it has not."""
-        return (labels, scores) if self.labels_like_depth else self._fitted(index, labels, scores, shape, where, what)
+        return values if self.labels_like_depth else self._fitted(index, values, shape, str(path), what)
 
     def _fitted(
-        self, index: int, labels: Any, scores: Any, shape: tuple[int, ...], where: str, what: str = "the image is"
-    ) -> tuple[Any, Any]:
-        """Labels (H', W') and scores (H', W', K), each where given, as the depth's camera sees them."""
+        self, index: int, values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is"
+    ) -> Pixels:
+        """Labels (H', W') or scores (H', W', K) as the depth's camera sees them."""
         camera = self._frame(index).label_camera
         if camera is None:
-            return fitted(labels, scores, shape, where, what)
-        ours, size, centre = self.intrinsics(index, shape), (shape[0], shape[1]), self.options.pixel_centre or 0.0
-        return (
-            None if labels is None else fit_labels(labels, camera.at(labels.shape, centre), ours, size),
-            None if scores is None else fit_scores(scores, camera.at(scores.shape, centre), ours, size),
-        )
+            return fitted(values, shape, where, what)
+        K = camera.at(values.shape, self.options.pixel_centre or 0.0)
+        return fit(values, K, self.intrinsics(index, shape), (shape[0], shape[1]))
 
     def _geometry_bytes(self, source: FrameSource) -> bytes:
         """The pose and the cameras of a frame, as bytes that are equal where they are."""
@@ -338,7 +332,7 @@ class FileScene(Scene):
         return data
 
     def _stored_pose(self, source: FrameSource) -> Poses:
-        return read_pose(source.pose) if isinstance(source.pose, Path) else source.pose
+        return read_pose(source.pose_file) if source.pose is None else source.pose
 
     def _space(self, backbone: str) -> LabelSpace | None:
         """The classes of a label source, None where nothing says them; what says them is read once."""
