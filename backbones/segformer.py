@@ -36,7 +36,7 @@ class SegformerOptions(ModelOptions):
     engine: Literal["torch", "onnx"] = Field("torch", description="torch, or ONNX Runtime on the CPU")
 
 
-class Segformer:
+class Segformer(Backbone):
     """The checkpoint's logits, upsampled bilinearly to the image (Xie et al. 2021, NeurIPS, SegFormer).
 
     Its classes are those of the checkpoint's id2label.
@@ -44,19 +44,14 @@ class Segformer:
 
     Options: type[BaseModel] = SegformerOptions
     gives_scores = True
-    fit_frames = 0
 
     def __init__(self, options: SegformerOptions) -> None:
         self.options = options
         self.checkpoint = Checkpoint.find(options)
         self.processor = _processor(self.checkpoint)
         model = self.checkpoint.load_model(transformers.AutoModelForSemanticSegmentation, options)
-        self.label_space: LabelSpace | None = label_space(model.config.id2label, self.checkpoint.title)
+        self.label_space = label_space(model.config.id2label, self.checkpoint.title)
         self._logits = _engine(model, options)
-
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """Itself."""
-        return self
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:

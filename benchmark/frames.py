@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, flat
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 
 RIGID_TOLERANCE = 1e-3
 
@@ -133,7 +133,7 @@ class Frame:
     def ignore_id(self) -> int:
         """The id of a pixel without a label: 255, or 65535 in 16-bit maps."""
         if self.labels is not None:
-            return IGNORE_8BIT if self.labels.dtype == np.uint8 else IGNORE_16BIT
+            return ignore_id(self.labels)
         assert self.scores is not None
         return IGNORE_8BIT if self.scores.shape[2] <= IGNORE_8BIT else IGNORE_16BIT
 

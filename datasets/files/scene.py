@@ -37,7 +37,7 @@ from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
 from semstab.datasets.views.same_view import fitted
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame, Intrinsics
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.labels import IGNORE_16BIT, LabelSpace, ignore_id
 
 NO_ID = IGNORE_16BIT - 1
 """In a table of class ids: an id that is not in it."""
@@ -287,8 +287,7 @@ class FileScene(Scene):
         if backbone in self._class_ids:
             labels = _translated(labels, self._class_ids[backbone], path)
         if void := self.options.void_ids.get(backbone):
-            ignore = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
-            labels = np.where(np.isin(labels, void), labels.dtype.type(ignore), labels)
+            labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
         return self._stored(index, labels, shape, path, "labels are")
 
     def _scores(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Scores:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.frames import Intrinsics
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.labels import ignore_id
 
 Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 Scores = npt.NDArray[np.floating[Any]]
@@ -39,7 +39,7 @@ def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[
     H, W = labels.shape
     fitted: Labels = labels[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
     outside = ~(_within(rows, H)[:, None] & _within(columns, W))
-    fitted[outside] = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+    fitted[outside] = ignore_id(labels)
     return fitted
 
 
