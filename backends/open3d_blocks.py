@@ -89,17 +89,7 @@ class Open3DBlocks:
         index = self._index_of(rows)
         order = np.lexsort(index.T[::-1])
         rows = rows[order]
-        columns = (
-            "op",
-            "evidence",
-            "drift_sum",
-            "pixels",
-            "first_frame",
-            "last_frame",
-            "self_sum",
-            "frame_entropy_sum",
-        )
-        values: dict[str, Any] = {name: self._read(name, rows) for name in columns}
+        values: dict[str, Any] = {name: self._read(name, rows) for name in self._attributes}
         return VoxelTable(**index_columns(index[order]), **values, voxel_size=self.voxel_size)
 
     def events(self) -> None:

@@ -237,10 +237,16 @@ def ignore_id(labels: npt.NDArray[Any]) -> int:
     return IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
 
 
+def fixed(array: Any) -> Any:
+    """The array contiguous and read-only, so that numba compiles one version for all."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
 def flat(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The image's values (n,), contiguous and read-only, so that numba compiles one version for all images."""
-    values = np.ascontiguousarray(image).reshape(-1)
-    values.flags.writeable = False
+    """The image's values (n,), fixed."""
+    values: npt.NDArray[Any] = fixed(image).reshape(-1)
     return values
 
 

@@ -120,12 +120,16 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Write any dataset as posed folders. Goes on where it was."""
-    _convert(
-        selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames),
-        out,
-        depth_error,
-        quiet,
-    )
+    from rich.console import Console
+
+    from semstab.convert import convert
+    from semstab.convert.display import frame_bar, print_converted
+
+    chosen = selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames)
+    console = Console(quiet=quiet)
+    with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
+        for converted in convert(chosen, out, depth_error=depth_error, progress=bar):
+            print_converted(converted, console)
 
 
 def _image_size(text: str) -> int | list[int]:
@@ -151,15 +155,3 @@ def _check(config: Config, json_file: Path | None, quiet: bool) -> list[str]:
     if json_file is not None:
         write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in found]})
     return [f"{checked.scene}: {problem}" for checked in found for problem in checked.problems]
-
-
-def _convert(config: Config, out: Path, depth_error: float, quiet: bool) -> None:
-    from rich.console import Console
-
-    from semstab.convert import convert
-    from semstab.convert.display import FrameBar, print_converted
-
-    console = Console(quiet=quiet)
-    with FrameBar(Console(stderr=True, quiet=quiet)) as bar:
-        for converted in convert(config, out, depth_error=depth_error, progress=bar):
-            print_converted(converted, console)

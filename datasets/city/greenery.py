@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from semstab.datasets.city.classes import CLUTTER, LOW_VEGETATION, TREE
-from semstab.datasets.city.mesh import Float64, Shape, Surface, blob, box, combine, cone, moved
+from semstab.datasets.city.mesh import Float64, Shape, Surface, blob, box, choose, combine, cone, moved
 from semstab.datasets.city.plots import Barrier, Spot, columns
 from semstab.datasets.city.streets import Layout
 from semstab.datasets.city.terrain import Terrain
@@ -30,7 +30,7 @@ def trees(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.rando
     yaw = rng.uniform(0, 2 * np.pi, len(spots))
     slim = rng.uniform(0.8, 1.15, size=(len(spots), 3)) * size[:, None]
     needles = (form == len(forms) - 1)[:, None]
-    tint = np.where(needles, _choose(NEEDLES, len(spots), rng), _choose(LEAVES, len(spots), rng))
+    tint = np.where(needles, choose(NEEDLES, len(spots), rng), choose(LEAVES, len(spots), rng))
     tint = tint * rng.uniform(0.85, 1.15, size=(len(spots), 1))
     rows = [np.flatnonzero(form == k) for k in range(len(forms))]
     return [forms[k].place(TREE, position[r], yaw[r], slim[r], tint[r]) for k, r in enumerate(rows) if len(r)]
@@ -42,7 +42,7 @@ def bushes(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.rand
     position = terrain.on(*layout.to_world(s, t), -0.1)
     bush = moved(blob(0, rng, 0.18), (0, 0, 0.45), (0.85, 0.85, 0.8))
     extent = rng.uniform(0.75, 1.3, size=(len(spots), 3)) * size[:, None]
-    tint = _choose(HEDGE, len(spots), rng) * rng.uniform(0.8, 1.25, size=(len(spots), 1))
+    tint = choose(HEDGE, len(spots), rng) * rng.uniform(0.8, 1.25, size=(len(spots), 1))
     return bush.place(LOW_VEGETATION, position, rng.uniform(0, 6.28, len(spots)), extent, tint)
 
 
@@ -77,7 +77,7 @@ def _barriers(
         [np.hypot(*along.T) + 0.05, np.full(len(owner), profile[0]), np.full(len(owner), profile[1])], axis=1
     )
     size[:, 2] *= rng.uniform(0.9, 1.1, len(owner)) * rng.uniform(0.8, 1.2, len(ends))[owner]
-    tint = _choose(colors, len(ends), rng)[owner] * rng.uniform(0.92, 1.08, size=(len(owner), 1))
+    tint = choose(colors, len(ends), rng)[owner] * rng.uniform(0.92, 1.08, size=(len(owner), 1))
     position = terrain.on(middle[:, 0], middle[:, 1], -0.15)
     lean = terrain.slope(middle[:, 0], middle[:, 1])
     return box().place(class_id, position, np.arctan2(along[:, 1], along[:, 0]), size, tint, lean)
@@ -101,7 +101,3 @@ def _conifer() -> Shape:
     """A trunk under three stacked cones; 11 m high."""
     tiers = [cone(9, (z, z + h), (r, 0.02)) for z, h, r in ((1.4, 4.6, 2.3), (4.2, 4.2, 1.75), (7.0, 4.0, 1.15))]
     return combine(cone(6, (-0.3, 2.0), (0.25, 0.22), color=BARK), *tiers)
-
-
-def _choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
-    return colors[rng.integers(len(colors), size=count)]

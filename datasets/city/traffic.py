@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.city.classes import HUMAN, MOVING_CAR, STATIC_CAR
-from semstab.datasets.city.mesh import Float64, Shape, Surface, box, combine, join
+from semstab.datasets.city.mesh import Float64, Shape, Surface, box, choose, combine, join
 from semstab.datasets.city.plots import SIDEWALK, SIDEWALK_ABOVE, Spot, columns
 from semstab.datasets.city.streets import MAIN_WIDTH, Layout, Street
 from semstab.datasets.city.terrain import Terrain
@@ -53,13 +53,13 @@ def person() -> Shape:
 
 def parked_cars(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
     """Cars that stand still."""
-    paint = PAINT[rng.integers(len(PAINT), size=len(spots))]
+    paint = choose(PAINT, len(spots), rng)
     return _stand(car(), STATIC_CAR, spots, ROAD_ABOVE, paint, _car_sizes(len(spots), rng), layout, terrain)
 
 
 def standing_people(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
     """People who stand still."""
-    clothes = CLOTHES[rng.integers(len(CLOTHES), size=len(spots))]
+    clothes = choose(CLOTHES, len(spots), rng)
     heights = np.tile(rng.uniform(0.9, 1.08, size=(len(spots), 1)), (1, 3))
     return _stand(person(), HUMAN, spots, ROAD_ABOVE, clothes, heights, layout, terrain)
 
@@ -120,8 +120,8 @@ class Traffic:
         cars = _movers(streets, 38.0, lambda width: min(1.75, 0.135 * width), (6.0, 13.0), rng)
         walkers = _movers(streets, 70.0, lambda width: width / 2 + SIDEWALK / 2, (0.9, 1.7), rng)
         n, m = len(cars.at), len(walkers.at)
-        cars = replace(cars, tint=PAINT[rng.integers(len(PAINT), size=n)], size=_car_sizes(n, rng))
-        clothes, heights = CLOTHES[rng.integers(len(CLOTHES), size=m)], rng.uniform(0.9, 1.08, size=(m, 1))
+        cars = replace(cars, tint=choose(PAINT, n, rng), size=_car_sizes(n, rng))
+        clothes, heights = choose(CLOTHES, m, rng), rng.uniform(0.9, 1.08, size=(m, 1))
         return cls(layout, terrain, cars, replace(walkers, tint=clothes, size=np.tile(heights, (1, 3))))
 
     def at(self, seconds: float, camera: Float64) -> Surface:
