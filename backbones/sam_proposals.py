@@ -16,10 +16,9 @@ import numpy.typing as npt
 import torch
 import transformers
 from pydantic import Field
-from torch import nn
 
 from semstab.backbones import UNASSIGNED, Image, image_digest
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.errors import DataError
 from semstab.files import atomic_path, content_key
 
@@ -176,9 +175,8 @@ def point_grid(side: int) -> Array:
 
 def full_size(logits: torch.Tensor, padded: Any, resized: Any, image: Any) -> torch.Tensor:
     """Mask logits (h, w) of the padded square, without the padding, at the image's size; bilinear each time."""
-    square = nn.functional.interpolate(logits[None, None], size=padded, mode="bilinear", align_corners=False)
-    inside = square[..., : resized[0], : resized[1]]
-    return nn.functional.interpolate(inside, size=image, mode="bilinear", align_corners=False)[0, 0]
+    square = bilinear(logits[None], padded)
+    return bilinear(square[..., : resized[0], : resized[1]], image)[0]
 
 
 def stability_score(logits: torch.Tensor, offset: float) -> float:

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 from torch import nn
 
 from semstab.backbones import Backbone, Image, Prediction, narrowed
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.backbones.dense_clip import dense_features
 from semstab.backbones.prompts import Prompts, read_prompts
 from semstab.backbones.simfeatup import SimFeatUp
@@ -85,9 +85,7 @@ class SegEarthOV(Backbone):
     def _prediction(self, image: Image, scores: bool) -> Prediction:
         pixels = torch.as_tensor(normalised(image, self.options.resize)).to(self._model.device, self._model.dtype)
         logits = slide(pixels, self.window, self.stride, self._window_logits)
-        full = nn.functional.interpolate(
-            logits[None].float(), size=image.shape[:2], mode="bilinear", align_corners=False
-        )[0]
+        full = bilinear(logits.float(), image.shape[:2])
         probability = self._class_probability((self.options.sharpness * full).softmax(dim=0))
         best, label = probability.max(dim=0)
         if self.prompts.background is not None:
@@ -112,10 +110,7 @@ class SegEarthOV(Backbone):
             patches = self._upsampler(patches, pixels)
         cosine = torch.einsum("qd,dhw->qhw", self._queries, nn.functional.normalize(patches[0], dim=0))
         cosine = cosine + self.options.bias * (self._queries @ nn.functional.normalize(whole[0], dim=0))[:, None, None]
-        upsampled = nn.functional.interpolate(
-            cosine[None], size=pixels.shape[-2:], mode="bilinear", align_corners=False
-        )[0]
-        return upsampled[:, *place]
+        return bilinear(cosine, pixels.shape[-2:])[:, *place]
 
     @torch.inference_mode()
     def _text_features(self, tokenizer: Any, prompts: Prompts) -> torch.Tensor:
