@@ -8,10 +8,11 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from semstab.measures import Measure
 from semstab.metrics import macro_mean, pool
 from semstab.records import Record, Result, Variation
 from semstab.results import Means
-from semstab.statistics import number_at
+from semstab.statistics import Estimate, MapStatistics
 
 ENOUGH = 1000
 """Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its
@@ -83,16 +84,26 @@ def pooled(records: Sequence[Record]) -> Pooled:
         strata=strata,
         classes=tuple(pool(rows, voxels) for rows in of_class),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
-        psa=_macro(records, "agreement", "psa", "value"),
-        alpha=_macro(records, "agreement", "alpha", "value"),
-        drift=_macro(records, "drift", "sbd", "value"),
-        drift_null=_macro(records, "drift", "null", "value"),
+        psa=_macro(records, lambda found: found.agreement.psa),
+        alpha=_macro(records, lambda found: found.agreement.alpha),
+        drift=_macro(records, lambda found: found.drift.sbd),
+        drift_null=_macro(records, lambda found: found.drift.null),
     )
 
 
-def _macro(records: Sequence[Record], *path: str) -> float:
-    """The macro mean of a number of the units' statistics; NaN where none has it."""
-    return macro_mean([number_at(record.statistics, *path) for record in records])
+def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:
+    """The macro mean of an estimate in the units' statistics; NaN where none has it."""
+    return macro_mean([take(record.statistics).value for record in records if record.statistics is not None])
+
+
+def over_all(measure: Measure) -> Callable[[Pooled], float]:
+    """Takes a measure's mean over all voxels."""
+    return lambda pooled: pooled.every[measure]
+
+
+def over_recurrent(measure: Measure) -> Callable[[Pooled], float]:
+    """Takes a measure's mean over the voxels with OP >= 3."""
+    return lambda pooled: pooled.recurrent[measure]
 
 
 @dataclass(frozen=True)

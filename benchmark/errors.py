@@ -1,5 +1,8 @@
 """The one exception root: what the command line reports in one line, with its exit code."""
 
+LONGEST = 200
+"""Characters of another library's error that are told."""
+
 
 class SemstabError(Exception):
     """Something the caller can mend. The message says what is wrong, where, and what to do."""
@@ -20,5 +23,6 @@ class MissingDependencyError(SemstabError, ImportError):
 
 
 def one_line(error: Exception) -> str:
-    """What another library's error says, without its line breaks; its type where it says nothing."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """What another library's error says, without its line breaks and in bounds; its type where it says nothing."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

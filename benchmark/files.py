@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import math
 import os
+import stat
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,9 @@ import yaml
 
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.json_form import to_json
+
+MAX_YAML_BYTES = 2**24
+MAX_ALIASED = 10**5
 
 
 @contextmanager
@@ -82,13 +89,54 @@ def read_json(path: str | Path) -> Any:
         raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
 
 
+def read_limited(path: str | Path, limit: int) -> bytes:
+    """The content of a file. Raises OSError, too, for what is no file (a pipe, a device), or larger than the limit."""
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"{size} bytes are too many for such a file, at most {limit}")
+        return file.read()
+
+
+def open_file(path: str | Path) -> BufferedReader:
+    """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  an opener; the caller closes it
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return file
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a pipe at once, though nobody writes to it."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
 def parse_yaml(text: str, where: str) -> Any:
     """The content of a YAML text, without tags that make objects.
 
     Raises ConfigError in one line that starts with `where` where it is not valid.
     """
     try:
-        return yaml.safe_load(text)
+        loader = yaml.SafeLoader(text)
+        node = loader.get_single_node()
+        values: dict[int, float] = {}
+        if _expanded(node, values) > len(values) + MAX_ALIASED:
+            raise ConfigError(f"{where}: its aliases (*name) stand for more than {MAX_ALIASED} values; write them out")
+        return None if node is None else loader.construct_document(node)
+    except ConfigError:
+        raise
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
+
+
+def _expanded(node: Any, known: dict[int, float]) -> float:
+    """How many values a YAML node stands for with its aliases written out: infinity where it holds itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        parts = getattr(node, "value", ())
+        parts = parts if isinstance(parts, list) else ()
+        children = (child for part in parts for child in (part if isinstance(part, tuple) else (part,)))
+        known[id(node)] = 1 + sum(_expanded(child, known) for child in children)
+    return known[id(node)]

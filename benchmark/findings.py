@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from semstab.averages import ENOUGH, Level, Pooled, Sweep, complete_scenes, describe, levels, pooled
+from semstab.measures import SBD, VSS
 from semstab.records import Result
 
-VISIBLE_VSS = 0.001
+VISIBLE_VSS = 10.0 ** -VSS.digits[0]
 """A difference of VSS counts from one unit of the last decimal of the paper's main tables on."""
 
-VISIBLE_SBD = 0.0001
+VISIBLE_SBD = 10.0 ** -SBD.digits[0]
 """Likewise for SBD."""
 
 VISIBLE_SHARE = 0.0001
@@ -27,7 +28,7 @@ ASSOCIATION = ("voxel_size", "depth_noise", "translation_noise", "rotation_noise
 """The sweeps of the third finding. Drift is left out: it bends the map slowly, so that successive frames still meet."""
 
 
-class Verdict(enum.Enum):
+class Answer(enum.Enum):
     """What the records say of a claim."""
 
     SHOWN = "shown"
@@ -36,16 +37,16 @@ class Verdict(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ClaimResult:
     """What one test says: the numbers that the verdict rests on, and why it is not 'shown', where it is not."""
 
-    verdict: Verdict
+    verdict: Answer
     numbers: str = ""
     why: str = ""
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ClaimTest:
     """A test of a claim on the voxels of one backbone, pooled over scenes and on each scene by itself.
 
     condition  what was swept, where something was
@@ -53,12 +54,12 @@ class Evidence:
     """
 
     backbone: str
-    outcome: Outcome
+    outcome: ClaimResult
     condition: str = ""
     scenes: tuple[int, int] = (0, 0)
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Answer:
         """Of its outcome."""
         return self.outcome.verdict
 
@@ -74,7 +75,7 @@ class Finding:
     name: str
     claim: str
     rule: str
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[ClaimTest, ...]
     caveat: str = ""
 
     @property
@@ -89,12 +90,12 @@ class Finding:
         return f"shown in {shown} of {tested} tests" if 0 < shown < tested else self.verdict.value
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Answer:
         """Shown where every test that can be made shows it."""
         shown, tested = self.counts
         if not tested:
-            return Verdict.UNTESTED
-        return Verdict.SHOWN if shown == tested else Verdict.NOT_SHOWN
+            return Answer.UNTESTED
+        return Answer.SHOWN if shown == tested else Answer.NOT_SHOWN
 
 
 def findings(result: Result) -> tuple[Finding, ...]:
@@ -114,11 +115,11 @@ def _disagreement(result: Result) -> Finding:
     )
 
 
-def more_disagreement(voxels: Pooled) -> Outcome:
+def more_disagreement(voxels: Pooled) -> ClaimResult:
     """Is VSS of the recurrent voxels lower than that of all?"""
     if voxels.recurrent.voxels < ENOUGH:
         return _untested(f"{voxels.recurrent.voxels:,} voxels have OP>=3; {ENOUGH:,} are needed.")
-    every, recurrent = voxels.every.vss, voxels.recurrent.vss
+    every, recurrent = voxels.every[VSS], voxels.recurrent[VSS]
     return _outcome(
         f"VSS {recurrent:.4f} for OP>=3 against {every:.4f} over all voxels: {100 * (1 - recurrent):.1f}% of the"
         f" evidence disagrees, not {100 * (1 - every):.1f}%.",
@@ -141,14 +142,14 @@ def _drift(result: Result) -> Finding:
     )
 
 
-def falling_drift(voxels: Pooled) -> Outcome:
+def falling_drift(voxels: Pooled) -> ClaimResult:
     """Does mean SBD fall from each stratum to the next?"""
-    strata = [row for row in voxels.strata if row.sbd_voxels >= ENOUGH]
+    strata = [row for row in voxels.strata if row.defined(SBD) >= ENOUGH]
     if len(strata) < 2:
         return _untested(f"Fewer than two strata of OP have {ENOUGH:,} voxels with an SBD.")
     return _outcome(
-        f"SBD {', '.join(f'{row.sbd:.4f} at {row.name}' for row in strata)}.",
-        [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a.sbd - b.sbd < VISIBLE_SBD],
+        f"SBD {', '.join(f'{row[SBD]:.4f} at {row.name}' for row in strata)}.",
+        [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a[SBD] - b[SBD] < VISIBLE_SBD],
     )
 
 
@@ -165,7 +166,7 @@ def _association(result: Result) -> Finding:
     )
 
 
-def less_association(sweep: Sweep, found: Sequence[Level]) -> Outcome:
+def less_association(sweep: Sweep, found: Sequence[Level]) -> ClaimResult:
     """Does VSS rise and the recurrent share fall wherever fewer observations meet?"""
     if sweep.noise and all(level.value for level in found):
         return _untested("There is no undisturbed level (0) to compare with.")
@@ -209,7 +210,7 @@ def _sampling(result: Result) -> Finding:
     )
 
 
-def denser_sampling(sweep: Sweep, found: Sequence[Level]) -> Outcome:
+def denser_sampling(sweep: Sweep, found: Sequence[Level]) -> ClaimResult:
     """Does aggregate VSS fall with more frames, and recurrent VSS move much less?"""
     found = [level for level in found if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
     if len(found) < 2:
@@ -230,14 +231,14 @@ def denser_sampling(sweep: Sweep, found: Sequence[Level]) -> Outcome:
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 
-def _base_evidence(result: Result, backbone: str, test: Callable[[Pooled], Outcome]) -> Evidence:
+def _base_evidence(result: Result, backbone: str, test: Callable[[Pooled], ClaimResult]) -> ClaimTest:
     records = result.select(backbone=backbone)
     return _evidence(backbone, test(pooled(records)), [test(pooled([record])) for record in records])
 
 
 def _sweep_evidence(
-    result: Result, sweeps: Sequence[str], test: Callable[[Sweep, Sequence[Level]], Outcome], nothing: str
-) -> tuple[Evidence, ...]:
+    result: Result, sweeps: Sequence[str], test: Callable[[Sweep, Sequence[Level]], ClaimResult], nothing: str
+) -> tuple[ClaimTest, ...]:
     """For each sweep and backbone; one row a backbone that says so where nothing was swept."""
     found = []
     for sweep in (describe(name) for name in sweeps):
@@ -247,30 +248,30 @@ def _sweep_evidence(
                 together = test(sweep, levels(result, sweep.name, backbone))
                 found.append(_evidence(backbone, together, by_scene, sweep.title))
     missing = _untested(f"The study varies {nothing}, or no scene has all levels.")
-    return tuple(found) or tuple(Evidence(backbone, missing) for backbone in result.backbones)
+    return tuple(found) or tuple(ClaimTest(backbone, missing) for backbone in result.backbones)
 
 
-def _evidence(backbone: str, together: Outcome, by_scene: Sequence[Outcome], condition: str = "") -> Evidence:
+def _evidence(backbone: str, together: ClaimResult, by_scene: Sequence[ClaimResult], condition: str = "") -> ClaimTest:
     """What the pooled voxels say, unless most scenes by themselves say otherwise: then pooling made it."""
     shown, tested = _count(by_scene)
-    if together.verdict is Verdict.SHOWN and 2 * shown < tested:
+    if together.verdict is Answer.SHOWN and 2 * shown < tested:
         why = f"The scenes together show it, but by themselves only {shown} of {tested}."
-        together = Outcome(Verdict.NOT_SHOWN, together.numbers, why)
-    return Evidence(backbone, together, condition, (shown, tested))
+        together = ClaimResult(Answer.NOT_SHOWN, together.numbers, why)
+    return ClaimTest(backbone, together, condition, (shown, tested))
 
 
-def _count(outcomes: Sequence[Outcome]) -> tuple[int, int]:
-    tested = [outcome.verdict for outcome in outcomes if outcome.verdict is not Verdict.UNTESTED]
-    return sum(verdict is Verdict.SHOWN for verdict in tested), len(tested)
+def _count(outcomes: Sequence[ClaimResult]) -> tuple[int, int]:
+    tested = [outcome.verdict for outcome in outcomes if outcome.verdict is not Answer.UNTESTED]
+    return sum(verdict is Answer.SHOWN for verdict in tested), len(tested)
 
 
-def _outcome(numbers: str, why: Sequence[str]) -> Outcome:
+def _outcome(numbers: str, why: Sequence[str]) -> ClaimResult:
     """Shown, unless something speaks against it."""
-    return Outcome(Verdict.NOT_SHOWN if why else Verdict.SHOWN, numbers, " ".join(why))
+    return ClaimResult(Answer.NOT_SHOWN if why else Answer.SHOWN, numbers, " ".join(why))
 
 
-def _untested(why: str) -> Outcome:
-    return Outcome(Verdict.UNTESTED, why=why)
+def _untested(why: str) -> ClaimResult:
+    return ClaimResult(Answer.UNTESTED, why=why)
 
 
 def _values(sweep: Sweep, found: Sequence[Level], separator: str = ", ") -> str:
@@ -278,7 +279,7 @@ def _values(sweep: Sweep, found: Sequence[Level], separator: str = ", ") -> str:
 
 
 def _vss(level: Level) -> float:
-    return level.mean(lambda p: p.every.vss)
+    return level.mean(lambda p: p.every[VSS])
 
 
 def _share(level: Level) -> float:
@@ -286,4 +287,4 @@ def _share(level: Level) -> float:
 
 
 def _recurrent_vss(level: Level) -> float:
-    return level.mean(lambda p: p.recurrent.vss)
+    return level.mean(lambda p: p.recurrent[VSS])

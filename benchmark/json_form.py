@@ -11,14 +11,13 @@ import functools
 import math
 import reprlib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path, PurePath
 from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints, runtime_checkable
 
 from semstab.errors import DataError, one_line
 
 T = TypeVar("T")
-Reader = Callable[[Any], Any]
 
 INLINE: Mapping[str, bool] = types.MappingProxyType({"inline": True})
 """Metadata of a field whose own fields stand among those of its parent: `unit: Unit = field(metadata=INLINE)`."""
@@ -36,7 +35,7 @@ class OwnForm(Protocol):
 
     @classmethod
     def of_json_content(cls, content: Any) -> Any:
-        """Read it; raises ValueError, TypeError or KeyError where it does not fit."""
+        """Read it, with `fields_of`; raises ValueError or TypeError where it does not fit."""
 
 
 # --- To JSON ----------------------------------------------------------------------------------------------------------
@@ -67,7 +66,9 @@ def _writer(kind: Any) -> Callable[[Any], Any]:
 
 
 _WRITERS: Mapping[Any, Callable[[Any], Any]] = {
-    float: lambda value: value if math.isfinite(value) else None,
+    float: lambda value: float(value) if math.isfinite(value) else None,
+    int: int,
+    str: str.__str__,
     Mapping: lambda value: {str(key): to_json(item) for key, item in value.items()},
     tuple: lambda value: [to_json(item) for item in value],
     list: lambda value: [to_json(item) for item in value],
@@ -99,20 +100,20 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
     the field where the content is not that of a `cls`.
     """
     try:
-        return cast(T, _reader(cast(Any, cls))(content))
+        return cast(T, _read(cls, content))
     except _MisfitError as misfit:
         line = misfit.line()
     except RecursionError:
         line = "content: is nested too deeply"
-    raise DataError(f"{where}: {line}; it is damaged, or another version's: make it again")
+    raise DataError(f"{where}: {line}; it is damaged, or another version's; delete it and compute it again")
 
 
 class _MisfitError(Exception):
     """Content that is not what the types say; each level that it leaves adds its step to the path."""
 
-    def __init__(self, message: str) -> None:
+    def __init__(self, message: str, *steps: str) -> None:
         super().__init__(message)
-        self.steps: list[str] = []
+        self.steps = list(steps)
 
     def line(self) -> str:
         path = "".join(reversed(self.steps)).removeprefix(".") or "content"
@@ -127,176 +128,112 @@ def _expected(what: str, content: Any) -> _MisfitError:
     return _MisfitError(f"should be {what}, is {reprlib.repr(content)}")
 
 
-@functools.cache
-def _reader(hint: Any) -> Reader:
-    """What reads content as a `hint`."""
-    if hint in _PLAIN:
-        return _PLAIN[hint]
-    if (origin := get_origin(hint)) in _GENERIC:
-        return _GENERIC[origin](get_args(hint))
-    if isinstance(hint, type) and issubclass(hint, OwnForm):
-        return _built(hint.of_json_content)
-    if dataclasses.is_dataclass(hint):
-        return _dataclass(hint)
-    raise TypeError(f"{hint} has no JSON form")
+def _read(hint: Any, content: Any) -> Any:
+    """Content as a `hint`."""
+    if hint is float:
+        return _number(content)
+    if hint in _EXACT:
+        return _exactly(hint, content)
+    origin, arguments = _parsed(hint)
+    if origin in _GENERIC:
+        return _GENERIC[origin](arguments, content)
+    return content if hint is Any else _object(hint, content)
 
 
-def _float(content: Any) -> float:
-    if type(content) is float:
+_parsed = functools.cache(lambda hint: (get_origin(hint), get_args(hint)))
+
+
+def _at(step: str, hint: Any, content: Any) -> Any:
+    """What stands at that step of the path."""
+    try:
+        return _read(hint, content)
+    except _MisfitError as misfit:
+        misfit.steps.append(step)
+        raise
+
+
+_EXACT: Mapping[Any, str] = {
+    int: "a whole number", str: "text", bool: "true or false", type(None): "null", list: "a list", dict: "an object",
+}  # fmt: skip
+
+
+def _exactly(kind: Any, content: Any) -> Any:
+    if type(content) is kind:
+        return content
+    raise _expected(_EXACT[kind], content)
+
+
+def _number(content: Any) -> float:
+    """An int stays as it was written."""
+    if type(content) is float or (type(content) is int and abs(content) < 2**1023):
         return content
     if content is None:
         return math.nan
-    if type(content) is int and abs(content) < 2**1023:
-        return float(content)
     raise _expected("a number", content)
 
 
-def _exactly(kind: type[Any], what: str) -> Reader:
-    def read(content: Any) -> Any:
-        if type(content) is kind:
-            return content
-        raise _expected(what, content)
-
-    return read
+def _one_of(values: tuple[Any, ...], content: Any) -> Any:
+    if any(type(content) is type(value) and content == value for value in values):
+        return content
+    raise _expected(f"one of {', '.join(map(repr, values))}", content)
 
 
-_text = _exactly(str, "text")
-
-_PLAIN: Mapping[Any, Reader] = {
-    float: _float,
-    int: _exactly(int, "a whole number"),
-    str: _text,
-    bool: _exactly(bool, "true or false"),
-    type(None): _exactly(type(None), "null"),
-    Path: lambda content: Path(_text(content)),
-    Any: lambda content: content,
-}
+def _optional(arguments: tuple[Any, ...], content: Any) -> Any:
+    """X | None."""
+    (hint,) = (argument for argument in arguments if argument is not type(None))
+    return None if content is None else _read(hint, content)
 
 
-def _one_of(values: tuple[Any, ...]) -> Reader:
-    def read(content: Any) -> Any:
-        if any(type(content) is type(value) and content == value for value in values):
-            return content
-        raise _expected(f"one of {', '.join(map(repr, values))}", content)
-
-    return read
+def _sequence(arguments: tuple[Any, ...], content: Any) -> list[Any]:
+    items = _exactly(list, content)
+    return [_at(f"[{i}]", arguments[0], item) for i, item in enumerate(items)]
 
 
-def _optional(arguments: tuple[Any, ...]) -> Reader:
-    others = [argument for argument in arguments if argument is not type(None)]
-    if len(others) != 1 or len(others) == len(arguments):
-        raise TypeError(f"{arguments}: a union that has no JSON form")
-    reader = _reader(others[0])
-    return lambda content: None if content is None else reader(content)
-
-
-def _list(arguments: tuple[Any, ...]) -> Reader:
-    reader = _reader(arguments[0])
-
-    def read(content: Any) -> Any:
-        if type(content) is not list:
-            raise _expected("a list", content)
-        return _items(content, [reader] * len(content))
-
-    return read
-
-
-def _tuple(arguments: tuple[Any, ...]) -> Reader:
+def _tuple(arguments: tuple[Any, ...], content: Any) -> tuple[Any, ...]:
     if arguments[1:] == (...,):
-        read_list = _list(arguments)
-        return lambda content: tuple(read_list(content))
-    readers = [_reader(argument) for argument in arguments]
-
-    def read(content: Any) -> Any:
-        if type(content) is not list or len(content) != len(readers):
-            raise _expected(f"a list of {len(readers)}", content)
-        return tuple(_items(content, readers))
-
-    return read
+        return tuple(_sequence(arguments, content))
+    if len(_exactly(list, content)) != len(arguments):
+        raise _expected(f"a list of {len(arguments)}", content)
+    return tuple(_at(f"[{i}]", hint, item) for i, (hint, item) in enumerate(zip(arguments, content, strict=True)))
 
 
-def _items(content: list[Any], readers: list[Reader]) -> list[Any]:
-    values: list[Any] = []
-    try:
-        for item, reader in zip(content, readers, strict=True):
-            values.append(reader(item))
-    except _MisfitError as misfit:
-        misfit.steps.append(f"[{len(values)}]")
-        raise
-    return values
+def _mapping(arguments: tuple[Any, ...], content: Any) -> dict[str, Any]:
+    entries = _exactly(dict, content)
+    return {key: _at(f".{key}", arguments[1], item) for key, item in entries.items()}
 
 
-def _mapping(arguments: tuple[Any, ...]) -> Reader:
-    reader = _reader(arguments[1])
-
-    def read(content: Any) -> Any:
-        values = {}
-        for key, item in _entries(content).items():
-            try:
-                values[key] = reader(item)
-            except _MisfitError as misfit:
-                misfit.steps.append(f".{key}")
-                raise
-        return values
-
-    return read
-
-
-_GENERIC: Mapping[Any, Callable[[tuple[Any, ...]], Reader]] = {
-    Literal: _one_of,
-    Union: _optional,
-    types.UnionType: _optional,
-    tuple: _tuple,
-    list: _list,
-    Mapping: _mapping,
+_GENERIC: Mapping[Any, Callable[[tuple[Any, ...], Any], Any]] = {
+    Literal: _one_of, Union: _optional, types.UnionType: _optional, tuple: _tuple, list: _sequence, Mapping: _mapping,
     dict: _mapping,
-}
+}  # fmt: skip
 
 
-def _entries(content: Any) -> dict[str, Any]:
-    if type(content) is not dict:
-        raise _expected("an object", content)
-    return content
+def _object(cls: Any, content: Any) -> Any:
+    """A class; that it refuses what it is made of is a misfit, too."""
+    try:
+        if issubclass(cls, OwnForm):
+            return cls.of_json_content(content)
+        if cls is Path:
+            return Path(_exactly(str, content))
+        own, inline, optional = _fields(cls)
+        return cls(**{name: _read(hint, content) for name, hint in inline.items()}, **fields_of(content, own, optional))
+    except (ValueError, TypeError) as error:
+        raise _MisfitError(f"{type(error).__name__}: {error}") from error
 
 
-def _dataclass(cls: Any) -> Reader:
-    hints = get_type_hints(cls)
-    known = [field for field in dataclasses.fields(cls) if field.init]
-    inlined = [(field.name, _reader(hints[field.name])) for field in known if "inline" in field.metadata]
-    own = [
-        (field.name, field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING, hints)
-        for field in known
-        if "inline" not in field.metadata
-    ]
-    readers: dict[str, Reader] = {}  # made when first needed: a type may hold itself
-    make = _built(lambda values: cls(**values))
-
-    def read(content: Any) -> Any:
-        entries = _entries(content)
-        values = {name: reader(entries) for name, reader in inlined}
-        for name, required, types_of in own:
-            try:
-                if name in entries:
-                    if name not in readers:
-                        readers[name] = _reader(types_of[name])
-                    values[name] = readers[name](entries[name])
-                elif required:
-                    raise _MisfitError("is missing")
-            except _MisfitError as misfit:
-                misfit.steps.append(f".{name}")
-                raise
-        return make(values)
-
-    return read
+def fields_of(content: Any, hints: Mapping[str, Any], optional: Collection[str] = ()) -> dict[str, Any]:
+    """The entries of a JSON object that are asked for, each read as its type; `optional` ones may be missing."""
+    entries = _exactly(dict, content)
+    if missing := [name for name in hints if name not in entries and name not in optional]:
+        raise _MisfitError("is missing", f".{missing[0]}")
+    return {name: _at(f".{name}", hint, entries[name]) for name, hint in hints.items() if name in entries}
 
 
-def _built(make: Reader) -> Reader:
-    """What a class makes of its content; that it refuses it is a misfit, too."""
-
-    def read(content: Any) -> Any:
-        try:
-            return make(content)
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
-            raise _MisfitError(f"{type(error).__name__}: {error}") from error
-
-    return read
+@functools.cache
+def _fields(cls: Any) -> tuple[dict[str, Any], dict[str, Any], set[str]]:
+    """The types of a dataclass's own fields and of its inline ones, and which fields may be missing."""
+    types_of, known = get_type_hints(cls), [field for field in dataclasses.fields(cls) if field.init]
+    inline = {field.name: types_of[field.name] for field in known if "inline" in field.metadata}
+    own = {field.name: types_of[field.name] for field in known if field.name not in inline}
+    missing = dataclasses.MISSING
+    return own, inline, {f.name for f in known if f.default is not missing or f.default_factory is not missing}

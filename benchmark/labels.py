@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+import reprlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy.typing as npt
 import yaml
 
 from semstab.errors import ConfigError, DataError
-from semstab.files import parse_yaml, write_text
+from semstab.files import MAX_YAML_BYTES, parse_yaml, read_limited, write_text
 
 IGNORE_8BIT = 255
 IGNORE_16BIT = 65535
@@ -93,11 +94,12 @@ class LabelSpace:
             raise ConfigError(f"{where}: a taxonomy needs a list 'classes'")
         known = ("name", "classes", "ignored")
         if unknown := [key for key in content if key not in known]:
-            raise ConfigError(f"{where}: unknown key '{unknown[0]}'; known: {', '.join(known)}")
+            raise ConfigError(f"{where}: unknown key {reprlib.repr(unknown[0])}; known: {', '.join(known)}")
         entries = [entry if isinstance(entry, dict) else {"name": entry} for entry in content["classes"]]
         for entry in entries:
             if not isinstance(entry.get("name"), str) or set(entry) - {"name", "id", "color", "members"}:
-                raise ConfigError(f"{where}: a class needs a name, and may have id, color, members; got {entry}")
+                got = reprlib.repr(entry)
+                raise ConfigError(f"{where}: a class needs a name, and may have id, color, members; got {got}")
         return cls(
             name=str(content.get("name", Path(where).stem)),
             classes=tuple(entry["name"] for entry in entries),
@@ -281,7 +283,7 @@ def _taxonomy_text(name: str) -> tuple[str, str]:
         hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(shipped_taxonomies())}, or a .yaml file"
         raise ConfigError(f"taxonomy '{name}' is not known; {hint}")
     try:
-        return path.read_text(encoding="utf-8"), str(path)
+        return read_limited(path, MAX_YAML_BYTES).decode("utf-8"), str(path)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: the taxonomy cannot be read ({error})") from error
 
@@ -294,17 +296,17 @@ def name_key(name: str) -> str:
 def _ids(entries: list[dict[str, Any]], where: str) -> tuple[int, ...]:
     ids = [entry.get("id", k) for k, entry in enumerate(entries)]
     if not all(isinstance(i, int) and not isinstance(i, bool) for i in ids):
-        raise ConfigError(f"{where}: class ids must be whole numbers, got {ids}")
+        raise ConfigError(f"{where}: class ids must be whole numbers, got {reprlib.repr(ids)}")
     return tuple(ids)
 
 
 def _color(value: Any, where: str) -> Color:
     if isinstance(value, list | tuple) and len(value) == 3 and all(isinstance(c, int) and 0 <= c <= 255 for c in value):
         return (value[0], value[1], value[2])
-    raise ConfigError(f"{where}: a colour is three whole numbers from 0 to 255, got {value}")
+    raise ConfigError(f"{where}: a colour is three whole numbers from 0 to 255, got {reprlib.repr(value)}")
 
 
 def _names(value: Any, where: str) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise ConfigError(f"{where}: members and ignored are lists of names, got {value}")
+        raise ConfigError(f"{where}: members and ignored are lists of names, got {reprlib.repr(value)}")
     return tuple(value)

@@ -45,7 +45,7 @@ class ProgressBar(Observer):
     def run_finished(self, result: Result) -> None:
         """Take the bar away, and say what could not be told."""
         self.close()
-        for note in self.notes:
+        for note in self.notes if not result.failures else ():
             self.bar.console.print(note, style="dim", soft_wrap=True)
 
     def close(self) -> None:
@@ -55,14 +55,19 @@ class ProgressBar(Observer):
 
 def failure_lines(result: Result) -> Iterator[str]:
     """One line for what failed for the same reason."""
-    reasons: dict[tuple[str, str, str], list[Failure]] = {}
+    reasons: dict[str, list[Failure]] = {}
     for failure in result.failures:
-        reasons.setdefault((failure.unit.scene, failure.unit.backbone, failure.message), []).append(failure)
-    for (scene, backbone, message), failures in reasons.items():
+        reasons.setdefault(failure.message, []).append(failure)
+    for message, failures in reasons.items():
+        places = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.backbone}" for failure in failures))
         varied = [name for failure in failures if (name := _named(failure))]
-        what = f"{varied[0]}{f' and {len(varied) - 1} more' if len(varied) > 1 else ''}: " if varied else ""
-        where = "" if message.startswith(f"{scene}, {backbone}") else f"{scene}, {backbone}: "
+        where = "" if message.startswith(places[0]) else f"{_first_of(places)}: "
+        what = f"{_first_of(varied)}: " if varied else ""
         yield f"{where}{what}{message}"
+
+
+def _first_of(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _named(failure: Failure) -> str:

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from semstab.comparison_model import BackboneComparison
 from semstab.config import BACKENDS, BASE
 from semstab.json_form import INLINE
 from semstab.results import Agreement, Unit, UnitSummary
+from semstab.statistics_model import MapStatistics
 from semstab.voxels import VoxelTable
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
@@ -80,8 +82,8 @@ class Record:
     truth_file: Path | None = None
 
     @property
-    def statistics(self) -> Mapping[str, Any]:
-        """What `semstab.statistics` says of the map, as JSON content; empty in studies of earlier versions."""
+    def statistics(self) -> MapStatistics | None:
+        """What `semstab.statistics` says of the map."""
         return self.summary.statistics
 
     @property
@@ -163,7 +165,7 @@ class Result:
     up: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
-    comparisons: tuple[Mapping[str, Any], ...] = ()
+    comparisons: tuple[BackboneComparison, ...] = ()
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None

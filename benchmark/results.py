@@ -6,9 +6,10 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from semstab.json_form import INLINE
+from semstab.measures import Measure, MeasureMeans
+from semstab.statistics_model import MapStatistics
 
 SCHEMA = 2
 """Version of summary.json."""
@@ -81,23 +82,30 @@ class FrameReport:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over a group of voxels: a stratum, a class, the recurrent ones. NaN where undefined.
+    """Means over a group of voxels: a stratum, a class, the recurrent ones; `means[VSS]` is that of a measure.
 
-    share is the group's part of all voxels, 0 to 1; sbd runs over its sbd_voxels, those with OP >= 2, only.
+    share is the group's part of all voxels, 0 to 1.
     """
 
     name: str
     share: float
     voxels: int
-    vss: float
-    sbd: float
-    entropy: float
-    sbd_voxels: int
+    means: MeasureMeans = field(metadata=INLINE)
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means[measure]
+
+    def defined(self, measure: Measure) -> int:
+        """The voxels over which the measure's mean runs."""
+        return self.means.voxels.get(measure.key, self.voxels)
 
 
 @dataclass(frozen=True)
 class TableSummary:
-    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes."""
+    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
+
+    `summary[VSS]` is the mean of a measure over all voxels where it is defined.
+    """
 
     K: int
     voxel_size: float
@@ -105,12 +113,13 @@ class TableSummary:
     observations: int
     voxels: int
     mean_op: float
-    vss: float
-    sbd: float
-    entropy: float
+    means: MeasureMeans = field(metadata=INLINE)
     strata: tuple[Means, ...]
     recurrent: Means
     classes: tuple[Means, ...]
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means[measure]
 
 
 @dataclass(frozen=True)
@@ -118,7 +127,7 @@ class UnitSummary:
     """One entry of 'runs' in summary.json.
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves; statistics is what `semstab.statistics.describe` says of the map, empty where
+    fusion because what they show moves; statistics is what `semstab.statistics.describe` says of the map, None where
     nothing was asked for.
     """
 
@@ -130,11 +139,11 @@ class UnitSummary:
     fuse_ms_per_frame: float
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     left_out: int = 0
-    statistics: Mapping[str, Any] = field(default_factory=dict)
+    statistics: MapStatistics | None = None
 
 
 @dataclass(frozen=True)
-class Difference:
+class Deviation:
     """Largest and mean absolute difference of one quantity over the voxels that two tables share."""
 
     max: float
@@ -143,12 +152,15 @@ class Difference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json."""
+    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
+
+    differences  of OP, of every measure and of the evidence, by their keys
+    """
 
     scene: str
     backbone: str
     backends: tuple[str, str]
     voxels: tuple[int, int]
     only_in: tuple[int, int]
-    differences: Mapping[str, Difference]
+    differences: Mapping[str, Deviation]
     agrees: bool

@@ -55,7 +55,8 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
     extra = (GROUND_TRUTH,) if scene.ground_truth else ()
     names = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
     if not names:
-        raise DataError(f"{scene.name}: there are no label maps; add them in labels/BACKBONE/, or choose with --scene")
+        places = f"looked for {', '.join(scene.label_paths)}; " if scene.label_paths else ""
+        raise DataError(f"{scene.name}: there are no label maps; {places}add them, or choose with --scene")
     frames = chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
     for backbone in names:
         source = scene.label_space(backbone)

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from semstab.config import BACKENDS
+from semstab.measures import measures
 from semstab.metrics import macro_mean, pool
 from semstab.records import Result
 from semstab.results import STAGES, Agreement, Means, UnitSummary
@@ -30,7 +31,7 @@ def print_summary(result: Result, console: Console) -> None:
     once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
     console.print(
         f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
-        "Read VSS, SBD and entropy by OP, or for OP>=3."
+        f"Read {_listed([measure.word for measure in measures()])} by OP, or for OP>=3."
     )
 
 
@@ -40,11 +41,11 @@ def _verdict_lines(result: Result) -> Iterator[str]:
     units = [record.summary for record in (*result.select(), *result.select(BACKENDS))]
     for base in result.select():
         group = (base.unit.scene, base.unit.backbone)
-        judged = [run for run in units if (run.unit.scene, run.unit.backbone) == group and run.statistics]
+        same = [run for run in units if (run.unit.scene, run.unit.backbone) == group]
+        judged = [run.statistics for run in same if run.statistics is not None]
         if judged:
-            fullest = max(judged, key=lambda run: sum(section is not None for section in run.statistics.values()))
-            scene = f"{fullest.unit.scene}, " if several else ""
-            yield f"{scene}{fullest.statistics['verdict']['line']}\n"
+            scene = f"{base.unit.scene}, " if several else ""
+            yield f"{scene}{max(judged, key=lambda found: found.sections).verdict.line}\n"
 
 
 def _once(run: UnitSummary) -> int:
@@ -64,16 +65,7 @@ def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
 
 
 def _scene_table(runs: Sequence[UnitSummary]) -> Table:
-    numbers = (
-        "voxels",
-        "mean\nOP",
-        "VSS\n↑",
-        "SBD ↓\nbits",
-        "entropy\n↓",
-        "flicker\n%",
-        "OP>=3\n%",
-        "ms a\nframe",
-    )
+    numbers = ("voxels", "mean\nOP", *_headers(), "flicker\n%", "OP>=3\n%", "ms a\nframe")
     table = _table(_title(runs), ("scene",), numbers)
     for backbone, rows in _by_backbone(runs):
         table.add_row(backbone, style="bold")
@@ -90,9 +82,7 @@ def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
     return [
         f"{sum(table.voxels for table in tables):,}",
         _number(macro_mean([table.mean_op for table in tables]), 2),
-        _number(macro_mean([table.vss for table in tables]), 3),
-        _number(macro_mean([table.sbd for table in tables]), 4),
-        _number(macro_mean([table.entropy for table in tables]), 4),
+        *(_number(macro_mean([table[m] for table in tables]), m.digits[0]) for m in measures()),
         _number(macro_mean([run.flicker_percent for run in runs]), 2),
         _number(100 * macro_mean([table.recurrent.share for table in tables]), 2),
         _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1),
@@ -101,7 +91,7 @@ def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
 
 def _strata_table(runs: Sequence[UnitSummary]) -> Table:
     title = "by observation persistence" + (", all scenes pooled" if len(_scenes(runs)) > 1 else "")
-    table = _table(title, ("persistence",), ("voxels", "%", "VSS\n↑", "SBD ↓\nbits", "entropy\n↓"))
+    table = _table(title, ("persistence",), ("voxels", "%", *_headers()))
     for backbone, rows in _by_backbone(runs):
         table.add_row(backbone, style="bold")
         voxels = sum(run.table.voxels for run in rows)
@@ -116,10 +106,14 @@ def _stratum_cells(row: Means) -> list[str]:
         f"  {row.name}",
         f"{row.voxels:,}",
         _number(100 * row.share, 2),
-        _number(row.vss, 3),
-        _number(row.sbd, 4),
-        _number(row.entropy, 4),
+        *(_number(row[m], m.digits[0]) for m in measures()),
     ]
+
+
+def _headers() -> list[str]:
+    """Each measure over an arrow that says which way is good, and its unit."""
+    arrows = [(measure, "↑" if measure.better == "higher" else "↓") for measure in measures()]
+    return [f"{m.word} {arrow}\n{m.unit}" if m.unit else f"{m.word}\n{arrow}" for m, arrow in arrows]
 
 
 def _stages_line(runs: Sequence[UnitSummary]) -> str:
@@ -131,16 +125,25 @@ def _stages_line(runs: Sequence[UnitSummary]) -> str:
 
 
 def _agreement_table(agreement: Sequence[Agreement]) -> Table:
-    numbers = ("voxels in\none only", "|ΔOP|", "|ΔVSS|", "|ΔSBD|", "|ΔH|", "|Δe|", "")
-    table = _table("agreement: largest differences of a voxel (H entropy, e evidence)", ("scene, backbone",), numbers)
+    symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures()}, "evidence": "e"}
+    numbers = ("voxels in\none only", *(f"|Δ{symbol}|" for symbol in symbols.values()), "")
+    short = [f"{measure.symbol} {measure.word}" for measure in measures() if measure.short]
+    title = f"agreement: largest differences of a voxel ({', '.join([*short, 'e evidence'])})"
+    table = _table(title, ("scene, backbone",), numbers)
     for pair in dict.fromkeys(row.backends for row in agreement):
         table.add_row(" · ".join(pair), style="bold")
         for row in (row for row in agreement if row.backends == pair):
-            largest = [row.differences[name].max for name in ("op", "vss", "sbd", "entropy", "evidence")]
+            largest = [row.differences[name].max for name in symbols]
             differences = [f"{difference:.0e}" if difference else "0" for difference in largest]
             verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
             table.add_row(f"  {row.scene}, {row.backbone}", f"{sum(row.only_in):,}", *differences, verdict)
     return table
+
+
+def _listed(words: Sequence[str]) -> str:
+    """'a, b and c'."""
+    *most, last = words
+    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _title(runs: Sequence[UnitSummary]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.config import read_yaml, validated
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     DepthKind,
@@ -18,7 +19,6 @@ from semstab.datasets.files.options import (
     ScoresLayout,
 )
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.formats.disk import files_by_stem, natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.formats.text_files import read_intrinsics

@@ -12,9 +12,9 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import FileOptions, FourIntrinsics, GroundTruth, UpAxis, VoidIds, zero_is_void
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.formats.json_files import number, read_object
 from semstab.datasets.formats.text_tables import read_matrices
 from semstab.datasets.views.cameras import Camera, camera_of

@@ -14,9 +14,10 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.datasets import GROUND_TRUTH
+from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.label_ids import NO_ID
 from semstab.datasets.files.options import DepthScale, FileOptions, GroundTruth, Size, UpAxis, VoidIds, zero_is_void
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.files.scene import NO_ID, FrameSource
 from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera

@@ -34,6 +34,7 @@ class Scene(ABC):
     regions            maps of regions without classes, which `frame` reads by name and nothing fuses
     up                 (3,) unit vector of the world's up axis, or None where it is not known
     folder             where its files lie and label maps of it are looked for, or None where it has none
+    label_paths        where label maps are looked for, of the first frame, with BACKBONE for any name
     settings_file      the file that says what no option says, or None where there is no such file
     labels_like_depth  whether its label maps have the pixels of the depth, not those of the colour images
     skips_incomplete   whether selected frames that lack a file are left out; else they are an error
@@ -45,6 +46,7 @@ class Scene(ABC):
     regions: tuple[str, ...] = ()
     up: npt.NDArray[np.float64] | None = None
     folder: Path | None = None
+    label_paths: tuple[str, ...] = ()
     settings_file: Path | None = None
     labels_like_depth: bool = True
     skips_incomplete: bool = False

@@ -9,18 +9,20 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, InvalidDepth, Size
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.files.scene import FrameSource
+from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera, camera_of
 from semstab.frames import Intrinsics
 
 IMAGE_SIZE = (640, 480)
+INTRINSICS_FILE = "camera-intrinsics.txt"
 USUAL = (585.0, 585.0, 320.0, 240.0)
 
 
 class SevenScenesOptions(FileOptions):
-    """What the format says, and may be said otherwise; the camera of all sequences is 585 585 320 240."""
+    """What the format says, and may be said otherwise; the camera is 585 585 320 240 unless a file says."""
 
     depth_scale: DepthScale = 1000
     invalid_depth: InvalidDepth = (65535,)
@@ -46,7 +48,15 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth image."""
         color = self.options.color_intrinsics
-        camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
+        camera = self._camera(folder)
         label_camera = None if color is None else Camera(Intrinsics(*color), self.options.color_size)
         depth = files_named(folder, "", ".depth.png")
         return frames_of(folder, depth, camera, pose="{name}.pose.txt", color="{name}.color", label_camera=label_camera)
+
+    def _camera(self, folder: Path) -> Camera:
+        """Of the depth: as the options say, else as a file beside the frames or above them does, as 3DMatch has it."""
+        files = (place / INTRINSICS_FILE for place in (folder, folder.parent))
+        file = next((path for path in files if path.is_file()), None)
+        if file is None or self.options.intrinsics is not None:
+            return camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
+        return Camera(read_intrinsics(file))

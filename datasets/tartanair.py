@@ -10,9 +10,9 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import CameraAxes, FileOptions, FourIntrinsics, MaxDepth, UpAxis
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.formats.text_tables import read_table
 from semstab.datasets.views.cameras import camera_of
 from semstab.datasets.views.poses import from_quaternions

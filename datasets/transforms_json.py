@@ -15,9 +15,9 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import Folders, Template, inside
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES

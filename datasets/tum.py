@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, Positive, UpAxis
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.text_tables import read_table, records, to_number
 from semstab.datasets.views.cameras import camera_of

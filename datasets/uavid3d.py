@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
@@ -21,7 +22,6 @@ from semstab.datasets.files.options import (
     PoseConvention,
 )
 from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.files.scene import FrameSource
 from semstab.datasets.files.templates import Folders, Template, inside
 from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES

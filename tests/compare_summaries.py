@@ -17,6 +17,9 @@ TOLERANCE = 1e-9
 IGNORED = frozenset({"key", "input", "digest", "schema"})
 """Keys that are no result; so are those that end in _ms or _seconds, `fuse_ms_per_frame`, and `stages_ms`."""
 
+NOTHING = (None, {})
+"""A section that was not computed."""
+
 NAMED_BY = ("scene", "backbone", "backend", "backends", "variation", "name", "rule", "measure", "a", "b")
 """What tells the entries of a list apart, whatever their order."""
 
@@ -31,7 +34,7 @@ def _differences(a: Any, b: Any, path: str, tolerance: float, added: bool) -> It
         yield from _of_objects(a, b, path, tolerance, added)
     elif isinstance(a, list) and isinstance(b, list):
         yield from _of_lists(a, b, path, tolerance, added)
-    elif not _same(a, b, tolerance):
+    elif not (_same(a, b, tolerance) or (a in NOTHING and b in NOTHING)):
         yield f"{path or 'content'}: {_said(a)} and {_said(b)}"
 
 

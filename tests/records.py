@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from semstab.config import BASE
 from semstab.metrics import summarise
-from semstab.records import BASE, Record, Result, Variation
+from semstab.records import Record, Result, Variation
 from semstab.results import Unit, UnitSummary
 from semstab.voxels import VoxelTable
 

@@ -21,16 +21,20 @@ import semstab
 from semstab.config import Config
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.memory import estimate
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
+from semstab.json_form import to_json
 from semstab.metrics import sbd
 from semstab.plots import figures
 from semstab.plots.maps import right_or_wrong
 from semstab.plots.statistics import DriftByOP, draw_intervals, draw_reliability
 from semstab.report import TOPICS, write_report
-from semstab.settings import load_config, make_plan
-from semstab.statistics import Estimate, analyse, describe, nulls
+from semstab.settings import load_config
+from semstab.statistics import Estimate, Reliability, analyse, describe
 from semstab.statistics.__main__ import main
-from semstab.tables import tables, to_json
+from semstab.statistics.correctness import ACCURACY
+from semstab.tables import tables
+from semstab.tables import to_json as table_content
 from semstab.terminal import print_summary
 from semstab.voxels import Events, VoxelTable
 
@@ -84,7 +88,7 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
         table, events = saved(run, name)
         true = None if name == "gt" else truth
         expected = analyse(table, events, true, limit=true, name=name, edges=(1, 3))
-        assert entry["statistics"] == json.loads(json.dumps(nulls(expected.summary)))
+        assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
         for column, values in expected.maps.items():
             np.testing.assert_array_equal(columns.column(column).to_numpy(), values)
@@ -122,11 +126,11 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    assert entry.statistics == nulls(describe(table, name="a"))
-    assert entry.statistics["drift"]["tests"] is None
+    assert to_json(entry.statistics) == to_json(describe(table, name="a"))
+    assert entry.statistics.drift.tests is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
-    assert again.runs[0].statistics == entry.statistics
+    assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
 
 
 class Interrupting(Observer):
@@ -144,28 +148,28 @@ def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> N
     with pytest.raises(KeyboardInterrupt):
         semstab.engine.run(config, out=tmp_path / "run", observers=[Interrupting()])
     resumed = semstab.engine.run(config, out=tmp_path / "run")
-    assert [entry.statistics for entry in resumed.runs] == [entry.statistics for entry in whole.runs]
-    assert resumed.comparisons == whole.comparisons
-    assert whole.comparisons[0]["paired"]["values"]["accuracy"]["a"]["value"] > 0.5  # the truth was fused again
+    assert [to_json(entry.statistics) for entry in resumed.runs] == [to_json(entry.statistics) for entry in whole.runs]
+    assert to_json(resumed.comparisons) == to_json(whole.comparisons)
+    assert whole.comparisons[0].paired.of(ACCURACY)["a"].value > 0.5  # the truth was fused again
 
 
 def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
     result = semstab.engine.run(configure(root, backends=["open3d"], check="numpy", statistics=True))
     open3d, numpy = result.runs
-    assert open3d.statistics["drift"]["tests"] is None
-    assert open3d.statistics["correctness"] is not None
-    assert numpy.statistics["drift"]["tests"] is not None
-    assert numpy.statistics["agreement"]["alpha"] == pytest.approx(open3d.statistics["agreement"]["alpha"])
+    assert open3d.statistics.drift.tests is None
+    assert open3d.statistics.correctness is not None
+    assert numpy.statistics.drift.tests is not None
+    assert numpy.statistics.agreement.alpha.value == pytest.approx(open3d.statistics.agreement.alpha.value)
     plain = semstab.engine.run(configure(root, backends=["open3d"], check="numpy"))
-    assert [bool(entry.statistics) for entry in plain.runs] == [True, False]
+    assert [entry.statistics is not None for entry in plain.runs] == [True, False]
 
 
 def test_frames_without_ground_truth_are_left_out_of_the_truth(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=4)
     (root / "labels/gt/0002.png").unlink()
     (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
-    assert entry.statistics["correctness"]["accuracy"]["value"] > 0.5
+    assert entry.statistics.correctness.accuracy.value > 0.5
 
 
 def test_no_ground_truth_no_judgement(tmp_path) -> None:
@@ -174,8 +178,8 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
         path.unlink()
     (root / "labels/gt").rmdir()
     (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
-    assert entry.statistics["correctness"] is entry.statistics["geometry"] is None
-    assert entry.statistics["drift"]["tests"] is not None
+    assert entry.statistics.correctness is entry.statistics.geometry is None
+    assert entry.statistics.drift.tests is not None
 
 
 def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
@@ -212,7 +216,7 @@ def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, cap
 
 def rows_of(found, name):
     (table,) = (table for table in tables(found) if table.name == name)
-    return to_json(table)["rows"]
+    return table_content(table)["rows"]
 
 
 @pytest.fixture(scope="module")
@@ -231,10 +235,10 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
     base = {record.unit.backbone: record.statistics for record in found.select()}
     for row in rows_of(found, "temporal_agreement"):
         own = base[row["backbone"]]
-        assert row["psa"] == pytest.approx(own["agreement"]["psa"], nan_ok=True)
-        assert row["flip_rate"] == own["drift"]["flips"]["rate"]["value"]
+        assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
+        assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        assert row["sbd_p"] == base[row["backbone"]]["drift"]["tests"]["sbd_p"] or row["backbone"] == "gt"
+        assert row["sbd_p"] == base[row["backbone"]].drift.tests.sbd_p or row["backbone"] == "gt"
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
         assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])
@@ -259,8 +263,8 @@ def test_agreement_stands_beside_the_sweep(studied) -> None:
     found, _ = studied
     rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["backbone"] == "a"]
     (still,), noisy = (found.select("depth_noise", backbone="a", value=value) for value in (0, 0.05))
-    assert rows[0]["psa"] == still.statistics["agreement"]["psa"]["value"]
-    alphas = [record.statistics["agreement"]["alpha"]["value"] for record in noisy]
+    assert rows[0]["psa"] == still.statistics.agreement.psa.value
+    alphas = [record.statistics.agreement.alpha.value for record in noisy]
     assert rows[1]["alpha"]["mean"] == pytest.approx(np.mean(alphas))
     assert rows[1]["alpha"]["sd"] == pytest.approx(np.std(alphas, ddof=1))
 
@@ -288,7 +292,7 @@ def test_every_table_and_figure_has_one_place_in_the_report(studied) -> None:
 def test_columns_without_a_number_are_left_out() -> None:
     table = voxels((5, 1, [1, 0, 0]), (5, 2, [1, 1, 0]))
     plain = record(table)
-    judged = dataclasses.replace(plain, summary=dataclasses.replace(plain.summary, statistics=nulls(describe(table))))
+    judged = dataclasses.replace(plain, summary=dataclasses.replace(plain.summary, statistics=(describe(table))))
     (row,) = rows_of(study(judged), "temporal_agreement")
     assert "flip_rate" not in row
     assert row["repeated_voxels"] == 5
@@ -299,11 +303,11 @@ def test_the_mean_of_several_scenes_counts_each_once() -> None:
     maps = {"x": voxels((5, 2, [2, 0, 0]), (5, 2, [1, 1, 0])), "y": voxels((90, 2, [2, 0, 0]))}
     records = [record(table, scene=scene) for scene, table in maps.items()]
     judged = [
-        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=nulls(describe(maps[r.unit.scene]))))
+        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=(describe(maps[r.unit.scene]))))
         for r in records
     ]
     *_, total = rows_of(study(*judged), "uncertainty")
-    entropies = [record.statistics["uncertainty"]["entropy"]["value"] for record in judged]
+    entropies = [record.statistics.uncertainty.entropy.value for record in judged]
     assert total["scene"] == "Mean"
     assert total["entropy"] == pytest.approx(np.mean(entropies))
 
@@ -312,7 +316,7 @@ def test_the_reading_says_the_verdicts(tmp_path) -> None:
     table = voxels((5, 2, [1, 1, 0]))
     records = [record(table, scene=scene) for scene in "xy"]
     judged = [
-        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=nulls(describe(table, name="m"))))
+        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=(describe(table, name="m"))))
         for r in records
     ]
     (path,) = write_report(study(*judged), tmp_path)
@@ -342,9 +346,9 @@ def test_what_is_right_and_stable_by_voxel() -> None:
 
 def test_reliability_pools_the_bins_of_several_scenes() -> None:
     bins = [
-        {"low": 0.8, "high": 0.9, "voxels": 10, "confidence": 0.85, "accuracy": 0.5},
-        {"low": 0.8, "high": 0.9, "voxels": 30, "confidence": 0.81, "accuracy": 0.7},
-        {"low": 0.9, "high": 1.0, "voxels": 0, "confidence": None, "accuracy": None},
+        Reliability(0.8, 0.9, 10, confidence=0.85, accuracy=0.5),
+        Reliability(0.8, 0.9, 30, confidence=0.81, accuracy=0.7),
+        Reliability(0.9, 1.0, 0, confidence=np.nan, accuracy=np.nan),
     ]
     upper = draw_reliability({"net": bins}).axes[0]
     points = [line.get_xydata().tolist() for line in upper.lines if len(line.get_xydata()) == 1]

@@ -13,11 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import semstab
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.exclusion import leave_out
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
-from semstab.settings import load_config, make_plan, read
+from semstab.settings import load_config
+from semstab.task import read
 
 CAMERA = Intrinsics(4, 4, 2, 2)
 

@@ -11,7 +11,7 @@ from semstab.averages import ENOUGH, Level, describe, pooled
 from semstab.findings import (
     HARDLY,
     VISIBLE_VSS,
-    Verdict,
+    Answer,
     denser_sampling,
     falling_drift,
     findings,
@@ -43,7 +43,7 @@ def walls(tmp_path_factory):
 
 def test_recurrent_voxels_that_disagree_more():
     outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N, SPLIT)))]))
-    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.verdict is Answer.SHOWN
     assert (
         outcome.numbers
         == "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%."
@@ -53,17 +53,17 @@ def test_recurrent_voxels_that_disagree_more():
 
 def test_recurrent_voxels_that_agree_as_well_as_all():
     outcome = more_disagreement(pooled([record(voxels((N, 1, SPLIT), (N, 4, SPLIT)))]))
-    assert outcome.verdict is Verdict.NOT_SHOWN
+    assert outcome.verdict is Answer.NOT_SHOWN
     assert "agree as well" in outcome.why
 
 
 def test_too_few_recurrent_voxels_say_nothing():
     outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N - 1, SPLIT)))]))
-    assert outcome.verdict is Verdict.UNTESTED
+    assert outcome.verdict is Answer.UNTESTED
     assert outcome.why == "999 voxels have OP>=3; 1,000 are needed."
 
 
-@pytest.mark.parametrize(("gap", "verdict"), [(1.2, Verdict.SHOWN), (0.8, Verdict.NOT_SHOWN)])
+@pytest.mark.parametrize(("gap", "verdict"), [(1.2, Answer.SHOWN), (0.8, Answer.NOT_SHOWN)])
 def test_a_difference_counts_from_the_last_printed_decimal_on(gap, verdict):
     evidence = [
         1 - 2 * gap * VISIBLE_VSS,
@@ -79,7 +79,7 @@ def test_the_first_finding_against_the_voxels_themselves(walls):
         tables = [r.table() for r in walls.select(backbone=row.backbone)]
         values, seen_by = (np.concatenate([measure(table) for table in tables]) for measure in (vss, op))
         every, recurrent = values.mean(), values[seen_by >= 3].mean()
-        assert row.verdict is (Verdict.SHOWN if every - recurrent >= VISIBLE_VSS else Verdict.NOT_SHOWN)
+        assert row.verdict is (Answer.SHOWN if every - recurrent >= VISIBLE_VSS else Answer.NOT_SHOWN)
         assert f"VSS {recurrent:.4f} for OP>=3 against {every:.4f}" in row.outcome.numbers
     assert [row.backbone for row in finding.evidence] == list(BACKBONES)
 
@@ -93,22 +93,22 @@ def drifting(*sbd_by_op):
 
 def test_sbd_that_falls_from_stratum_to_stratum():
     outcome = falling_drift(drifting((N, 1, 0.0), (N, 2, 0.08), (N, 4, 0.05), (N, 9, 0.02)))
-    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5."
 
 
 def test_sbd_that_rises_once_does_not_fall():
     outcome = falling_drift(drifting((N, 2, 0.05), (N, 4, 0.06), (N, 9, 0.02)))
-    assert outcome.verdict is Verdict.NOT_SHOWN
+    assert outcome.verdict is Answer.NOT_SHOWN
     assert outcome.why == "No fall from OP=2 to 3<=OP<=5."
 
 
 def test_a_small_stratum_does_not_count():
-    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Verdict.SHOWN
+    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Answer.SHOWN
 
 
 def test_one_stratum_has_no_trend():
-    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Verdict.UNTESTED
+    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Answer.UNTESTED
 
 
 # --- Finer voxels and noise -------------------------------------------------------------------------------------------
@@ -117,21 +117,21 @@ def test_one_stratum_has_no_trend():
 def test_noise_that_lowers_recurrence_and_raises_vss():
     found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
     outcome = less_association(describe("depth_noise"), found)
-    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == "0 → 1 % of depth: VSS 0.8750 → 0.9375; OP>=3 50.00 → 25.00%."
 
 
 def test_finer_voxels_are_compared_with_the_coarsest():
     found = [level(0.1, *seen(3 * N, N, SPLIT)), level(0.4, *seen(N, N, SPLIT))]
     outcome = less_association(describe("voxel_size"), found)
-    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers.startswith("0.4 → 0.1 m: VSS 0.8750 → 0.9375")
 
 
 def test_every_level_has_to_follow():
     found = [level(0.0, *seen(N, N, SPLIT)), level(0.1, *seen(3 * N, N, SPLIT)), level(0.2, *seen(N, 3 * N, SPLIT))]
     outcome = less_association(describe("translation_noise"), found)
-    assert outcome.verdict is Verdict.NOT_SHOWN
+    assert outcome.verdict is Answer.NOT_SHOWN
     assert "VSS hardly rises or falls: -0.0625 at 0.2 m." in outcome.why
     assert "The share does not fall at 0.2 m." in outcome.why
     assert "1.0 pixels" in outcome.why
@@ -139,13 +139,13 @@ def test_every_level_has_to_follow():
 
 def test_noise_needs_an_undisturbed_level():
     found = [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))]
-    assert less_association(describe("depth_noise"), found).verdict is Verdict.UNTESTED
-    assert less_association(describe("depth_noise"), found[:1]).verdict is Verdict.UNTESTED
+    assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
+    assert less_association(describe("depth_noise"), found[:1]).verdict is Answer.UNTESTED
 
 
 def test_recurrence_that_was_never_there_cannot_fall():
     found = [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))]
-    assert less_association(describe("depth_noise"), found).verdict is Verdict.UNTESTED
+    assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
 
 
 # --- Denser sampling --------------------------------------------------------------------------------------------------
@@ -157,13 +157,13 @@ def sampled(fewer, more):
 
 def test_denser_sampling_that_uncovers_what_was_there():
     outcome = sampled(seen(9 * N, N, SPLIT), seen(N, N, SPLIT))
-    assert outcome.verdict is Verdict.SHOWN
+    assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == (
         "20 → 80 frames: VSS over all voxels 0.9750 → 0.8750, for OP>=3 0.7500 → 0.7500; OP>=3 10.00 → 50.00%."
     )
 
 
-@pytest.mark.parametrize(("share", "verdict"), [(0.9, Verdict.SHOWN), (1.1, Verdict.NOT_SHOWN)])
+@pytest.mark.parametrize(("share", "verdict"), [(0.9, Answer.SHOWN), (1.1, Answer.NOT_SHOWN)])
 def test_recurrent_vss_may_move_by_half_as_much(share, verdict):
     # With half of the voxels recurrent before, a share x after and VSS falling by m among them, the aggregate falls by
     # 0.25 (x - 0.5) + m x: at x = 0.8 m is half of that where m = 0.0625.
@@ -171,17 +171,17 @@ def test_recurrent_vss_may_move_by_half_as_much(share, verdict):
     evidence = [0.75 - move, 0.25 + move, 0]
     outcome = sampled(seen(4 * N, 4 * N, SPLIT), seen(2 * N, 8 * N, evidence))
     fall = 0.25 * 0.3 + move * 0.8
-    assert (move <= HARDLY * fall) == (verdict is Verdict.SHOWN)
+    assert (move <= HARDLY * fall) == (verdict is Answer.SHOWN)
     assert outcome.verdict is verdict
 
 
 def test_vss_that_does_not_fall():
     outcome = sampled(seen(N, N, SPLIT), seen(9 * N, N, SPLIT))
-    assert (outcome.verdict, outcome.why) == (Verdict.NOT_SHOWN, "VSS over all voxels does not fall.")
+    assert (outcome.verdict, outcome.why) == (Answer.NOT_SHOWN, "VSS over all voxels does not fall.")
 
 
 def test_levels_without_recurrent_voxels_do_not_count():
-    assert sampled(seen(9 * N, 10, SPLIT), seen(N, N, SPLIT)).verdict is Verdict.UNTESTED
+    assert sampled(seen(9 * N, 10, SPLIT), seen(N, N, SPLIT)).verdict is Answer.UNTESTED
 
 
 # --- Together ---------------------------------------------------------------------------------------------------------
@@ -193,8 +193,8 @@ def test_what_only_pooling_makes_is_not_shown():
     unclear = record(voxels((N, 1, [1, 1, 0]), (9 * N, 4, [3, 2, 0])), scene="unclear")
     finding = findings(study(clear, unclear))[0]
     (row,) = finding.evidence
-    assert more_disagreement(pooled([clear, unclear])).verdict is Verdict.SHOWN
-    assert (row.verdict, row.scenes) == (Verdict.NOT_SHOWN, (0, 2))
+    assert more_disagreement(pooled([clear, unclear])).verdict is Answer.SHOWN
+    assert (row.verdict, row.scenes) == (Answer.NOT_SHOWN, (0, 2))
     assert "by themselves only 0 of 2" in row.outcome.why
 
 
@@ -203,14 +203,14 @@ def test_a_finding_is_shown_where_every_backbone_shows_it():
     disagreeing = record(voxels(*seen(N, N, SPLIT)), backbone="disagreeing")
     untested = record(voxels((N, 1, SPLIT)), backbone="unseen")
     both = findings(study(agreeing, disagreeing, untested))[0]
-    assert (both.verdict, both.counts, both.said) == (Verdict.NOT_SHOWN, (1, 2), "shown in 1 of 2 tests")
-    assert findings(study(disagreeing, untested))[0].verdict is Verdict.SHOWN
-    assert findings(study(untested))[0].verdict is Verdict.UNTESTED
+    assert (both.verdict, both.counts, both.said) == (Answer.NOT_SHOWN, (1, 2), "shown in 1 of 2 tests")
+    assert findings(study(disagreeing, untested))[0].verdict is Answer.SHOWN
+    assert findings(study(untested))[0].verdict is Answer.UNTESTED
 
 
 def test_without_sweeps_two_findings_cannot_be_tested():
     found = findings(study(record(voxels(*seen(N, N, SPLIT)))))
-    assert [finding.verdict for finding in found[2:]] == [Verdict.UNTESTED] * 2
+    assert [finding.verdict for finding in found[2:]] == [Answer.UNTESTED] * 2
     assert all(row.outcome.why.startswith("The study varies n") for finding in found[2:] for row in finding.evidence)
 
 
@@ -224,8 +224,8 @@ def test_repeats_are_averaged():
 def test_the_walls_show_what_they_were_made_for(walls):
     """Errors drawn anew in every frame: more looks, more disagreement; and noise tears apart what meets."""
     by_name = {finding.name: finding for finding in findings(walls)}
-    assert by_name["disagreement"].verdict is Verdict.SHOWN
-    assert by_name["drift"].verdict is Verdict.SHOWN
-    assert by_name["association"].verdict is Verdict.SHOWN
+    assert by_name["disagreement"].verdict is Answer.SHOWN
+    assert by_name["drift"].verdict is Answer.SHOWN
+    assert by_name["association"].verdict is Answer.SHOWN
     assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
     assert all(row.outcome.numbers for row in by_name["sampling"].evidence)

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from semstab.config import Config, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.selection import select_frames
+from semstab.engine import run
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
-from semstab.pipeline import run
-from semstab.plan import make_plan
 
 # --- by number
 

@@ -7,13 +7,15 @@ import pytest
 import tiny_scene
 
 import semstab
-from semstab import memory
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
+from semstab.engine import memory
 from semstab.engine.memory import available_bytes, estimate, require_memory
+from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
-from semstab.task import Task, load_config, make_plan, read
+from semstab.settings import load_config
+from semstab.task import Task, read
 
 FRAMES = 30
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from semstab import backends
 from semstab.errors import DataError
 from semstab.frames import Frame, Intrinsics
+from semstab.measures import ENTROPY, SBD, VSS, margin, measures
 from semstab.metrics import (
     compare,
     dominant,
@@ -24,7 +25,7 @@ from semstab.metrics import (
     summarise,
     vss,
 )
-from semstab.results import Means, Unit
+from semstab.results import Means, MeasureMeans, Unit
 from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
 from semstab.voxels import VoxelTable
 
@@ -70,16 +71,16 @@ def two_frames_that_disagree(disagreeing, voxels):
 def test_the_row_op_2_of_the_persistence_table_is_one_hot_labels_of_which_a_quarter_disagree():
     row = summarise(two_frames_that_disagree(65, 256)).strata[1]
     assert row.name == "OP=2"
-    assert (round(row.vss, 3), round(row.sbd, 4), round(row.entropy, 4)) == (0.873, 0.0790, 0.1602)
+    assert (round(row[VSS], 3), round(row[SBD], 4), round(row[ENTROPY], 4)) == (0.873, 0.0790, 0.1602)
 
 
 @pytest.mark.parametrize("disagreeing", [0, 1, 254, 500, 1000])
 def test_measures_at_op_2_are_linear_in_the_share_that_disagrees(disagreeing):
     f = disagreeing / 1000
     summary = summarise(two_frames_that_disagree(disagreeing, 1000))
-    assert summary.vss == pytest.approx(1 - f / 2)
-    assert summary.sbd == pytest.approx(f * JS_HALF)
-    assert summary.entropy == pytest.approx(f * math.log(2) / math.log(3))
+    assert summary[VSS] == pytest.approx(1 - f / 2)
+    assert summary[SBD] == pytest.approx(f * JS_HALF)
+    assert summary[ENTROPY] == pytest.approx(f * math.log(2) / math.log(3))
 
 
 SCENES = {  # voxels, sampled points, VSS, SBD, H: the paper's multi-scene table
@@ -156,16 +157,16 @@ def test_strata_count_their_edges_in():
 def test_recurrent_means_seen_three_times_or_more():
     summary = summarise(voxel_table(op=[1, 2, 3, 4], evidence=[[1, 0], [1, 1], [2, 1], [2, 2]]))
     assert (summary.recurrent.name, summary.recurrent.voxels, summary.recurrent.share) == ("OP>=3", 2, 0.5)
-    assert summary.recurrent.vss == pytest.approx((2 / 3 + 1 / 2) / 2)
+    assert summary.recurrent[VSS] == pytest.approx((2 / 3 + 1 / 2) / 2)
 
 
 def test_sbd_is_averaged_over_voxels_seen_twice_or_more():
     table = voxel_table(op=[1, 2, 3], evidence=[[1, 0]] * 3, drift_sum=[0, 0.3, 0.2])
     assert sbd(table)[1:].tolist() == [0.3, 0.1]
     summary = summarise(table)
-    assert summary.sbd == pytest.approx(0.2)
-    assert math.isnan(summary.strata[0].sbd)
-    assert [row.sbd_voxels for row in summary.strata] == [0, 1, 1, 0]
+    assert summary[SBD] == pytest.approx(0.2)
+    assert math.isnan(summary.strata[0][SBD])
+    assert [row.defined(SBD) for row in summary.strata] == [0, 1, 1, 0]
 
 
 def test_classes_hold_the_voxels_that_they_dominate():
@@ -174,7 +175,7 @@ def test_classes_hold_the_voxels_that_they_dominate():
     assert dominant(table).tolist() == [0, 2, 1, 0]
     classes = summarise(table).classes
     assert [(row.name, row.voxels) for row in classes] == [("road", 2), ("tree", 1), ("car", 1)]
-    assert classes[0].vss == pytest.approx((2 / 3 + 1 / 3) / 2)
+    assert classes[0][VSS] == pytest.approx((2 / 3 + 1 / 3) / 2)
 
 
 def test_classes_without_names_go_by_number():
@@ -185,15 +186,15 @@ def test_means_of_nothing_are_undefined():
     summary = summarise(voxel_table(op=[1], evidence=[[1, 0]]))
     for row in (summary.strata[1], summary.recurrent, summary.classes[1]):
         assert (row.voxels, row.share) == (0, 0)
-        assert math.isnan(row.vss)
-        assert math.isnan(row.sbd)
-        assert math.isnan(row.entropy)
+        assert math.isnan(row[VSS])
+        assert math.isnan(row[SBD])
+        assert math.isnan(row[ENTROPY])
 
 
 def test_a_map_without_voxels_has_a_summary():
     summary = summarise(backends.create("numpy", voxel_size=0.2, num_classes=3).table())
     assert (summary.voxels, summary.points, summary.observations, summary.K) == (0, 0, 0, 3)
-    undefined = [summary.mean_op, summary.vss, summary.sbd, summary.entropy, summary.recurrent.share]
+    undefined = [summary.mean_op, summary[VSS], summary[SBD], summary[ENTROPY], summary.recurrent.share]
     assert all(math.isnan(value) for value in undefined)
 
 
@@ -203,17 +204,17 @@ def test_strata_and_classes_partition_the_voxels(sequence):
     summary = summarise(fuse(as_frames(sequence)))
     for rows in (summary.strata, summary.classes):
         assert sum(row.voxels for row in rows) == summary.voxels
-        assert pool(rows, summary.voxels).vss == pytest.approx(summary.vss, nan_ok=True)
-        assert pool(rows, summary.voxels).sbd == pytest.approx(summary.sbd, nan_ok=True)
-        assert pool(rows, summary.voxels).entropy == pytest.approx(summary.entropy, nan_ok=True)
+        for measure in measures():
+            assert pool(rows, summary.voxels)[measure] == pytest.approx(summary[measure], nan_ok=True)
 
 
 def test_pooling_weighs_scenes_by_their_voxels():
-    a = Means("OP=2", share=0.5, voxels=1, vss=1.0, sbd=0.1, entropy=0.0, sbd_voxels=1)
-    b = Means("OP=2", share=0.25, voxels=3, vss=0.6, sbd=math.nan, entropy=0.4, sbd_voxels=0)
+    one, three = {"vss": 1.0, "sbd": 0.1, "entropy": 0.0}, {"vss": 0.6, "sbd": math.nan, "entropy": 0.4}
+    a = Means("OP=2", share=0.5, voxels=1, means=MeasureMeans(one, {"sbd": 1}))
+    b = Means("OP=2", share=0.25, voxels=3, means=MeasureMeans(three, {"sbd": 0}))
     pooled = pool([a, b], voxels=14)
-    assert (pooled.name, pooled.voxels, pooled.sbd_voxels) == ("OP=2", 4, 1)
-    assert (pooled.share, pooled.vss, pooled.sbd, pooled.entropy) == pytest.approx((4 / 14, 0.7, 0.1, 0.3))
+    assert (pooled.name, pooled.voxels, pooled.defined(SBD)) == ("OP=2", 4, 1)
+    assert (pooled.share, pooled[VSS], pooled[SBD], pooled[ENTROPY]) == pytest.approx((4 / 14, 0.7, 0.1, 0.3))
 
 
 def test_a_macro_mean_leaves_out_what_is_undefined():
@@ -233,6 +234,13 @@ def test_vss_and_entropy_of_a_voxel(evidence, concentration, uncertainty):
     table = voxel_table([4], [evidence])
     assert vss(table)[0] == pytest.approx(concentration)
     assert entropy(table)[0] == pytest.approx(uncertainty)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "lead"), [([4, 0, 0, 0], 1), ([1, 1, 1, 1], 0), ([2, 2, 0, 0], 0), ([1, 0, 2, 1], 0.25), ([1, 3], 0.5)]
+)
+def test_the_margin_is_how_far_the_dominant_class_is_ahead(evidence, lead):
+    assert margin(voxel_table([4], [evidence]))[0] == pytest.approx(lead)
 
 
 def test_op_is_the_number_of_frames():
@@ -299,7 +307,7 @@ def test_a_map_agrees_with_itself():
     assert (row.scene, row.backbone, row.backends) == ("s", "b", ("numpy", "open3d"))
     assert (row.voxels, row.only_in) == ((3, 3), (0, 0))
     assert {name: (d.max, d.mean) for name, d in row.differences.items()} == dict.fromkeys(
-        ["op", "vss", "sbd", "entropy", "evidence"], (0, 0)
+        ["op", *(measure.key for measure in measures()), "evidence"], (0, 0)
     )
 
 
@@ -310,7 +318,7 @@ def test_a_map_agrees_with_itself():
         ("drift_sum", 1, 0.4, {"sbd"}),
         ("evidence", 1, [2, 2], {"evidence"}),
         ("evidence", 2, [1, 3], {"evidence"}),
-        ("evidence", 2, [2, 2], {"evidence", "vss", "entropy"}),
+        ("evidence", 2, [2, 2], {"evidence", "vss", "entropy", "margin"}),
     ],
 )
 def test_a_difference_in_any_quantity_is_disagreement(column, row, value, quantities):

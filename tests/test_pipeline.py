@@ -20,6 +20,7 @@ from semstab.engine import Observer, load_result
 from semstab.engine.folder import Folder
 from semstab.errors import ConfigError, DataError
 from semstab.json_form import to_json
+from semstab.measures import ENTROPY, SBD, VSS
 from semstab.records import Result
 from semstab.results import STAGES, Unit
 from semstab.settings import load_config
@@ -78,7 +79,7 @@ def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     # 8 columns, and one more a frame; 6 rows
     assert run.table.voxels == (8 + 2) * 6
     assert run.table.points == run.table.observations == 3 * 48
-    assert (run.table.vss, run.table.sbd, run.table.entropy) == (1.0, 0.0, 0.0)
+    assert (run.table[VSS], run.table[SBD], run.table[ENTROPY]) == (1.0, 0.0, 0.0)
     # of 10 columns, the outermost two a side are seen less often
     assert [row.voxels for row in run.table.strata] == [2 * 6, 2 * 6, 6 * 6, 0]
     assert run.table.recurrent.share == pytest.approx(0.6)
@@ -116,7 +117,8 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
         assert key in first
     assert first["strata"][0]["sbd"] is None
     assert first["strata"][3] == {
-        "name": "OP>5", "share": 0.0, "voxels": 0, "vss": None, "sbd": None, "entropy": None, "sbd_voxels": 0
+        "name": "OP>5", "share": 0.0, "voxels": 0, "vss": None, "sbd": None, "entropy": None, "margin": None,
+        "sbd_voxels": 0,
     }  # fmt: skip
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["command"] == ["semstab-bench", "--x"]
@@ -145,8 +147,8 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
         assert int(last["map_voxels"]) == run.table.voxels
-        assert float(last["map_vss"]) == pytest.approx(run.table.vss, abs=1e-12)
-        assert float(last["map_entropy"]) == pytest.approx(run.table.entropy, abs=1e-12)
+        assert float(last["map_vss"]) == pytest.approx(run.table[VSS], abs=1e-12)
+        assert float(last["map_entropy"]) == pytest.approx(run.table[ENTROPY], abs=1e-12)
         assert float(last["map_recurrent"]) == pytest.approx(run.table.recurrent.share, abs=1e-12)
 
 
@@ -306,7 +308,7 @@ def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, 
 def test_pixel_stride_keeps_every_nth_pixel_at_its_place(root) -> None:
     (run,) = semstab.engine.run(configure(root, backbones=["gt"], pixel_stride=2)).runs
     assert run.table.points == 3 * 4 * 3
-    assert run.table.vss == 1.0
+    assert run.table[VSS] == 1.0
 
 
 def test_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
@@ -333,7 +335,7 @@ def test_a_damaged_image_stops_the_run_at_its_frame(root) -> None:
     watching = Watching()
     with pytest.raises(DataError, match=r"depth/0002\.png: not a PNG image"):
         semstab.engine.run(configure(root, backbones=["a"], threads=4), observers=[watching])
-    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1"]
+    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1", "finished"]
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
@@ -363,7 +365,7 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
     semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
     Painting.wants_color = True
     semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
-    assert seen == [False, True, False] + [True] * 3  # that in the middle is for the figures
+    assert seen == [False] * 3 + [True] * 3
 
 
 def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:

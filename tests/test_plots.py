@@ -19,10 +19,11 @@ from wall_study import BACKBONES, drawn_walls, wall_study
 from semstab import backends
 from semstab.averages import ENOUGH, describe, levels
 from semstab.errors import DataError
+from semstab.measures import SBD_MAX, VSS, measures
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
 from semstab.plots import figures, topdown
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import BINS, MOST_DRIFT, OP_BOUNDS, Histogram, op_position, together
+from semstab.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
 from semstab.plots.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.plots.style import COLUMN, DPI, PAGE
 from semstab.plots.sweeps import draw_sweep
@@ -66,8 +67,8 @@ def test_the_bins_of_op_are_single_values_and_then_widen():
 @given(SEQUENCES)
 def test_histograms_say_what_the_voxels_say(sequence):
     table = fused(sequence)
-    histogram = Histogram.of(table)
-    for measure, values in ((histogram.disagreement, 1 - vss(table)), (histogram.sbd, sbd(table))):
+    found = histograms(table)
+    for measure, values in ((found["vss"], 1 - vss(table)), (found["sbd"], sbd(table))):
         defined = ~np.isnan(values)
         for k, seen in enumerate(range(1, 9)):
             here = values[defined & (op(table) == seen)]
@@ -92,33 +93,33 @@ def fused(sequence):
 @given(SEQUENCES)
 def test_no_voxel_drifts_further_than_the_scale_of_the_maps(sequence):
     drift = sbd(fused(sequence))
-    assert (drift[~np.isnan(drift)] <= MOST_DRIFT + 1e-12).all()
+    assert (drift[~np.isnan(drift)] <= SBD_MAX + 1e-12).all()
 
 
 def test_the_largest_drift_is_that_of_two_frames_that_contradict_each_other():
     half = -(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25)) - 0.5
-    assert pytest.approx(half) == MOST_DRIFT
+    assert pytest.approx(half) == SBD_MAX
 
 
 def test_histograms_add_up():
     parts = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1)), voxels((2, 4, SPLIT, 0.2), (7, 2, SURE))
     whole = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1), (2, 4, SPLIT, 0.2), (7, 2, SURE))
-    added, direct = together(map(Histogram.of, parts)), Histogram.of(whole)
-    assert np.array_equal(added.sbd.counts, direct.sbd.counts)
-    assert np.array_equal(added.disagreement.counts, direct.disagreement.counts)
-    assert added.sbd.sums == pytest.approx(direct.sbd.sums)
+    added, direct = together(map(histograms, parts)), histograms(whole)
+    assert set(added) == {measure.key for measure in measures()}
+    for key, found in added.items():
+        assert np.array_equal(found.counts, direct[key].counts)
+        assert found.sums == pytest.approx(direct[key].sums)
 
 
 def test_the_ecdf_of_recurrent_voxels_leaves_the_others_out():
-    measure = Histogram.of(voxels((6, 1, SURE), (3, 3, SURE), (1, 3, SPLIT))).disagreement
+    measure = histograms(voxels((6, 1, SURE), (3, 3, SURE), (1, 3, SPLIT)))["vss"]
     assert (measure.ecdf()[0], measure.ecdf(3)[0], measure.ecdf(3)[BINS // 4]) == (0.9, 0.75, 1.0)
 
 
 def test_the_axes_of_the_ecdfs_end_where_nearly_all_voxels_are():
-    histogram = Histogram.of(voxels((99, 2, SURE, 0.1), (1, 2, [1, 1, 0], 0.3)))
-    disagreement, drift = informative({"s": histogram})
-    assert disagreement == 0.05
-    assert drift == pytest.approx(0.1, abs=MOST_DRIFT / BINS)
+    ends = informative([histograms(voxels((99, 2, SURE, 0.1), (1, 2, [1, 1, 0], 0.3)))])
+    assert ends["vss"] == 0.06
+    assert ends["sbd"] == pytest.approx(0.1, abs=SBD_MAX / BINS)
 
 
 # --- From above -------------------------------------------------------------------------------------------------------
@@ -204,7 +205,7 @@ def pixels(axes):
 def test_a_map_has_the_colours_of_its_categories():
     columns = {"op": [1, 4, 4], "evidence": [SURE, [2, 2, 0], [4, 0, 0]], "drift_sum": [0, 0.6, 0]}
     table = at([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **columns)
-    kind, drift, doubt, *_ = draw_stability(table, (0, 0, 1)).axes
+    kind, _, drift, doubt, *_ = draw_stability(table, (0, 0, 1)).axes
     assert pixels(kind)[0].tolist() == [list(CATEGORY_COLORS[k]) for k in categories(table)]
     grey = [204, 204, 204]
     assert pixels(drift)[0, 0, :3].tolist() == grey
@@ -214,7 +215,7 @@ def test_a_map_has_the_colours_of_its_categories():
 
 def test_nothing_is_white():
     table = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
-    for axes in draw_stability(table, (0, 0, 1)).axes[:3]:
+    for axes in draw_stability(table, (0, 0, 1)).axes[: 1 + len(measures())]:
         assert pixels(axes)[0, 1, :3].tolist() == [255, 255, 255]
 
 
@@ -235,10 +236,10 @@ def test_without_an_image_the_overview_has_two_panels():
 
 def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
     found = {name: levels(walls, "depth_noise", name) for name in BACKBONES}
-    share, stability, _ = draw_sweep(describe("depth_noise"), found).axes
+    share, stability, *_ = draw_sweep(describe("depth_noise"), found).axes
     lines = [container.lines[0].get_ydata() for container in stability.containers]
     expected = [
-        [level.mean(lambda p, group=group: getattr(p, group).vss) for level in levels_]
+        [level.mean(lambda p, group=group: getattr(p, group)[VSS]) for level in levels_]
         for levels_ in found.values()
         for group in ("every", "recurrent")
     ]
@@ -257,8 +258,8 @@ def test_recurrent_values_of_few_voxels_are_not_drawn():
 
 
 def test_curves_against_op_have_the_means_of_the_voxels():
-    histogram = Histogram.of(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
-    stability, drift, counts = draw_persistence({"m": histogram}).axes
+    found = histograms(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
+    stability, drift, *_, counts = draw_persistence({"m": found}).axes
     mean, few = stability.get_lines()
     assert mean.get_xdata().tolist() == pytest.approx([1, 2, 4])
     assert mean.get_ydata().tolist() == pytest.approx([1, 0.75, 0.5])
@@ -268,8 +269,8 @@ def test_curves_against_op_have_the_means_of_the_voxels():
 
 
 def test_an_ecdf_has_a_curve_a_scene_and_one_of_the_recurrent_voxels():
-    scenes = {name: Histogram.of(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
-    disagreement, _ = draw_ecdf(scenes, (0.5, 0.3)).axes
+    scenes = {name: histograms(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
+    disagreement, *_ = draw_ecdf(scenes, informative(scenes.values())).axes
     at_zero = [line.get_ydata()[0] for line in disagreement.get_lines()]
     assert at_zero == pytest.approx([0.5, 0.25, 0.0])
 

@@ -26,6 +26,7 @@ from semstab.datasets.selection import select_frames
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.labels import LabelSpace
+from semstab.measures import ENTROPY
 from semstab.metrics import matched_region_flicker
 from semstab.predict.jobs import file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
@@ -518,7 +519,7 @@ def test_labels_and_scores_of_several_models(scene):
     found = run(live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true", f"{PREDICTOR},seed=3,name=other"))
     assert [unit.unit.backbone for unit in found.runs] == ["colour-clusters", "colour-clusters-scores", "other"]
     hard, soft, _ = (unit.table for unit in found.runs)
-    assert soft.entropy > hard.entropy
+    assert soft[ENTROPY] > hard[ENTROPY]
 
 
 def test_the_ground_truth_stays_what_it_is(scene):

@@ -20,6 +20,7 @@ from dataset_writers import (
 )
 
 from semstab.config import FrameSelection
+from semstab.datasets import open_dataset
 from semstab.datasets.selection import select_frames
 
 
@@ -146,3 +147,17 @@ def test_the_scene_in_the_middle_of_the_city_is_worth_reading():
     assert all(frame.valid.all() for frame in frames)
     assert len(np.unique([frame.labels for frame in frames])) > 4
     assert (fused(frames).op >= 3).mean() > 0.05
+
+
+@pytest.mark.parametrize("above", [False, True])
+def test_the_camera_of_7_scenes_is_that_of_its_file(tmp_path, above):
+    form, frames = FORMATS["seven_scenes"], source(1000)
+    folder = tmp_path / "seq-01"
+    form.write(folder, frames)
+    usual = open_dataset("seven_scenes", {"root": folder}).scene("seq-01")
+    assert usual.intrinsics(0, (480, 640)).fx == 585
+    np.savetxt((folder.parent if above else folder) / "camera-intrinsics.txt", frames[0].intrinsics.matrix)
+    found = open_dataset("seven_scenes", {"root": folder}).scene("seq-01").intrinsics(0, (H, W))
+    np.testing.assert_allclose(found.matrix, frames[0].intrinsics.matrix)
+    said = open_dataset("seven_scenes", {"root": folder, "intrinsics": (50, 51, 24, 16)}).scene("seq-01")
+    assert said.intrinsics(0, (H, W)).fy == 51

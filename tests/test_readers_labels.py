@@ -141,6 +141,12 @@ def test_a_labels_root_that_is_wrong_is_said(scene, tmp_path, caplog):
     )
     assert opened(FORM, root, labels_root=tmp_path).backbones == ()
     assert f"room: no label maps in {tmp_path} fit the options labels and scores" in caplog.text
+    assert f"looked for {tmp_path}/room/BACKBONE/00003.png" in caplog.text
+    said = {"labels_root": tmp_path, "labels": "{backbone}/{scene}_{name}", "scores": {"x": "soft/{name}.npy"}}
+    assert opened(FORM, root, **said).label_paths == (
+        f"{tmp_path}/BACKBONE/room_00003.png",
+        f"{tmp_path}/soft/00003.npy",
+    )
 
 
 def test_a_scene_without_labels_has_depth_and_poses(scene):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import time
 from pathlib import Path
 
@@ -31,8 +32,12 @@ def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
     assert len(images) >= 3 * COUNT
     for path in images:
         path.write_bytes(b"")  # whoever reads it fails
-    read, actual = [], io.open
-    monkeypatch.setattr(io, "open", lambda path, *rest, **how: (read.append(Path(path)), actual(path, *rest, **how))[1])
+    read = []
+    for module in (io, os):  # who opens a file by either of the two is seen
+        actual = module.open
+        monkeypatch.setattr(
+            module, "open", lambda path, *rest, to=actual, **how: (read.append(Path(path)), to(path, *rest, **how))[1]
+        )
     scene = opened(form, tmp_path)
     assert select_frames(scene, FrameSelection()).indices == [*range(COUNT)]
     assert read

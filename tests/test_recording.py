@@ -22,16 +22,19 @@ from semstab.backends.numba_hash import NumbaHash
 from semstab.config import Config
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
+from semstab.engine.units import Plan, PlannedUnit
 from semstab.errors import ConfigError
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
-from semstab.recording import MEASURES, SERIES, Recording, background, observer, tracker, voxel_maps
+from semstab.measures import SBD_MAX, measures
+from semstab.recording import SERIES, Recording, background, looks, observer, tracker, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
-from semstab.recording.voxel_maps import SBD_MAX, TITLES
-from semstab.results import GroupResult, RunResult, Unit, UnitSummary
-from semstab.task import Plan, Task, load_config
+from semstab.records import Record, Result, Variation
+from semstab.results import Unit, UnitSummary
+from semstab.settings import load_config
+from semstab.task import Task
 from semstab.voxels import VoxelTable
 
 NANOSECONDS = 1_000_000_000
@@ -85,7 +88,7 @@ def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]
 
 
 def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
-    """What a map shows at last, voxels sorted: indices, and each of TITLES by the name of its view."""
+    """What a map shows at last, voxels sorted: indices, and each of `looks` by the name of its view."""
     chunks = []
     for at in sorted(at for at in rows if at.startswith(f"{path}/")):
         shown: dict[str, Any] = {}
@@ -98,7 +101,7 @@ def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
     index = [tuple(cell) for shown in chunks for cell in shown["VoxelGridMap:voxel_indices"]]
     order = sorted(range(len(index)), key=index.__getitem__)
     assert len(set(index)) == len(index)
-    components = {name: f"{name}:values" for name in MEASURES}
+    components = {name: f"{name}:values" for name, look in looks().items() if look.range}
     components |= {"class": "VoxelGridMap:colors", "category": "category:colors"}
     found: dict[str, Any] = {"voxel_indices": [index[i] for i in order]}
     for name, component in components.items():
@@ -164,8 +167,9 @@ def test_the_final_voxels_are_those_of_the_run(run, backbone) -> None:
     assert voxels["frame"] == 2
     np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
     np.testing.assert_allclose(voxels["voxel_size"], [[0.25] * 3])
-    for name in MEASURES:  # SBD of a voxel seen once is NaN
-        np.testing.assert_allclose(voxels[name], getattr(metrics, name)(table), rtol=1e-6)
+    for measure in measures():  # SBD of a voxel seen once is NaN
+        np.testing.assert_allclose(voxels[measure.key], measure.of(table), rtol=1e-6)
+    np.testing.assert_array_equal(voxels["op"], table.op)
     expected = voxel_maps.packed(metrics.CATEGORY_COLORS)[metrics.categories(table)]
     np.testing.assert_array_equal(voxels["category"], expected)
 
@@ -186,7 +190,7 @@ def test_the_largest_sbd_has_the_last_colour() -> None:
 
 
 def test_the_blueprint_shows_every_series_and_every_backbone(run) -> None:
-    maps = {f"{backbone}: {title}" for backbone in "ab" for title in TITLES.values()}
+    maps = {f"{backbone}: {title}" for backbone in "ab" for title in (look.title for look in looks().values())}
     pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", "drift of this frame")}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
@@ -198,7 +202,7 @@ def test_every_map_has_an_eye_that_looks_down_on_it(run) -> None:
     blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when there is a map to look at
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
     assert len(blueprints) == 2
-    assert len(eyes) == 2 * len(TITLES)  # of two backbones, each a view for the class, the measures, the category
+    assert len(eyes) == 2 * len(looks())  # of two backbones, each a view for the class, the measures, the category
     table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
     for eye in eyes:
         assert eye["EyeControls3D:position"][0][1] < table.centers[:, 1].min()  # from above: up is -y
@@ -214,9 +218,9 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
             for row in rows
             if "ViewBlueprint:display_name" in row
         }
-        for name, title in TITLES.items():
+        for name, shown in looks().items():
             for chunk in chunks:
-                at = f"{views[f'a: {title}']}/ViewContents/overrides{chunk}/visualizers/"
+                at = f"{views[f'a: {shown.title}']}/ViewContents/overrides{chunk}/visualizers/"
                 instructions = [row for row in rows if row["rerun.entity"].startswith(at)]
                 sources = {
                     mapping["target"]: mapping["source_component"]
@@ -229,9 +233,9 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
                     assert sources == {"VoxelGridMap:colors": "category:colors"}
                 else:
                     assert sources == {"VoxelGridMap:values": f"{name}:values", "VoxelGridMap:colors": None}
-                    defaults = f"{views[f'a: {title}']}/defaults"
+                    defaults = f"{views[f'a: {shown.title}']}/defaults"
                     (look,) = (row for row in rows if row["rerun.entity"] == defaults)
-                    np.testing.assert_allclose(look["VoxelGridMap:value_range"], [MEASURES[name].range], rtol=1e-6)
+                    np.testing.assert_allclose(look["VoxelGridMap:value_range"], [shown.range], rtol=1e-6)
 
 
 def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkeypatch) -> None:
@@ -246,8 +250,8 @@ def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkey
              and "/map/" in row["rerun.entity"]})
         for rows in read_blueprints(path)
     ]  # fmt: skip
-    assert min(known) == len(TITLES) - 1
-    assert max(known) == (len(TITLES) - 1) * voxel_maps.CHUNKS
+    assert min(known) == len(looks()) - 1
+    assert max(known) == (len(looks()) - 1) * voxel_maps.CHUNKS
     assert len(grid(read(path), r"/floor\ 1/map/net\/x/numpy")["voxel_indices"]) == len(table)
 
 
@@ -297,7 +301,7 @@ def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> N
             assert entities
             assert all(series(again, at) == series(first, at) for at in entities)
     was, now = (grid(rows, "/wall/map/a/numpy") for rows in (first, again))
-    assert {*TITLES} < {*was}
+    assert {*looks()} < {*was}
     assert [repr(was[key]) for key in was] == [repr(now[key]) for key in was]
 
 
@@ -363,7 +367,7 @@ def test_without_a_recording_rerun_is_not_imported(run) -> None:
     program = (
         "import sys, semstab; from semstab.settings import load_config;"
         f"semstab.engine.run(load_config({str(run / 'config.yaml')!r}));"
-        "assert 'semstab.pipeline' in sys.modules and 'rerun' not in sys.modules"
+        "assert 'semstab.engine.execution' in sys.modules and 'rerun' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
 
@@ -407,15 +411,19 @@ def record(path: Path, frames: list[Frame], *, finish: bool = True) -> tuple[Rec
     """Drive a recording as the pipeline does."""
     watching = Recording(path)
     task = Task(Scene(), "net/x", [f.index for f in frames], CLASSES.mapping_to(CLASSES), ("numpy",))
-    watching.run_started(Plan(Config(voxel_size=0.25), (task,)))
+    config = Config(voxel_size=0.25)
+    unit = PlannedUnit(Variation(), config, task, "key", image_space=True, kept=True)
+    watching.run_started(Plan(config, {}, (unit,), ()), [])
     backend = backends.create("numpy", voxel_size=0.25, num_classes=3)
     for each in frames:
         watching.frame_fused(UNIT, each, FrameRow(backend.integrate(each), each.timestamp, math.nan))
+        watching.frame_finished(task, each)
     table = backend.table()
     if finish:
         watching.unit_fused(UNIT, table)
         watching.unit_finished(UNIT, table, summary_of(table))
-        watching.run_finished(RunResult((GroupResult((summary_of(table),), ()),)))
+        watching.group_finished(task)
+        watching.run_finished(Result("run", "numpy", (Record("key", Variation(), summary_of(table)),)))
     return watching, table
 
 

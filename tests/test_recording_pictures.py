@@ -25,12 +25,13 @@ from semstab.backends.numba_hash import NumbaHash
 from semstab.engine.units import make_plan
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
+from semstab.measures import SBD_MAX
 from semstab.metrics import compensated_flicker
 from semstab.recording import Recording, camera, drift_colors, flips, voxel_maps
 from semstab.recording.entities import Clock
 from semstab.recording.flips import FlipLog
 from semstab.recording.tracker import Tracker
-from semstab.recording.voxel_maps import TITLES
+from semstab.recording.voxel_maps import looks
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 
@@ -98,7 +99,7 @@ def level(drift: float | None) -> int:
         return drift_colors.FIRST_SEEN
     if drift < 1e-9:
         return drift_colors.NO_DRIFT
-    level = int(drift_colors.LEVELS * (drift / voxel_maps.SBD_MAX) ** 0.5 + 1e-9)
+    level = int(drift_colors.LEVELS * (drift / SBD_MAX) ** 0.5 + 1e-9)
     return drift_colors.NO_DRIFT + 1 + min(level, drift_colors.LEVELS - 1)
 
 
@@ -443,7 +444,7 @@ def test_500_frames_of_4k_stay_below_the_size_that_is_stated() -> None:
     _, jpeg = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, camera.JPEG_QUALITY])
     color = max(500 * jpeg.size, camera.COLOR_BYTES)
     labels, drift, depth = W * H, (W // 2) * (H // 2), 2 * (W // 2) * (H // 2)
-    voxels = (voxel_maps.BUDGET + voxel_maps.MAX_VOXELS) * (3 * 4 + 4 * len(TITLES))
+    voxels = (voxel_maps.BUDGET + voxel_maps.MAX_VOXELS) * (3 * 4 + 4 * len(looks()))
     assert 500 * (labels + drift + depth) + color + voxels < 0.7e9
 
 

@@ -14,9 +14,10 @@ from records import record, study, voxels
 from wall_study import BACKBONES, CLASSES, STEPS, drawn_walls
 
 from semstab.averages import ENOUGH, pooled
+from semstab.config import BASE, SHARED
 from semstab.findings import findings
 from semstab.plots import figures
-from semstab.records import BASE, SHARED, Failure, ImageSpace, Variation
+from semstab.records import Failure, ImageSpace, Variation
 from semstab.report import write_report
 from semstab.report.reading import reading
 from semstab.results import Agreement, Unit

@@ -10,10 +10,10 @@ from scipy.ndimage import uniform_filter
 from simulated_events import grid
 
 from semstab.errors import DataError
+from semstab.metrics.matching import voxel_keys
 from semstab.statistics import BlockBootstrap, spatial_blocks
 from semstab.statistics.agreement import alpha_columns, alpha_of, psa_columns, ratio_of
 from semstab.statistics.blocks import interval
-from semstab.statistics.matching import voxel_keys
 
 COVERED = (0.91, 0.99)
 """Of 300 intervals at 95 % this share is within 3 standard errors."""

@@ -12,10 +12,12 @@ from simulated_events import grid, log_of
 from statsmodels.stats.multitest import multipletests
 
 from semstab.errors import ConfigError, DataError
+from semstab.measures import VSS
 from semstab.metrics import vss
+from semstab.metrics.matching import shared_rows
 from semstab.statistics import coverage, paired, psa, sign_flip_test, standardised
+from semstab.statistics.agreement import PSA
 from semstab.statistics.comparison import EDGES, holm, standard_weights
-from semstab.statistics.matching import shared_rows
 
 SIDE = 24
 
@@ -77,7 +79,7 @@ def test_standardised_values_of_one_model_seen_more_or_less_often_are_the_same()
         "often": noisy(rng, 8, 0.7, seen=np.arange(8) < rng.choice([2, 8], p=[0.2, 0.8], size=(SIDE**2, 1))),
     }
     raw = {name: vss(table).mean() for name, table in tables.items()}
-    at_common = standardised(tables, "vss")
+    at_common = standardised(tables, VSS)
     assert raw["rarely"] - raw["often"] > 0.05
     difference = at_common["rarely"].value - at_common["often"].value
     spread = (at_common["rarely"].high - at_common["rarely"].low) / 2
@@ -90,7 +92,7 @@ def test_standardised_value_by_hand():
     a = log_of([[0, 0, -1, -1], [0, 1, -1, -1], [0, 0, 0, 0]], index=index).table()
     b = log_of([[0, 0, -1, -1], [1, 1, -1, -1], [0, 0, 0, 1]], index=index).table()
     np.testing.assert_allclose(standard_weights({"a": a, "b": b})[[0, 2]], [2 / 3, 1 / 3])
-    values = standardised({"a": a, "b": b}, "psa")
+    values = standardised({"a": a, "b": b}, PSA)
     assert values["a"].value == pytest.approx(2 / 3 * 1 / 2 + 1 / 3)
     assert values["b"].value == pytest.approx(2 / 3 + 1 / 3 * 1 / 2)
 
@@ -100,14 +102,14 @@ def test_a_stratum_that_one_map_lacks_counts_for_none():
     a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index).table()
     b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index).table()
     assert standard_weights({"a": a, "b": b}).tolist() == [1.0] + [0.0] * len(EDGES)
-    assert standardised({"a": a, "b": b}, "psa")["a"].value == 1
+    assert standardised({"a": a, "b": b}, PSA)["a"].value == 1
     never = log_of([[0, -1]], index=index[:1]).table()
-    assert math.isnan(standardised({"a": a, "b": never}, "psa")["a"].value)
+    assert math.isnan(standardised({"a": a, "b": never}, PSA)["a"].value)
 
 
 def test_edges_that_do_not_ascend_are_refused():
     with pytest.raises(ConfigError, match="must ascend from 2"):
-        standardised({"a": table_of([(0, 0, 0)])}, "psa", edges=(1, 5))
+        standardised({"a": table_of([(0, 0, 0)])}, PSA, edges=(1, 5))
 
 
 # --- Paired comparison ------------------------------------------------------------------------------------------------

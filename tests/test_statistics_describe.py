@@ -11,14 +11,17 @@ import tiny_scene
 from simulated_events import grid, log_of
 
 import semstab
+from semstab.comparison_model import BackboneComparison
 from semstab.config import Config
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json, write_json
+from semstab.json_form import from_json, to_json
 from semstab.metrics import sbd
 from semstab.statistics import Estimate, analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
 from semstab.statistics.__main__ import main
-from semstab.statistics.blocks import UNDEFINED
+from semstab.statistics.agreement import PSA
 from semstab.statistics.text import comparison_lines, lines
+from semstab.statistics_model import UNDEFINED, MapStatistics
 from semstab.voxels import VoxelTable
 
 SIDE, F = 24, 8
@@ -51,29 +54,29 @@ def described():
 def test_a_description_is_content_for_json_and_undefined_numbers_are_null(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
-    assert content["agreement"]["alpha"]["value"] == described.summary["agreement"]["alpha"]["value"]
+    assert content["agreement"]["alpha"]["value"] == described.summary.agreement.alpha.value
     assert content["strata"][0]["psa"] is None
-    assert math.isnan(described.summary["strata"][0]["psa"])
-    assert json.loads(json.dumps(described.summary))["name"] == "sim"
+    assert math.isnan(described.summary.strata[0].psa)
+    assert to_json(from_json(MapStatistics, content, "statistics.json")) == content
 
 
 def test_a_description_holds_what_the_functions_say(described):
     events = backbone(0.2, 0, place=0.2)
     table, summary = events.table(), described.summary
     repeated = table.op >= 2
-    assert summary["repeated"] == {"voxels": int(repeated.sum()), "share": pytest.approx(repeated.mean())}
-    assert summary["agreement"]["alpha"]["value"] == pytest.approx(krippendorff_alpha(table))
-    assert summary["drift"]["excess"]["value"] == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
-    parts = summary["uncertainty"]
-    assert parts["entropy"]["value"] == pytest.approx(parts["within"]["value"] + parts["between"]["value"])
-    geometry = summary["geometry"]
-    assert geometry["geometry"]["value"] == 0
-    assert geometry["total"]["value"] == pytest.approx(1 - summary["agreement"]["psa"]["value"])
-    shares = [summary["correctness"]["quadrants"][name]["value"] for name in
-              ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")]  # fmt: skip
-    assert sum(shares) == pytest.approx(1)
-    assert summary["drift"]["tests"]["drifting_voxels"] == 0
-    assert [row["rule"] for row in summary["fusion_rules"]] == ["averaging", "majority", "product", "geometric"]
+    assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
+    assert summary.agreement.alpha.value == pytest.approx(krippendorff_alpha(table))
+    assert summary.drift.excess.value == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
+    parts = summary.uncertainty
+    assert parts.entropy.value == pytest.approx(parts.within.value + parts.between.value)
+    geometry = summary.geometry
+    assert geometry.geometry.value == 0
+    assert geometry.total.value == pytest.approx(1 - summary.agreement.psa.value)
+    found = summary.correctness.quadrants
+    parts_of_all = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
+    assert sum(share.value for share in parts_of_all) == pytest.approx(1)
+    assert summary.drift.tests.drifting_voxels == 0
+    assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 
 def test_every_map_has_a_value_for_every_voxel(described):
@@ -85,18 +88,17 @@ def test_every_map_has_a_value_for_every_voxel(described):
 def test_the_same_seed_gives_the_same_description():
     events = backbone(0.2, 3)
     a, b, other = (describe(events.table(), events, seed=seed) for seed in (4, 4, 5))
-    assert json.dumps(a) == json.dumps(b)
-    assert a["agreement"]["psa"]["low"] != other["agreement"]["psa"]["low"]
+    assert to_json(a) == to_json(b)
+    assert a.agreement.psa.low != other.agreement.psa.low
 
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = backbone(0.2, 0)
     alone, logged = describe(events.table()), describe(events.table(), events)
-    for section in ("fusion_rules", "correctness", "geometry"):
-        assert alone[section] is None
-    assert alone["drift"]["tests"] is None
-    assert alone["drift"]["null"] == logged["drift"]["null"]
-    assert alone["agreement"] == logged["agreement"]
+    assert alone.fusion_rules is alone.correctness is alone.geometry is None
+    assert alone.drift.tests is None
+    assert alone.drift.null == logged.drift.null
+    assert to_json(alone.agreement) == to_json(logged.agreement)
 
 
 @pytest.mark.parametrize("labels", [np.zeros((0, 2), dtype=int), [[0, -1]], [[0, 0], [0, 0]]])
@@ -104,7 +106,7 @@ def test_maps_that_say_nothing_are_described_too(labels):
     events = log_of(labels)
     table = events.table()
     summary = describe(table, events, table, limit=table)
-    assert summary["verdict"]["level"] == "no verdict"
+    assert summary.verdict.level == "no verdict"
     assert "no verdict" in lines(summary)[0]
 
 
@@ -120,17 +122,18 @@ def test_backbones_beside_each_other():
     logs = {"steady": backbone(0.1, 5), "flickering": backbone(0.4, 6), "stuck": backbone(0.1, 7, place=0.3)}
     tables = {name: log.table() for name, log in logs.items()}
     content = compare_backbones(tables, logs, ground_truth())
-    json.dumps(content)
-    by_alpha = next(row for row in content["paired"]["rankings"] if row["measure"] == "alpha")
-    assert by_alpha["ranks"][-1]["backbone"] == "flickering"
-    assert len(content["paired"]["differences"]) == 3 * 6
-    assert content["standardised"]["values"]["psa"]["steady"]["value"] > 0.8
-    rules = content["fusion_rules"]
-    assert rules["orders"]["accuracy"]["averaging"][0] == "steady"
-    assert rules["values"]["averaging"]["stuck"]["accuracy"] < 0.8
-    assert rules["order_changes"].keys() == rules["orders"].keys()
+    read = json.loads(json.dumps(to_json(content)))
+    assert to_json(from_json(BackboneComparison, read, "summary.json")) == read
+    by_alpha = next(row for row in content.paired.rankings if row.measure == "alpha")
+    assert by_alpha.ranks[-1].backbone == "flickering"
+    assert len(content.paired.differences) == 3 * 7
+    assert content.standardised.of(PSA, "steady").value > 0.8
+    rules = content.fusion_rules
+    assert rules.orders["accuracy"]["averaging"][0] == "steady"
+    assert rules.values["averaging"]["stuck"].accuracy < 0.8
+    assert rules.order_changes.keys() == rules.orders.keys()
     assert any("steady" in line for line in comparison_lines(content))
-    assert compare_backbones(tables)["fusion_rules"] is None
+    assert compare_backbones(tables).fusion_rules is None
 
 
 def test_one_backbone_cannot_be_compared():
@@ -187,8 +190,8 @@ def test_voxels_seen_once_change_no_verdict():
     only = VoxelTable(*(getattr(table, name)[again] for name in columns), voxel_size=table.voxel_size)
     assert (~again).any()
     a, b = describe(table), describe(only)
-    assert a["verdict"]["level"] == b["verdict"]["level"]
-    assert a["agreement"] == b["agreement"]
+    assert a.verdict.level == b.verdict.level
+    assert to_json(a.agreement) == to_json(b.agreement)
 
 
 # --- The command ------------------------------------------------------------------------------------------------------

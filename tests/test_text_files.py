@@ -58,7 +58,7 @@ def test_a_pose_is_16_or_12_numbers(tmp_path, text):
         ("1 2 3 0 0 0 1", r"found 7 numbers \(position and quaternion\?\)"),
         ("1 0 0 0 1 0 0 0 1", "found 9 numbers"),
         ("1 0 0 x 0 1 0 0 0 0 1 0", "expected numbers .*'x'"),
-        pytest.param("1 " * 40000, "too many for one matrix", id="long"),
+        pytest.param("1 " * 40000, "too many for such a file", id="long"),
     ],
 )
 def test_a_pose_of_another_form_is_refused(folder, text, match):

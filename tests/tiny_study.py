@@ -64,7 +64,8 @@ class Counting(Observer):
         self.units, self.kept = len(plan.distinct()), len(kept)
 
     def unit_done(self, cell, error) -> None:
-        what = f"{cell.unit.slug} {cell.variation.sweep} {cell.variation.value}"
+        value = cell.variation.value
+        what = f"{cell.unit.slug} {cell.variation.sweep} {value if value is None else f'{value:g}'}"
         (self.computed if error is None else self.failed).append(what)
 
 

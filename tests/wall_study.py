@@ -52,13 +52,13 @@ def wall_study(base: Path) -> tuple[Result, Path]:
             "name": "wall & <door>",
             "dataset": {"name": "posed_folder", "options": {"root": str(base / "walls")}},
             "voxel_size": 0.0625,
-            "backend": "numpy",
             "sweeps": {
                 "voxel_size": [0.0625, 0.125],
                 "depth_noise": {"values": [0, 0.01], "repeats": 2},
                 "frame_count": {"values": [5, 9], "scenes": ["often"]},
             },
-            "backends": {"values": ["numba"], "scenes": ["often"]},
+            "backends": ["numpy", {"name": "numba", "scenes": ["often"]}],
+            "check": None,
         }
     )
     folder = base / "wall study"

@@ -146,8 +146,13 @@ class Reading:
             return f"set {them} in the configuration"
         return "the dataset has no such option: convert it, then write it into the scene.yaml"
 
+    def change(self, name: str, value: str) -> str:
+        """A setting with its value, and where it is written."""
+        line = self._line(name, value)
+        return f"{line} ({self._where((line,))})"
+
     def _line(self, name: str, value: str) -> str:
-        in_file = self.file is not None and self.options.get(name) is None
+        in_file = self.file is not None and self.options.get(name) in (None, (), [], {})
         return f"{'' if in_file else OPTION}{name}: {value}"
 
 

@@ -26,6 +26,8 @@ def print_check(checked: SceneCheck, console: Console) -> None:
         console.print(table)
     for line in _advice(checked):
         console.print(line)
+    for remark in checked.remarks:
+        console.print(f"[yellow]look:[/] {escape(remark)}\n", highlight=False)
     state = "unsound" if checked.problems else checked.verdict.state
     console.print(f"[bold]{escape(checked.scene)}:[/] [{STATES[state]}]{state}[/]: {escape(_conclusion(checked))}\n")
 

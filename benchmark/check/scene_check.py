@@ -23,6 +23,7 @@ from semstab.check.coverage import (
 )
 from semstab.check.geometry import Verdict, judge, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
+from semstab.check.remarks import remarks
 from semstab.check.reprojection import Sample
 from semstab.check.views import View, clusters, evenly, label_source, pairs_within, reader
 from semstab.config import Config
@@ -75,6 +76,7 @@ class Motion:
 class SceneCheck:
     """All that is known about a scene from its sample; `verdict` alone is about geometry.
 
+    `remarks` are what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
     Where the geometry is unsound nothing is said about overlap, noise and voxels.
     """
 
@@ -92,6 +94,7 @@ class SceneCheck:
     fused_stride: int = 1
     persistence: tuple[Persistence, ...] = ()
     suggestion: Suggestion | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -136,6 +139,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         motion=_motion(sample),
         verdict=verdict,
         labels=tuple(_labels(scene, name, indices, config, look) for name in backbones),
+        remarks=tuple(remarks(scene, [look.views[at] for at in sorted(look.views)], how, look.tally.backbone)),
     )
     return checked if verdict.state == "unsound" else _with_coverage(checked, look, sample, config)
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
-from semstab.statistics import Analysis, analyse, compare_backbones, nulls
+from semstab.statistics import Analysis, BackboneComparison, analyse, compare_backbones
 from semstab.task import Task
 from semstab.voxels import Events, VoxelTable
 
@@ -32,11 +31,10 @@ def analyse_map(
     return analyse(table, events, truth, limit=truth, name=task.backbone, edges=config.strata)
 
 
-def comparison(scene: str, maps: Mapping[str, VoxelTable], truth: VoxelTable | None) -> dict[str, Any] | None:
+def comparison(scene: str, maps: Mapping[str, VoxelTable], truth: VoxelTable | None) -> BackboneComparison | None:
     """Maps of a scene beside each other; None where there are not two or more of them in one label space."""
     if len(maps) < 2 or len({table.classes for table in maps.values()}) > 1:
         return None
     if truth is not None and truth.classes != next(iter(maps.values())).classes:
         truth = None
-    found: dict[str, Any] = nulls({"scene": scene} | compare_backbones(maps, truth=truth))
-    return found
+    return compare_backbones(maps, truth=truth, scene=scene)

@@ -29,6 +29,7 @@ from semstab.metrics import compare
 from semstab.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
 from semstab.results import Agreement
 from semstab.settings import resolve
+from semstab.statistics import BackboneComparison
 from semstab.stopwatch import Stopwatch
 from semstab.voxels import VoxelTable
 
@@ -283,7 +284,7 @@ def _must_agree(name: str, check: bool | None) -> bool:
     return getattr(REGISTRY.load(name), "pointwise", True) if check is None else check
 
 
-def _comparisons(records: Sequence[Record], tables: _Tables) -> Iterator[Mapping[str, Any]]:
+def _comparisons(records: Sequence[Record], tables: _Tables) -> Iterator[BackboneComparison]:
     """The base units of each scene beside each other; accuracy where there is ground truth."""
     base = [record for record in records if record.variation.sweep == BASE]
     for scene in dict.fromkeys(record.unit.scene for record in base):

@@ -19,14 +19,15 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.jobs import Job, Outcome, shared_marker
 from semstab.engine.observer import Observers
-from semstab.engine.series import FrameRow, to_csv
+from semstab.engine.series import to_csv
 from semstab.engine.stream import Stream, UnitMap
 from semstab.errors import DataError
 from semstab.files import atomic_path, write_text
-from semstab.metrics import dominant, entropy, macro_mean, sbd, summarise, vss
+from semstab.measures import dominant, measures
+from semstab.metrics import macro_mean, summarise
 from semstab.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
 from semstab.results import STAGES, UnitSummary, slug
-from semstab.statistics import Analysis, nulls
+from semstab.statistics import Analysis
 from semstab.stopwatch import Stopwatch
 from semstab.task import Task, read
 from semstab.up_axis import estimate_up
@@ -48,9 +49,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
             observers.tell(lambda observer: observer.unit_fused(unit, table))
     with watch("statistics"):
         truth = None if one.truth is None else _table(one.truth, task)
-        found = analyse_map(task, config, table, one.backend.events() if config.statistics else None, truth)
+        events = one.backend.events() if config.statistics else None
+        found = analyse_map(task, config, table, events, truth) if one.request.judged else None
     with watch("measure"):
-        summary = _summary(task, config, table, one.rows, found)
+        summary = _summary(one, table, found)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
     content = UnitContent(task.digest, summary, files=saved)
@@ -80,8 +82,9 @@ def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
     )
 
 
-def _summary(task: Task, config: Config, table: VoxelTable, rows: Sequence[FrameRow], found: Analysis) -> UnitSummary:
+def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
+    task, config, rows = one.task, one.request.config, one.rows
     stages = [row.stage_ms() for row in rows]
     return UnitSummary(
         unit=task.units[0],
@@ -92,11 +95,13 @@ def _summary(task: Task, config: Config, table: VoxelTable, rows: Sequence[Frame
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
-        statistics=nulls(found.summary),
+        statistics=None if found is None else found.summary,
     )
 
 
-def _savers(stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis) -> Savers:
+def _savers(
+    stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis | None
+) -> Savers:
     """What is to be written of a unit beside its summary."""
     config, unit = one.request.config, one.task.units[0]
     savers: Savers = {}
@@ -105,7 +110,7 @@ def _savers(stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable |
     if not one.request.kept:
         return savers
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
-        save_voxels, table, columns=found.maps if config.statistics else {}
+        save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
     )
     savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
     events = one.backend.events() if config.events else None
@@ -132,8 +137,8 @@ def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]
 
 def save_voxels(table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
-    measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table), "label": dominant(table)}
-    table.save(path, measures | dict(columns or {}))
+    own = {measure.key: measure.of(table) for measure in measures()}
+    table.save(path, {**own, "label": dominant(table), **(columns or {})})
 
 
 def _save_text(text: str, path: Path) -> None:

@@ -130,6 +130,9 @@ class Folder:
         """Whether the unit's file has what is wanted of it, and its other files are there as they were."""
         if isinstance(planned, PlannedUnit):
             has = content.summary is not None and (content.image_space is not None or not planned.image_space)
+            has = has and (
+                not planned.judged or (content.summary is not None and content.summary.statistics is not None)
+            )
             wanted = self._wanted(planned)
         else:
             has, wanted = content.regions is not None, []

@@ -26,6 +26,7 @@ class Request:
     config: Config
     image_space: bool = False
     kept: bool = False
+    judged: bool = True
     left_out: int = 0
     regions: bool = False
 

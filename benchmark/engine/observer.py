@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from semstab.backends import FusionBackend
     from semstab.check import Verdict
+    from semstab.config import Config
     from semstab.engine.series import FrameRow
     from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
     from semstab.frames import Frame
@@ -35,6 +36,9 @@ class Observer:
 
     def group_kept(self, task: Task, summaries: Sequence[UnitSummary]) -> None:
         """These base units of a backbone on a scene were found finished."""
+
+    def group_started(self, task: Task, config: Config) -> None:
+        """The task's frames are fused from now on, by those of its backends that are not kept; `config` is a unit's."""
 
     def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
         """The unit's frames go into this map from now on."""

@@ -104,7 +104,11 @@ class Pass:
         """Fuse and measure; the outcome of every unit that was not put off."""
         order = sorted(frozenset[int]().union(*(stream.indices for stream in self._streams)))
         decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
-        for one in (one for stream in self._streams for one in stream.maps if one.request.kept):
+        watched = [one for stream in self._streams for one in stream.maps if one.request.kept]
+        if watched:
+            task = dataclasses.replace(watched[0].task, backends=tuple(one.task.backends[0] for one in watched))
+            self.observers.tell(lambda observer: observer.group_started(task, watched[0].request.config))
+        for one in watched:
             self.observers.tell(lambda observer, one=one: observer.unit_started(one.task.units[0], one.backend))  # type: ignore[misc]
         with contextlib.closing(decode) as frames:
             for index, fetched in zip(order, frames, strict=True):
@@ -142,7 +146,7 @@ class Pass:
         """A frame into every map of a stream."""
         watched = [one for one in stream.maps if one.request.kept]
         with self._failing([one.request for one in stream.maps]):
-            now = stream.next_frame(fetched.item, self._watch)
+            now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
             if watched and not watched[0].rows:
                 require_memory(stream.task, watched[0].request.config, now.frame)
             for one in stream.maps:

@@ -78,8 +78,8 @@ class Stream:
         self.shown = self.task.indices[len(self.task.indices) // 2] if self.image_space is not None else None
         self.overview: dict[str, Any] = {}
 
-    def next_frame(self, decoded: Decoded, watch: Stopwatch) -> Prepared:
-        """The frame as the stream's units fuse it."""
+    def next_frame(self, decoded: Decoded, watch: Stopwatch, *, color: bool) -> Prepared:
+        """The frame as the stream's units fuse it; with its colour only where somebody but the figures wants it."""
         if decoded.error is not None:
             raise decoded.error
         assert decoded.frame is not None
@@ -92,6 +92,7 @@ class Stream:
                 self.image_space.add(frame, truth)
         if decoded.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
+            frame = frame if color else dataclasses.replace(frame, color=None)
         self.poses.append(frame.T_wc)
         self.previous = frame
         return Prepared(frame, truth, flicker, lap.seconds)

@@ -26,6 +26,7 @@ from semstab.config import (
 from semstab.datasets import Scene, open_dataset
 from semstab.engine.jobs import Request
 from semstab.errors import ConfigError
+from semstab.measures import measures
 from semstab.records import REGIONS, Variation
 from semstab.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
@@ -52,6 +53,7 @@ class PlannedUnit:
     identity     hash of the settings that its numbers depend on; what shares it is computed once
     image_space  whether its stability in image coordinates is wanted
     kept         whether its voxels and its time series are kept
+    judged       whether the statistics say something of its map: not of the one that others are only checked against
     """
 
     variation: Variation
@@ -60,6 +62,7 @@ class PlannedUnit:
     identity: str
     image_space: bool
     kept: bool
+    judged: bool = True
 
     @property
     def unit(self) -> Unit:
@@ -76,6 +79,17 @@ class PlannedUnit:
         """A hash of its input."""
         return self.task.digest
 
+    def beside(self, other: Planned) -> Planned:
+        """The same unit, with what is wanted of either."""
+        if not isinstance(other, PlannedUnit):
+            return self
+        return dataclasses.replace(
+            other,
+            image_space=other.image_space or self.image_space,
+            kept=other.kept or self.kept,
+            judged=other.judged or self.judged,
+        )
+
     @property
     def logged(self) -> bool:
         """Whether its backend can give the log of its observations."""
@@ -85,7 +99,7 @@ class PlannedUnit:
         """What a job is told of it."""
         frames = FrameSelection(list=tuple(self.task.indices))
         config = self.config.model_copy(update={"frames": frames})
-        return Request(self.identity, config, self.image_space, self.kept, self.task.left_out)
+        return Request(self.identity, config, self.image_space, self.kept, self.judged, self.task.left_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,10 +158,8 @@ class Plan:
         """What is to be computed, by its identity, with all that is wanted of it anywhere."""
         distinct: dict[str, Planned] = {each.identity: each for each in self.regions}
         for each in self.units:
-            known = distinct.get(each.identity, each)
-            distinct[each.identity] = dataclasses.replace(
-                known, image_space=known.image_space or each.image_space, kept=known.kept or each.kept
-            )
+            known = distinct.get(each.identity)
+            distinct[each.identity] = each if known is None else each.beside(known)
         return distinct
 
     @cached_property
@@ -227,8 +239,10 @@ def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[s
             varied = change(each.config)
             (task,) = tasks_of(scenes[each.unit.scene], varied, beside[each.unit.scene])
             _check_count(variation, task)
-            kept = variation.sweep == BACKENDS
-            yield PlannedUnit(variation, varied, task, identity(varied, task), image_space=False, kept=kept)
+            kept, (backend, *_) = variation.sweep == BACKENDS, varied.backends
+            reference = kept and backend.name not in [named.name for named in config.backends]
+            judged = varied.statistics or not reference
+            yield PlannedUnit(variation, varied, task, identity(varied, task), False, kept, judged)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Change]]:
@@ -239,11 +253,11 @@ def _variations(config: Config) -> Iterator[tuple[Variation, Part, Change]]:
         for value in part.values:
             repeats = part.repeats if isinstance(part, Noise) and value else 1
             for repeat in range(repeats):
-                yield Variation(sweep, value, repeat), part, _change(sweep, value, config.seed + repeat)
+                yield Variation(sweep, float(value), repeat), part, _change(sweep, value, config.seed + repeat)
     _, *others = config.fused_by()
-    logged = next((backend for backend in config.fused_by() if keeps_log(backend.name)), None)
+    logged = next((backend.name for backend in config.fused_by() if keeps_log(backend.name)), None)
     for backend in others:
-        yield Variation(BACKENDS), backend, partial(_fused_by, backend, config.statistics and backend is logged)
+        yield Variation(BACKENDS), backend, partial(_fused_by, backend, config.statistics and backend.name == logged)
 
 
 def _change(sweep: str, value: float, seed: int) -> Change:
@@ -261,7 +275,8 @@ def _changed(settings: Mapping[str, Any], base: Config) -> Config:
 def _disturbed(noise: Mapping[str, Any], base: Config) -> Config:
     """With that noise beside what there is in every unit."""
     disturbed = (base.perturbation or Perturbation()).model_copy(update=noise)
-    return base.model_copy(update={"perturbation": disturbed if disturbed.adds_noise else None})
+    seed = disturbed.seed
+    return base.model_copy(update={"perturbation": disturbed if disturbed.adds_noise else None, "seed": seed})
 
 
 def _fused_by(backend: BackendConfig, statistics: bool, base: Config) -> Config:
@@ -303,7 +318,8 @@ def identity(config: Config, task: Task) -> str:
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:
     settings = config.model_dump(mode="json", include={*IN_KEYS} - {*without})
-    text = json.dumps([FORMAT, settings, content], sort_keys=True)
+    measured = [measure.key for measure in measures()]
+    text = json.dumps([FORMAT, measured, settings, content], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import DataError
-from semstab.metrics.voxelwise import entropy, sbd, vss
-from semstab.results import Agreement, Difference, Unit
+from semstab.measures import measures
+from semstab.metrics.matching import shared_rows
+from semstab.results import Agreement, Deviation, Unit
 from semstab.voxels import VoxelTable
 
 TOLERANCE = 1e-9
@@ -26,17 +26,10 @@ def compare(
     one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
     Raises DataError where the maps differ in K or voxel size.
     """
-    if (a.K, a.voxel_size) != (b.K, b.voxel_size):
-        raise DataError(
-            f"maps of {a.K} classes in voxels of {a.voxel_size:g} m and of {b.K} in {b.voxel_size:g} m"
-            " cannot be compared; fuse both alike"
-        )
-    in_a, in_b = _shared_rows(a, b)
+    in_a, in_b = shared_rows(a, b)
     quantities: dict[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]] = {
         "op": (a.op, b.op),
-        "vss": (vss(a), vss(b)),
-        "sbd": (sbd(a), sbd(b)),
-        "entropy": (entropy(a), entropy(b)),
+        **{measure.key: (measure.of(a), measure.of(b)) for measure in measures()},
         "evidence": (a.evidence, b.evidence),
     }
     differences = {name: _difference(x[in_a], y[in_b]) for name, (x, y) in quantities.items()}
@@ -54,18 +47,10 @@ def compare(
     )
 
 
-def _shared_rows(a: VoxelTable, b: VoxelTable) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Rows of the voxels that both tables hold."""
-    index = np.concatenate([a.index, b.index])
-    order = np.lexsort(index.T[::-1])  # stable: of two equal voxels a's comes first
-    twin = np.flatnonzero((index[order][1:] == index[order][:-1]).all(axis=1))
-    return order[twin], order[twin + 1] - len(a)
-
-
-def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Difference:
+def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Deviation:
     x, y = x.astype(np.float64), y.astype(np.float64)
     difference = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y))
     difference = np.where(np.isnan(difference), 1.0, difference)
     if not difference.size:
-        return Difference(math.nan, math.nan)
-    return Difference(float(difference.max()), float(difference.mean()))
+        return Deviation(math.nan, math.nan)
+    return Deviation(float(difference.max()), float(difference.mean()))

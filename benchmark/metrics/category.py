@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.information import entropy_bits, normalise
-from semstab.metrics.voxelwise import sbd
+from semstab.measures import sbd
 from semstab.results import RECURRENT
 from semstab.voxels import VoxelTable
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics.voxelwise import dominant, entropy, sbd, vss
+from semstab.measures import MeasureMeans, dominant, mean, measures
 from semstab.results import RECURRENT, Means, TableSummary
 from semstab.voxels import VoxelTable
 
@@ -19,19 +19,16 @@ STRATA = (1, 2, 5)
 def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     """Summarise a table (paper, tables of multi-scene, persistence-stratified and class-wise stability).
 
-    edges are the strata's upper bounds of OP, ascending; a last stratum holds what lies above. Means of SBD run over
-    voxels with OP >= 2; a mean over no voxel is NaN.
+    edges are the strata's upper bounds of OP, ascending; a last stratum holds what lies above. Each mean runs over the
+    voxels where its measure is defined; over no voxel it is NaN.
     """
-    measures = {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table)}
+    values = {measure: measure.of(table) for measure in measures()}
     label = dominant(table)
     names = table.classes or tuple(str(k) for k in range(table.K))
 
     def means(name: str, where: npt.NDArray[np.bool_]) -> Means:
         n = int(np.count_nonzero(where))
-        share = n / len(table) if len(table) else math.nan
-        sbd_voxels = int(np.count_nonzero(where & (table.op >= 2)))
-        means = {key: _mean(value[where]) for key, value in measures.items()}
-        return Means(name, share, n, **means, sbd_voxels=sbd_voxels)
+        return Means(name, n / len(table) if len(table) else math.nan, n, MeasureMeans.over(values, table.op, where))
 
     observations = int(table.op.sum(dtype=np.int64))
     return TableSummary(
@@ -41,7 +38,7 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
         observations=observations,
         voxels=len(table),
         mean_op=observations / len(table) if len(table) else math.nan,
-        **{key: _mean(value) for key, value in measures.items()},
+        means=MeasureMeans.over(values, table.op, np.ones(len(table), dtype=np.bool_)),
         strata=tuple(means(name, (table.op >= low) & (table.op <= high)) for name, low, high in strata(edges)),
         recurrent=means(f"OP>={RECURRENT}", table.op >= RECURRENT),
         classes=tuple(means(name, label == k) for k, name in enumerate(names)),
@@ -65,27 +62,18 @@ def pool(groups: Sequence[Means], voxels: int) -> Means:
     Strata and class tables of several scenes pool their voxels; scene tables give macro means instead.
     """
     n = sum(group.voxels for group in groups)
-    return Means(
-        name=groups[0].name,
-        share=n / voxels if voxels else math.nan,
-        voxels=n,
-        vss=_weighted([group.vss for group in groups], [group.voxels for group in groups]),
-        sbd=_weighted([group.sbd for group in groups], [group.sbd_voxels for group in groups]),
-        entropy=_weighted([group.entropy for group in groups], [group.voxels for group in groups]),
-        sbd_voxels=sum(group.sbd_voxels for group in groups),
-    )
+    rows, first = [(group.means, group.voxels) for group in groups], groups[0].means
+    weights = {key: [means.voxels.get(key, of_all) for means, of_all in rows] for key in first.value}
+    value = {key: _weighted([means.value[key] for means, _ in rows], own) for key, own in weights.items()}
+    pooled = MeasureMeans(value, {key: sum(weights[key]) for key in first.voxels})
+    return Means(groups[0].name, n / voxels if voxels else math.nan, n, pooled)
 
 
 def macro_mean(values: Sequence[float]) -> float:
     """The mean over scenes, each counting once, of those where the value is defined; NaN where none is."""
-    return _mean(np.array(values, dtype=np.float64))
+    return mean(np.array(values, dtype=np.float64))
 
 
 def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
     total = sum(weights)
     return sum(v * w for v, w in zip(values, weights, strict=True) if w) / total if total else math.nan
-
-
-def _mean(values: npt.NDArray[np.float64]) -> float:
-    defined = values[~np.isnan(values)]
-    return float(defined.mean()) if defined.size else math.nan

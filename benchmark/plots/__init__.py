@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from semstab.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
 from semstab.files import keep_only
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import Histogram, together
+from semstab.plots.histograms import Histograms, histograms, together
 from semstab.plots.judgement import statistics_figures
 from semstab.plots.maps import Overview, draw_overview, draw_stability
 from semstab.plots.style import Figure
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 __all__ = ["Figure", "figures", "write_figures"]
-
-Histograms = Mapping[str, Mapping[str, Histogram]]
-"""By backbone and scene."""
 
 
 def write_figures(result: Result, folder: str | Path) -> list[Path]:
@@ -80,34 +77,35 @@ def _distributions(kept: list[Record]) -> Iterator[Figure]:
         return
 
     @functools.cache
-    def histograms() -> Histograms:
+    def of_all() -> dict[str, dict[str, Histograms]]:
+        """By backbone and scene."""
         return {
-            backbone: {record.unit.scene: Histogram.of(record.table()) for record in records}
+            backbone: {record.unit.scene: histograms(record.table()) for record in records}
             for backbone, records in by_backbone(kept).items()
         }
 
     def ecdf(backbone: str) -> Canvas:
-        every = {f"{b}/{s}": h for b, scenes in histograms().items() for s, h in scenes.items()}
-        return draw_ecdf(histograms()[backbone], informative(every))
+        ends = informative(found for scenes in of_all().values() for found in scenes.values())
+        return draw_ecdf(of_all()[backbone], ends)
 
     for backbone in by_backbone(kept):
         yield Figure(
             slug("ecdf", backbone),
-            f"Disagreement and drift by scene: {backbone}",
-            "Empirical distributions over the voxels of each scene: disagreement 1 - VSS of all voxels, SBD of those"
-            " seen twice or more. Dashed: the recurrent voxels of all scenes. The x axes are the same for each backbone"
-            " and end where 99% of the voxels of every scene are reached.",
-            f"Two panels of cumulative curves, one a scene, for {backbone}: how many voxels have how much disagreement"
-            " and drift.",
+            f"The measures by scene: {backbone}",
+            "Empirical distributions over the voxels of each scene, of measures of which more is better as what they"
+            " lack: 1 - VSS is disagreement. SBD is that of the voxels seen twice or more. Dashed: the recurrent voxels"
+            " of all scenes. The x axes are the same for each backbone and end where 99% of the voxels of every scene"
+            " are reached.",
+            f"A panel a measure of cumulative curves, one a scene, for {backbone}: how many voxels have how much.",
             partial(ecdf, backbone),
         )
     yield Figure(
         "persistence",
-        "VSS and SBD against observation persistence",
+        "The measures against observation persistence",
         "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
         " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
-        "For each backbone, VSS and SBD as curves against OP on a logarithmic axis, with the number of voxels beneath.",
-        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in histograms().items()}),
+        "For each backbone, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
+        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in of_all().items()}),
     )
 
 
@@ -118,10 +116,9 @@ def _maps(result: Result, kept: list[Record]) -> Iterator[Figure]:
             yield Figure(
                 slug("stability_map", scene, backbone),
                 f"Stability from above: {scene}, {backbone}",
-                "The topmost voxel of each column along the up axis: its stability category, its SBD (grey: seen once,"
-                " no SBD; the scale ends at the largest value there is) and its normalised entropy.",
-                f"Three maps of {scene} from above with the stability category, the drift and the entropy of"
-                f" {backbone}'s voxels.",
+                "The topmost voxel of each column along the up axis: its stability category and every measure; grey:"
+                " seen once, which says nothing. Values beyond a scale look like its end.",
+                f"Maps of {scene} from above with the stability category and each measure of {backbone}'s voxels.",
                 partial(_draw_map, record, result.up[scene]),
                 dense=True,
             )
@@ -138,10 +135,10 @@ def _sweeps(result: Result) -> Iterator[Figure]:
             yield Figure(
                 f"sensitivity_{sweep.name}",
                 f"Sensitivity to {sweep.title}",
-                "The share of recurrent voxels, and VSS and SBD over all voxels (solid) and over the recurrent ones"
+                "The share of recurrent voxels, and every measure over all voxels (solid) and over the recurrent ones"
                 f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes; bars are the standard deviation"
-                " over repeats. Read (b) and (c) with (a): which voxels there are to average changes along the sweep.",
-                f"Three panels against {sweep.title}: the recurrent share, VSS and SBD, for all voxels and for the"
+                " over repeats. Read the others with (a): which voxels there are to average changes along the sweep.",
+                f"Panels against {sweep.title}: the recurrent share and each measure, for all voxels and for the"
                 " recurrent ones.",
                 partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in backbones}),
             )

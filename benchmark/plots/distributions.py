@@ -1,15 +1,17 @@
-"""ECDFs of disagreement and drift, and both against OP (paper, Semantic Agreement and Belief Drift)."""
+"""ECDFs of what each measure lacks, and each against OP (paper, Semantic Agreement and Belief Drift)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from semstab.averages import ENOUGH
-from semstab.plots.histograms import Histogram, Measure, op_position, together
-from semstab.plots.style import COLUMN, FAINT, INK, PAGE, canvas, color, mark_panel
+from semstab.measures import measures
+from semstab.plots.histograms import Histograms, MeasureByOP, lacking, op_position, together
+from semstab.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, mark_panel
 from semstab.results import RECURRENT
 
 if TYPE_CHECKING:
@@ -22,56 +24,62 @@ INFORMATIVE = 0.99
 """The axes of the ECDFs end where this share of the voxels of every curve is reached."""
 
 
-def draw_ecdf(scenes: Mapping[str, Histogram], limits: tuple[float, float]) -> Figure:
-    """The ECDF of 1 - VSS and of SBD of each scene, and of all recurrent voxels; limits end the x axes."""
-    figure = canvas(PAGE, 2.4)
-    left, right = figure.subplots(1, 2)
+def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Figure:
+    """The ECDF of how much each measure lacks in each scene, and in all recurrent voxels; ends are those of x axes."""
+    shown = measures()
+    figure = canvas(PAGE, 2.4 * math.ceil(len(shown) / 2))
+    panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
     everything = together(scenes.values())
-    disagreement = {name: histogram.disagreement for name, histogram in scenes.items()}
-    drift = {name: histogram.sbd for name, histogram in scenes.items()}
-    _draw_curves(left, disagreement, everything.disagreement)
-    _draw_curves(right, drift, everything.sbd)
-    left.set(xlabel="1 - VSS", ylabel="share of voxels", xlim=(0, 1.03 * limits[0]), ylim=(None, 1.0))
-    right.set(xlabel="SBD (bits)", ylabel="share of voxels", xlim=(0, 1.03 * limits[1]), ylim=(None, 1.0))
-    mark_panel(left, "a", "disagreement")
-    mark_panel(right, "b", "drift, voxels seen twice or more")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=min(6, len(scenes) + 1))
+    for axes, letter, measure in zip(panels, LETTERS, shown, strict=False):
+        _draw_curves(axes, {name: found[measure.key] for name, found in scenes.items()}, everything[measure.key])
+        label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
+        unit = f" ({measure.unit})" if measure.unit else ""
+        axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(None, 1.0))
+        mark_panel(axes, letter, f"{label}, voxels with OP ≥ {measure.lowest_op}" if measure.lowest_op > 1 else label)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(6, len(scenes) + 1))
     return figure
 
 
-def _draw_curves(axes: Axes, scenes: Mapping[str, Measure], everything: Measure) -> None:
+def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
     """One curve a scene, and a dashed one of all recurrent voxels, where there are any."""
-    for k, (name, measure) in enumerate(scenes.items()):
-        axes.step(measure.values, measure.ecdf(), where="post", color=color(k), label=name)
+    for k, (name, found) in enumerate(scenes.items()):
+        axes.step(found.values, found.ecdf(), where="post", color=color(k), label=name)
     recurrent = everything.ecdf(RECURRENT)
     if recurrent[-1]:
         axes.step(everything.values, recurrent, "k--", where="post", linewidth=1.0, label="OP ≥ 3, all scenes")
 
 
-def informative(histograms: Mapping[str, Histogram]) -> tuple[float, float]:
-    """Where the x axes of 1 - VSS and of SBD end, so that every scene's curve is seen up to its last percent."""
+def informative(units: Iterable[Histograms]) -> dict[str, float]:
+    """Where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
 
-    def end(measure: Measure) -> float:
-        reached = measure.ecdf() >= INFORMATIVE
-        return float(measure.values[reached.argmax()]) if reached.any() else measure.largest
+    def end(found: MeasureByOP) -> float:
+        reached = found.ecdf() >= INFORMATIVE
+        return float(found.values[reached.argmax()]) if reached.any() else found.largest
 
-    ends = [(end(h.disagreement), end(h.sbd)) for h in histograms.values()]
-    return max(0.05, *(d for d, _ in ends)), max(0.02, *(s for _, s in ends))
+    ends: dict[str, float] = {}
+    for scene in units:
+        for key, found in scene.items():
+            ends[key] = max(ends.get(key, 0.06 * found.largest), end(found))
+    return ends
 
 
-def draw_persistence(backbones: Mapping[str, Histogram]) -> Figure:
-    """VSS and SBD against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
+def draw_persistence(backbones: Mapping[str, Histograms]) -> Figure:
+    """Each measure against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    columns = len(backbones)
-    figure = canvas(COLUMN if columns == 1 else PAGE, 4.2)
-    grid = figure.subplots(3, columns, sharex=True, sharey="row", squeeze=False, height_ratios=(3, 3, 1.6))
+    columns, shown = len(backbones), measures()
+    figure = canvas(COLUMN if columns == 1 else PAGE, 1.2 + 1.5 * len(shown))
+    ratios = (*[3.0] * len(shown), 1.6)
+    grid = figure.subplots(len(ratios), columns, sharex=True, sharey="row", squeeze=False, height_ratios=ratios)
     for k, (name, histogram) in enumerate(backbones.items()):
         _draw_column(grid[:, k], histogram, color(k))
         grid[0, k].set_title(name)
-        grid[2, k].set_xlabel("OP (frames)")
-    for axes, label in zip(grid[:, 0], ("VSS", "SBD (bits)", "voxels"), strict=True):
+        grid[-1, k].set_xlabel("OP (frames)")
+    labels = (f"{m.title} ({m.unit})" if m.unit else m.title for m in shown)
+    for axes, label in zip(grid[:, 0], (*labels, "voxels"), strict=True):
         axes.set_ylabel(label)
     band = Patch(facecolor=FAINT, alpha=0.4, label="interquartile range")
     few = Line2D(
@@ -82,23 +90,21 @@ def draw_persistence(backbones: Mapping[str, Histogram]) -> Figure:
     return figure
 
 
-def _draw_column(rows: Panels, histogram: Histogram, shade: str) -> None:
-    voxels = histogram.disagreement.voxels
+def _draw_column(rows: Panels, found: Histograms, shade: str) -> None:
+    voxels = next(iter(found.values())).voxels
     present = voxels > 0
     x, few = op_position()[present], voxels[present] < ENOUGH
-    d, s = histogram.disagreement, histogram.sbd
-    curves = (
-        (1 - d.mean()[present], 1 - d.quantile(0.75)[present], 1 - d.quantile(0.25)[present]),
-        (s.mean()[present], s.quantile(0.25)[present], s.quantile(0.75)[present]),
-    )
-    for axes, (mean, low, high) in zip(rows[:2], curves, strict=True):
-        axes.fill_between(x, low, high, color=shade, alpha=0.2, linewidth=0.8)
+    for axes, measure in zip(rows[:-1], measures(), strict=True):
+        own = found[measure.key]
+        curves = (own.mean(), own.quantile(0.25), own.quantile(0.75))
+        mean, *ends = (lacking(measure, curve[present]) for curve in curves)
+        axes.fill_between(x, *ends, color=shade, alpha=0.2, linewidth=0.8)
         axes.plot(x, mean, color=shade, marker="o", markersize=3)
         axes.plot(x[few], mean[few], color=shade, marker="o", markersize=3, markerfacecolor="white", linewidth=0)
-    rows[2].vlines(x, 0.5, voxels[present], color=shade, linewidth=3)
-    rows[2].axhline(ENOUGH, color=INK, linewidth=0.6, linestyle=":")
-    rows[2].set(xscale="log", yscale="log", ylim=(0.5, None))
-    mark_op(rows[2], x[-1])
+    rows[-1].vlines(x, 0.5, voxels[present], color=shade, linewidth=3)
+    rows[-1].axhline(ENOUGH, color=INK, linewidth=0.6, linestyle=":")
+    rows[-1].set(xscale="log", yscale="log", ylim=(0.5, None))
+    mark_op(rows[-1], x[-1])
 
 
 def mark_op(axes: Axes, largest: float) -> None:

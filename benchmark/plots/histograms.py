@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics import op, sbd, vss
+from semstab.measures import Measure, measures, op
 from semstab.voxels import VoxelTable
 
 Int64 = npt.NDArray[np.int64]
@@ -16,9 +17,6 @@ Float64 = npt.NDArray[np.float64]
 
 BINS = 1000
 """Bins of a measure between 0 and its largest value; a further one, the first, holds 0 alone."""
-
-MOST_DRIFT = 0.3112781244591328
-"""The largest SBD there is, bits: D_JS of (1, 0) and (1/2, 1/2), the second observation contradicting the first."""
 
 
 def _op_bounds() -> Int64:
@@ -33,15 +31,18 @@ OP_BOUNDS = _op_bounds()
 
 
 @dataclass(frozen=True, eq=False)
-class Measure:
-    """A measure's voxels by OP and value: counts (OP bins, 1 + BINS), sums (OP bins,); `largest` ends the last bin."""
+class MeasureByOP:
+    """A measure's voxels by OP and value: counts (OP bins, 1 + BINS), sums (OP bins,); `largest` ends the last bin.
+
+    The values count from the best one: of a measure of which more is better they are what it lacks, as in 1 - VSS.
+    """
 
     counts: Int64
     sums: Float64
     largest: float
 
     @classmethod
-    def of(cls, values: Float64, bins: Int64, largest: float) -> Measure:
+    def of(cls, values: Float64, bins: Int64, largest: float) -> MeasureByOP:
         """The histogram of values (n,) in OP bins (n,); undefined values do not count."""
         defined = ~np.isnan(values)
         values, bins = values[defined], bins[defined]
@@ -50,8 +51,8 @@ class Measure:
         sums = np.bincount(bins, weights=values, minlength=len(OP_BOUNDS)).astype(np.float64)
         return cls(cells.reshape(len(OP_BOUNDS), BINS + 1), sums, largest)
 
-    def __add__(self, other: Measure) -> Measure:
-        return Measure(self.counts + other.counts, self.sums + other.sums, self.largest)
+    def __add__(self, other: MeasureByOP) -> MeasureByOP:
+        return MeasureByOP(self.counts + other.counts, self.sums + other.sums, self.largest)
 
     @property
     def values(self) -> Float64:
@@ -81,29 +82,24 @@ class Measure:
         return np.where(self.voxels > 0, self.values[reached.argmax(axis=1)], np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class Histogram:
-    """Disagreement 1 - VSS and SBD of a unit's voxels, or of several units' together."""
-
-    disagreement: Measure
-    sbd: Measure
-
-    @classmethod
-    def of(cls, table: VoxelTable) -> Histogram:
-        """The histogram of a unit."""
-        bins = np.searchsorted(OP_BOUNDS, op(table), side="right") - 1
-        return cls(Measure.of(1 - vss(table), bins, 1.0), Measure.of(sbd(table), bins, MOST_DRIFT))
-
-    def __add__(self, other: Histogram) -> Histogram:
-        return Histogram(self.disagreement + other.disagreement, self.sbd + other.sbd)
+Histograms = Mapping[str, MeasureByOP]
+"""Of a unit's voxels, or of several units' together: each measure by its key."""
 
 
-def together(histograms: Iterable[Histogram]) -> Histogram:
+def lacking(measure: Measure, value: Float64) -> Float64:
+    """How far values are from the best, and back."""
+    return value if measure.better == "lower" else measure.largest - value
+
+
+def histograms(table: VoxelTable) -> Histograms:
+    """The histograms of a unit."""
+    bins = np.searchsorted(OP_BOUNDS, op(table), side="right") - 1
+    return {m.key: MeasureByOP.of(lacking(m, m.of(table)), bins, m.largest) for m in measures()}
+
+
+def together(units: Iterable[Histograms]) -> Histograms:
     """The voxels of several units pooled."""
-    first, *rest = histograms
-    for histogram in rest:
-        first = first + histogram
-    return first
+    return reduce(lambda a, b: {key: one + b[key] for key, one in a.items()}, units)
 
 
 def op_position() -> Float64:

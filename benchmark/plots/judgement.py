@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial, reduce
 from operator import add
 from typing import TYPE_CHECKING, Any
@@ -14,23 +14,26 @@ from semstab.plots.maps import draw_uncertainty, right_or_wrong
 from semstab.plots.statistics import DriftByOP, Rows, draw_agreement, draw_drift, draw_intervals, draw_reliability
 from semstab.plots.style import Figure
 from semstab.records import Record, Result
-from semstab.results import slug
-from semstab.statistics import estimate_at, expected_sbd
+from semstab.results import Unit, slug
+from semstab.statistics import expected_sbd
+from semstab.statistics.agreement import ALPHA, PSA
+from semstab.statistics.comparison import compared
 from semstab.statistics.verdict import RELIABLE, TENTATIVE
+from semstab.statistics_model import Estimate, MapStatistics, Reliability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-MEASURES = {"psa": "PSA", "alpha": "alpha", "vss": "VSS", "accuracy": "accuracy"}
-"""Those of a comparison that are drawn: higher is better for all."""
+
+Judged = Sequence[tuple[Unit, MapStatistics]]
 
 
 def statistics_figures(result: Result, kept: Sequence[Record]) -> list[Figure]:
     """Every one for which the study has records; `kept` are the base ones whose voxels were kept."""
-    judged = [record for record in result.select() if record.statistics]
+    judged = [(record.unit, record.statistics) for record in result.select() if record.statistics is not None]
     return [
         *_agreement(judged),
-        *_drift([record for record in kept if record.statistics]),
+        *_drift([record for record in kept if record.statistics is not None]),
         *_reliability(judged),
         *_comparison(result),
         *_maps(result, kept),
@@ -38,7 +41,7 @@ def statistics_figures(result: Result, kept: Sequence[Record]) -> list[Figure]:
     ]
 
 
-def _agreement(judged: Sequence[Record]) -> Iterator[Figure]:
+def _agreement(judged: Judged) -> Iterator[Figure]:
     if judged:
         yield Figure(
             "temporal_agreement",
@@ -48,17 +51,19 @@ def _agreement(judged: Sequence[Record]) -> Iterator[Figure]:
             " and from which data are reliable (0.8).",
             "Two panels with one interval a scene and backbone: pairwise agreement and Krippendorff's alpha.",
             lambda: draw_intervals(
-                {"PSA": _estimates(judged, "psa"), "alpha": _estimates(judged, "alpha")},
-                {"alpha": (TENTATIVE, RELIABLE)},
+                {
+                    PSA.word: _estimates(judged, lambda found: found.agreement.psa),
+                    ALPHA.word: _estimates(judged, lambda found: found.agreement.alpha),
+                },
+                {ALPHA.word: (TENTATIVE, RELIABLE)},
             ),
         )
 
 
-def _estimates(records: Sequence[Record], measure: str) -> Rows:
-    rows: dict[str, dict[str, Any]] = {}
-    for record in records:
-        found = estimate_at(record.statistics, "agreement", measure)
-        rows.setdefault(record.unit.scene, {})[record.unit.backbone] = found
+def _estimates(judged: Judged, take: Callable[[MapStatistics], Estimate]) -> Rows:
+    rows: dict[str, dict[str, Estimate]] = {}
+    for unit, found in judged:
+        rows.setdefault(unit.scene, {})[unit.backbone] = take(found)
     return rows
 
 
@@ -81,11 +86,11 @@ def _drift_of(record: Record) -> DriftByOP:
     return DriftByOP.of(table, expected_sbd(table) if null is None else null)
 
 
-def _reliability(judged: Sequence[Record]) -> Iterator[Figure]:
-    bins = {
-        name: [row for record in records for row in record.statistics["correctness"]["reliability"]]
-        for name, records in by_backbone(r for r in judged if r.statistics["correctness"]).items()
-    }
+def _reliability(judged: Judged) -> Iterator[Figure]:
+    bins: dict[str, list[Reliability]] = {}
+    for unit, found in judged:
+        if found.correctness is not None:
+            bins.setdefault(unit.backbone, []).extend(found.correctness.reliability)
     if bins:
         yield Figure(
             "correctness",
@@ -99,12 +104,13 @@ def _reliability(judged: Sequence[Record]) -> Iterator[Figure]:
 
 
 def _comparison(result: Result) -> Iterator[Figure]:
-    panels: dict[str, dict[str, dict[str, Any]]] = {}
+    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
+    panels: dict[str, dict[str, dict[str, Estimate]]] = {}
     for found in result.comparisons:
-        for row in found["paired"]["differences"]:
-            if row["measure"] in MEASURES:
-                rows = panels.setdefault(MEASURES[row["measure"]], {}).setdefault(found["scene"], {})
-                rows[f"{row['a']} less {row['b']}"] = estimate_at(row, "difference")
+        for row in found.paired.differences:
+            panels.setdefault(words[row.measure], {}).setdefault(found.scene, {})[f"{row.a} less {row.b}"] = (
+                row.difference
+            )
     if panels:
         yield Figure(
             "comparison",
@@ -113,8 +119,8 @@ def _comparison(result: Result) -> Iterator[Figure]:
             " from a bootstrap over blocks of space. An interval that holds 0 decides nothing.",
             "One panel a measure with the difference of each pair of backbones in each scene and its interval, and 0.",
             lambda: draw_intervals(
-                {name: panels[name] for name in MEASURES.values() if name in panels},
-                dict.fromkeys(MEASURES.values(), (0.0,)),
+                panels,
+                dict.fromkeys(panels, (0.0,)),
             ),
         )
 
@@ -123,7 +129,7 @@ def _maps(result: Result, kept: Sequence[Record]) -> Iterator[Figure]:
     """Of the studies that were asked for statistics: they kept what the maps show beside the voxels."""
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
-        if scene in result.up and record.statistics and record.statistics["fusion_rules"]:
+        if scene in result.up and record.statistics is not None and record.statistics.fusion_rules:
             yield Figure(
                 slug("uncertainty_map", scene, backbone),
                 f"Where the uncertainty comes from: {scene}, {backbone}",

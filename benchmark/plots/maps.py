@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, dominant, entropy, sbd
-from semstab.plots.histograms import MOST_DRIFT
-from semstab.plots.style import COLUMN, FAINT, INK, PAGE, canvas, mark_panel
+from semstab.measures import dominant, measures
+from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
+from semstab.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.plots.topdown import EMPTY, Float64, Int64, top_down
 from semstab.results import RECURRENT
 from semstab.statistics import decompose, psa
@@ -48,15 +48,15 @@ WIDE = 1.4
 
 
 def draw_stability(table: VoxelTable, up: Sequence[float]) -> Figure:
-    """Stability category, SBD and entropy of the topmost voxels, with a scale bar."""
+    """Stability category and every measure of the topmost voxels, with a scale bar."""
     rows, cell = top_down(table, up)
-    figure, (kind, drift, doubt) = _panels(rows, 3)
+    figure, (kind, *panels) = _panels(rows, 1 + len(measures()))
     _draw_categories(figure, kind, rows, categories(table))
-    most = math.log(2) / math.log(table.K)
-    _draw_measure(figure, drift, rows, sbd(table), MOST_DRIFT)
-    _draw_measure(figure, doubt, rows, np.where(table.op > 1, entropy(table), np.nan), most)
-    titles = ("stability", "SBD, bits (grey: seen once)", "normalised entropy")
-    for axes, letter, title in zip((kind, drift, doubt), "abc", titles, strict=True):
+    for axes, measure in zip(panels, measures(), strict=True):
+        values = np.where(table.op > 1, measure.of(table), np.nan)
+        _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
+    titles = ("stability", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in measures()))
+    for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         _frame(axes)
         _scale_bar(axes, rows.shape[1], cell)
@@ -73,7 +73,7 @@ def draw_uncertainty(table: VoxelTable, up: Sequence[float], wrong: npt.NDArray[
     parts, again = decompose(table), table.op > 1
     most = math.log(2) / math.log(table.K)
     for axes, values in zip(panels, (parts.within, parts.between), strict=False):
-        _draw_measure(figure, axes, rows, np.where(again, values, np.nan), most)
+        _draw_measure(figure, axes, rows, np.where(again, values, np.nan), (0.0, most))
     if wrong is not None:
         panels[2].imshow(_painted(rows, wrong, [shade for _, shade in RIGHT_COLORS]), interpolation_stage="rgba")
         entries = [(name, tuple(channel / 255 for channel in shade)) for name, shade in RIGHT_COLORS]
@@ -155,13 +155,18 @@ def draw_overview(table: VoxelTable, up: Sequence[float], overview: Overview) ->
 
 
 def _panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
-    """A figure for n maps: side by side, or for wide maps beneath each other in one column of the page."""
+    """A figure for n maps: up to three side by side, or for wide maps beneath each other in one column of the page."""
     height, width = rows.shape
     if width >= WIDE * height:
         figure = canvas(COLUMN, n * (max(0.3, COLUMN * height / width) + 0.5))
         return figure, figure.subplots(n, 1)
-    figure = canvas(PAGE, min(8.0, PAGE / n * height / width + 0.65))
-    return figure, figure.subplots(1, n)
+    columns = min(n, 3)
+    lines = math.ceil(n / columns)
+    figure = canvas(PAGE, min(8.0, lines * (PAGE / columns * height / width + 0.65)))
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes in panels[n:]:
+        axes.set_axis_off()
+    return figure, list(panels[:n])
 
 
 def _painted(rows: Int64, label: npt.NDArray[Any], colors: Colors) -> Image:
@@ -188,13 +193,16 @@ def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: npt.NDAr
     bar.ax.tick_params(length=0)
 
 
-def _draw_measure(figure: Figure, axes: Axes, rows: Int64, values: Float64, most: float) -> None:
-    """A measure in colour, from 0 to `most`, with its colour bar; undefined values are grey, empty cells blank."""
+def _draw_measure(
+    figure: Figure, axes: Axes, rows: Int64, values: Float64, ends: tuple[float, float], *, best_first: bool = True
+) -> None:
+    """A measure in colour between two ends, with its colour bar; undefined values are grey, empty cells blank."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    colors = ScalarMappable(Normalize(0, most), matplotlib.colormaps[COLORMAP].with_extremes(bad=UNDEFINED))
+    shades = matplotlib.colormaps[COLORMAP if best_first else f"{COLORMAP}_r"].with_extremes(bad=UNDEFINED)
+    colors = ScalarMappable(Normalize(*ends), shades)
     image = colors.to_rgba(np.ma.masked_invalid(values[rows]), bytes=True)
     image[rows == EMPTY, :3] = BLANK
     axes.imshow(image, interpolation_stage="rgba")

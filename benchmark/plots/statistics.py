@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.averages import ENOUGH, Level, Pooled, Sweep
-from semstab.metrics import sbd
+from semstab.averages import ENOUGH, Level, Pooled, Sweep, over_all
+from semstab.measures import VSS, sbd
 from semstab.plots.distributions import mark_op
 from semstab.plots.histograms import OP_BOUNDS, op_position
-from semstab.plots.style import COLUMN, FAINT, INK, PAGE, canvas, color, mark_panel
+from semstab.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, mark_panel
 from semstab.plots.sweeps import draw_line, mark_values
-from semstab.statistics import Estimate
+from semstab.statistics_model import Estimate, Reliability
 from semstab.voxels import VoxelTable
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ Float64 = npt.NDArray[np.float64]
 # --- Along a sweep ----------------------------------------------------------------------------------------------------
 
 _PANELS: tuple[tuple[str, Callable[[Pooled], float]], ...] = (
-    ("VSS, all voxels", lambda pooled: pooled.every.vss),
+    ("VSS, all voxels", over_all(VSS)),
     ("PSA", lambda pooled: pooled.psa),
     ("alpha", lambda pooled: pooled.alpha),
     ("SBD (bits)", lambda pooled: pooled.drift),
@@ -117,7 +117,7 @@ def _draw_drift(axes: Axes, found: DriftByOP, shade: str) -> None:
 # --- Calibration ------------------------------------------------------------------------------------------------------
 
 
-def draw_reliability(backbones: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+def draw_reliability(backbones: Mapping[str, Sequence[Reliability]]) -> Figure:
     """Accuracy against the largest belief, and how many voxels have it; the bins of several scenes are pooled."""
     figure = canvas(COLUMN, 3.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -137,13 +137,13 @@ def draw_reliability(backbones: Mapping[str, Sequence[Mapping[str, Any]]]) -> Fi
     return figure
 
 
-def _pooled_bins(bins: Sequence[Mapping[str, Any]]) -> tuple[Float64, Float64, Float64, Float64]:
+def _pooled_bins(bins: Sequence[Reliability]) -> tuple[Float64, Float64, Float64, Float64]:
     """Voxels, mean confidence and accuracy, and the middle of each bin that has voxels."""
     sums: dict[float, Float64] = {}
     for row in bins:
-        if row["voxels"]:
-            own = row["voxels"] * np.array([1.0, row["confidence"], row["accuracy"]])
-            middle = (row["low"] + row["high"]) / 2
+        if row.voxels:
+            own = row.voxels * np.array([1.0, row.confidence, row.accuracy])
+            middle = (row.low + row.high) / 2
             sums[middle] = sums.get(middle, np.zeros(3)) + own
     middles = np.array(sorted(sums))
     voxels, confidence, accuracy = np.array([sums[middle] for middle in middles]).reshape(-1, 3).T
@@ -161,9 +161,13 @@ def draw_intervals(panels: Mapping[str, Rows], marks: Mapping[str, Sequence[floa
     scenes = list(dict.fromkeys(scene for rows in panels.values() for scene in rows))
     names = list(dict.fromkeys(name for rows in panels.values() for found in rows.values() for name in found))
     height = max(1.5, 0.75 + len(scenes) * (0.12 + 0.16 * len(names)))
-    figure = canvas(PAGE if len(panels) > 2 else COLUMN, height)
-    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, letter, (title, rows) in zip(grid, "abcdefgh", panels.items(), strict=False):
+    columns = min(4, len(panels))
+    lines = math.ceil(len(panels) / columns)
+    figure = canvas(PAGE if columns > 2 else COLUMN, height * lines)
+    grid = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    for axes, letter, (title, rows) in zip(grid, LETTERS, panels.items(), strict=False):
         for value in marks.get(title, ()):
             axes.axvline(value, color=INK, linewidth=0.8, linestyle=":" if value else "-")
         for i, scene in enumerate(scenes):

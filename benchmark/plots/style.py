@@ -93,6 +93,10 @@ def color(k: int) -> str:
     return COLORS[k % len(COLORS)]
 
 
+LETTERS = "abcdefghijklmnop"
+"""Of panels, in order."""
+
+
 def mark_panel(axes: Axes, letter: str, title: str) -> None:
     """Head a panel as the paper does: '(a) title'."""
     axes.set_title(f"({letter}) {title}", loc="left")

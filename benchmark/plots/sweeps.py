@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from semstab.averages import ENOUGH, Level, Pooled, Sweep
-from semstab.plots.style import INK, PAGE, canvas, color, mark_panel
+from semstab.averages import ENOUGH, Level, Pooled, Sweep, over_all, over_recurrent
+from semstab.measures import measures
+from semstab.plots.style import INK, LETTERS, PAGE, canvas, color, mark_panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -15,29 +16,29 @@ if TYPE_CHECKING:
 
 
 def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
-    """VSS, SBD and the recurrent share along a sweep; the values stand at equal distances, in order."""
-    figure = canvas(PAGE, 2.5)
-    share, vss, sbd = figure.subplots(1, 3)
+    """The recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
+    shown = measures()
+    rows = math.ceil((1 + len(shown)) / 3)
+    figure = canvas(PAGE, 2.5 if rows == 1 else 2.1 * rows)
+    share, *panels = figure.subplots(rows, 3, squeeze=False).ravel()
     values = sorted({level.value for levels in backbones.values() for level in levels})
     for k, levels in enumerate(backbones.values()):
         x = [values.index(level.value) for level in levels]
         draw_line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), marker="s")
-        for axes, measure in ((vss, "vss"), (sbd, "sbd")):
-            draw_line(axes, x, levels, _of_group("every", measure), color(k))
-            enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
-            at = [values.index(level.value) for level in enough]
-            draw_line(axes, at, enough, _of_group("recurrent", measure), color(k), open_=True)
-    titles = ("recurrent share (%)", "VSS", "SBD (bits)")
-    for axes, letter, title in zip((share, vss, sbd), "abc", titles, strict=True):
+        enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
+        at = [values.index(level.value) for level in enough]
+        for axes, measure in zip(panels, shown, strict=False):
+            draw_line(axes, x, levels, over_all(measure), color(k))
+            draw_line(axes, at, enough, over_recurrent(measure), color(k), open_=True)
+    titles = ("recurrent share (%)", *(f"{m.title} ({m.unit})" if m.unit else m.title for m in shown))
+    for axes, letter, title in zip((share, *panels), LETTERS, titles, strict=False):
         mark_values(axes, sweep, values)
         mark_panel(axes, letter, title)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
     share.set_ylim(bottom=0)
     figure.legend(handles=_legend(list(backbones)), loc="outside lower center", ncols=len(backbones) + 2)
     return figure
-
-
-def _of_group(group: str, measure: str) -> Callable[[Pooled], float]:
-    return lambda pooled: float(getattr(getattr(pooled, group), measure))
 
 
 def mark_values(axes: Axes, sweep: Sweep, values: Sequence[float]) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.files.label_source import LABEL_SPACE_FILE
+from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.files import atomic_path, content_key, read_json, write_json, write_png
@@ -73,8 +74,8 @@ class PredictionFolder:
         return self._frames.get(name, {}).get("image") == image and self.file(name).is_file()
 
     def file(self, name: str) -> Path:
-        """Where a frame's map is."""
-        return self.path / f"{name}{self._suffix}"
+        """Where a frame's map is. Raises DataError for a name that leads out of the folder."""
+        return inside(self.path, self.path, f"{name}{self._suffix}", f"image {name[:80]!r}")
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
         """Keep a frame's map: ids (H, W), or scores (H, W, K)."""

@@ -6,8 +6,8 @@ camera, camera/color                    Transform3D and Pinhole; EncodedImage (J
 camera/BACKBONE/labels, .../drift       SegmentationImage: classes; drift that the frame caused at each pixel's voxel.
                                         Smaller ones have a Transform3D, which spreads them over the camera's image
 depth, trajectory                       DepthImage; LineStrips3D
-map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; components category:colors, vss:values,
-                                        sbd:values, entropy:values and op:values, which the views map to its own
+map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; components category:colors, op:values
+                                        and KEY:values of each measure, which the views map to its own
 series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
 flips/BACKBONE/voxel_N                  StateChange: the dominant class of the voxels that drifted most
 flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them; Points3D: where those voxels are
@@ -20,6 +20,6 @@ log                                     TextLog: each unit's final numbers
 from semstab.recording.observer import Recording
 from semstab.recording.series import SERIES
 from semstab.recording.target import Target
-from semstab.recording.voxel_maps import MEASURES
+from semstab.recording.voxel_maps import looks
 
-__all__ = ["MEASURES", "SERIES", "Recording", "Target"]
+__all__ = ["SERIES", "Recording", "Target", "looks"]

@@ -10,9 +10,9 @@ import numpy.typing as npt
 import rerun as rr
 
 from semstab.metrics import vss
+from semstab.metrics.matching import shared_rows
 from semstab.recording.layout import DIFFERENCE
 from semstab.recording.voxel_maps import thinned
-from semstab.statistics.matching import shared_rows
 from semstab.voxels import VoxelTable
 
 ONLY_FIRST, ONLY_SECOND = (230, 159, 0), (86, 180, 233)

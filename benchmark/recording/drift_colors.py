@@ -9,7 +9,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from semstab.labels import LabelSpace
-from semstab.recording.voxel_maps import SBD_MAX
+from semstab.measures import SBD_MAX
 
 NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
 LEVELS = 24

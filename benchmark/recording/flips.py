@@ -13,7 +13,7 @@ import rerun as rr
 
 from semstab.frames import Frame
 from semstab.labels import LabelSpace
-from semstab.metrics.voxelwise import mean_drift
+from semstab.measures import mean_drift
 from semstab.recording.entities import Clock, path
 from semstab.recording.series import LINE_COLORS
 from semstab.recording.tracker import Tracker

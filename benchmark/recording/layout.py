@@ -15,10 +15,11 @@ import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
 from semstab.engine.units import Plan
+from semstab.measures import ENTROPY, VSS
 from semstab.recording import drift_colors, legend
 from semstab.recording.entities import path
 from semstab.recording.series import SERIES, entity
-from semstab.recording.voxel_maps import TABS, TITLES, chunk, defaults, visualizer
+from semstab.recording.voxel_maps import chunk, defaults, looks, visualizer
 from semstab.results import RECURRENT, Unit
 from semstab.task import Task
 
@@ -47,8 +48,8 @@ BACKGROUND = (72, 72, 78)
 OVERVIEW = ("drift", "compensated_flicker", "map_vss", "map_recurrent")
 COMPARED = {
     "drift": "Drift (bits)",
-    "map_vss": "VSS",
-    "map_entropy": "Entropy",
+    "map_vss": VSS.title,
+    "map_entropy": ENTROPY.title,
     "map_recurrent": f"OP >= {RECURRENT}",
     "new_voxels": "New voxels",
     "fuse_ms": "Fusion (ms)",
@@ -131,7 +132,7 @@ def _overview(scene: str, tasks: list[Task], scenery: Scenery | None, chunks: in
     classes = tasks[0].mapping.target
     width, height = legend.size(classes)
     area = LEFT[0], LEFT[1] - TITLE - (height + TITLE)
-    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area, chunks) for name in TITLES))
+    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area, chunks) for name in looks()))
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
     classes_view = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
     left = rrb.Vertical(maps, classes_view, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
@@ -202,13 +203,13 @@ def _maps(
     name: str, tasks: list[Task], scenery: Scenery | None, area: tuple[float, float], chunks: int
 ) -> rrb.Container:
     columns, aspect = _arrangement(len(tasks), scenery, area)
-    colored = 0 if name == "class" else chunks
+    look, colored = looks()[name], 0 if name == "class" else chunks
     views = [
-        _map(f"{task.backbone}: {TITLES[name]}", task, drawn(task), scenery, aspect, name, colored) for task in tasks
+        _map(f"{task.backbone}: {look.title}", task, drawn(task), scenery, aspect, name, colored) for task in tasks
     ]
     if len(views) > MOST_BESIDE:
-        return rrb.Tabs(*views, name=TABS[name])
-    return rrb.Grid(*views, grid_columns=columns, name=TABS[name])
+        return rrb.Tabs(*views, name=look.tab)
+    return rrb.Grid(*views, grid_columns=columns, name=look.tab)
 
 
 def _arrangement(views: int, scenery: Scenery | None, area: tuple[float, float]) -> tuple[int, float]:

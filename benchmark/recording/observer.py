@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import logging
 import math
@@ -16,10 +17,13 @@ import numpy.typing as npt
 import rerun as rr
 
 from semstab.backends import FusionBackend, GrowingMap
-from semstab.engine.observer import Observer
+from semstab.config import Config
+from semstab.engine.observer import Factory, Observer
 from semstab.engine.series import FrameRow
-from semstab.engine.units import Plan, Planned
+from semstab.engine.units import Plan, Planned, PlannedUnit
+from semstab.errors import ConfigError
 from semstab.frames import Frame
+from semstab.measures import measures
 from semstab.metrics import compensated_flicker
 from semstab.recording import drift_colors, legend, series
 from semstab.recording.background import Background
@@ -34,10 +38,11 @@ from semstab.recording.difference import log_difference
 from semstab.recording.entities import Clock, path
 from semstab.recording.flips import FlipLog
 from semstab.recording.layout import Known, Scenery, blueprint, drawn, is_pointwise
+from semstab.recording.parts import Parts
 from semstab.recording.target import DEFAULT_URL, Target
 from semstab.recording.tracker import FrameDrift, Tracker
 from semstab.recording.voxel_maps import CHUNKS, MapLog, chunks_of
-from semstab.records import Result
+from semstab.records import Result, Variation
 from semstab.results import Unit, UnitSummary
 from semstab.task import Task
 from semstab.voxels import VoxelTable
@@ -65,6 +70,9 @@ class Recording(Observer):
     Call `close` where a run does not come to its end. Raises ConfigError where the file cannot be written.
     """
 
+    pictures_only = False
+    """Whether series, maps and layout are logged by another recording, of which this is a part."""
+
     def __init__(self, target: str | Path | Target, run: Path | None = None) -> None:
         self.target = target if isinstance(target, Target) else Target(Path(target))
         self._run = run
@@ -80,6 +88,7 @@ class Recording(Observer):
         self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
         self._group: _Group | None = None  # the backbone on a scene that is being fused
         self._background: Background | None = None
+        self._parts: Parts | None = None
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
         """Keep the plan: layout, names and colours follow from it."""
@@ -102,27 +111,32 @@ class Recording(Observer):
         if self._group is None or self._group.task is not task:
             growing = self._growing.pop((unit.scene, unit.backbone), None)
             self._group = _Group(task, self._plan.config.voxel_size, origin, growing)
-        values = series.values(row.cells())
-        series.log_row(stream, unit, task, values)
-        self._group.span(values)
+        if not self.pictures_only:
+            values = series.values(row.cells())
+            series.log_row(stream, unit, task, values)
+            self._group.span(values)
 
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """Log what the camera and the map show."""
         (stream, background), group, scene = self._opened(), self._fused, task.scene.name
         self._cameras[scene].log(stream, frame, background)
-        group.log(stream, frame, background)
-        if chunks_of(group.grown) > self._known.chunks[scene]:
+        group.log(stream, frame, background, maps=not self.pictures_only)
+        if not self.pictures_only and chunks_of(group.grown) > self._known.chunks[scene]:
             show = functools.partial(self._show_chunks, stream, scene, group.grown)
             background.submit(frame.index, frame.timestamp, show)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
-        """Log the unit's voxels and flips, while they are measured; the time is that of its last frame."""
+        """Log the unit's voxels, while they are measured; the time is that of its last frame."""
+        if self.pictures_only:
+            return
         (stream, background), group = self._opened(), self._fused
         tolerance = self._plan.config.tolerance
         background.submit(*group.last, functools.partial(group.log_map, stream, unit, table, tolerance))
 
     def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
         """Log the unit's final numbers."""
+        if self.pictures_only:
+            return
         (stream, background), group = self._opened(), self._fused
         background.drain()
         self._clock.set(stream, *group.last)
@@ -131,10 +145,11 @@ class Recording(Observer):
     def group_finished(self, task: Task) -> None:
         """Log what flipped, and lay out what there is now."""
         (stream, background), group = self._opened(), self._group
-        if group is None or not group.tables:
+        if group is None:
             return
-        (*_, table) = group.tables.values()
-        background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
+        if group.tables:
+            (*_, table) = group.tables.values()
+            background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
         background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
         background.drain()
 
@@ -144,12 +159,37 @@ class Recording(Observer):
         if self._stream is not None:
             self._log_kept(self._stream)
 
+    def elsewhere(self, folder: Path) -> Factory:
+        """Each job records what only its frames show; series, maps and layout follow from the folder when all is done.
+
+        Raises ConfigError where a viewer is to follow the run.
+        """
+        if self.target.live:
+            raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
+        self._parts = Parts.of(folder)
+        self.target = self._parts.of_the_whole(self.target)
+        return functools.partial(PictureRecording, self._parts)
+
     def run_finished(self, result: Result) -> None:
         """Finish the file; where the recording is served, `serve` or `close` does that."""
+        if self._parts is not None:
+            self._finish_parts(self._parts, result)
+            return
         if not self.target.file.exists():
             self._opened()
         if self.target.viewer != "serve":
             self.close()
+
+    def _finish_parts(self, parts: Parts, result: Result) -> None:
+        """Add to the pictures what the folder tells, and make one file of all."""
+        logged = {(task.scene.name, task.backbone) for task, _ in self._kept}
+        for place, task in self._tasks.items():
+            summaries = [run for run in result.runs if (run.unit.scene, run.unit.backbone) == place]
+            if place not in logged and summaries:
+                self._kept.append((task, summaries))
+        self._opened()
+        self.close()
+        self.target = parts.merged(self.target)
 
     def serve(self) -> None:
         """Wait for viewers until the user interrupts, where the recording is served; else return at once."""
@@ -185,6 +225,8 @@ class Recording(Observer):
         if self._stream is None or self._background is None:
             self._stream = stream = self.target.open()
             self._background = Background(stream, self._clock)
+            if self.pictures_only:
+                return stream, self._background
             _log_static(stream, self._plan)
             self._send_blueprint(stream)
             self._log_kept(stream)
@@ -236,7 +278,7 @@ class Recording(Observer):
                 unit = summary.unit
                 table = VoxelTable.load(self._run / "voxels" / f"{unit.slug}.parquet")
                 if group is None:
-                    at = table.centers.mean(axis=0)
+                    at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
                     group = _Group(task, table.voxel_size, self._origin(stream, task, at))
                 for values in series.send_rows(
                     stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
@@ -260,6 +302,25 @@ class Recording(Observer):
             where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", origin * voxel_size, strict=True))
             stream.log(path(scene, "log"), rr.TextLog(f"map coordinates are relative to {where} of the scene's world"))
         return origin
+
+
+class PictureRecording(Recording):
+    """What only the frames of one job show, in a file of its own: camera, labels, drift and flips."""
+
+    pictures_only = True
+
+    def __init__(self, parts: Parts) -> None:
+        super().__init__(parts.folder / "unknown.rrd")
+        self._parts_of = parts
+
+    def group_started(self, task: Task, config: Config) -> None:
+        """The job's backbone on a scene: it is all of this recording's plan."""
+        self.target = self._parts_of.of_group(task)
+        units = (
+            PlannedUnit(Variation(), config, dataclasses.replace(task, backends=(backend,)), "", False, True)
+            for backend in task.backends
+        )
+        self.run_started(Plan(config, {}, tuple(units), ()), [])
 
 
 class _Group:
@@ -295,12 +356,13 @@ class _Group:
             low, high = self.spans.get(name, (value, value))
             self.spans[name] = min(low, value), max(high, value)
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """All units of the group fused the frame: log what it shows and what it changed."""
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, maps: bool) -> None:
+        """All units of the group fused the frame: log what it shows and what it changed, and where wanted the map."""
         self._tracker.follow(frame)
         self.last = frame.index, frame.timestamp
         self._flips.update(self._tracker, frame)
-        grown = self._map(drawn(self.task)).update(stream, self._tracker.map) if is_pointwise(drawn(self.task)) else []
+        drawn_map = self._map(drawn(self.task)) if maps and is_pointwise(drawn(self.task)) else None
+        grown = drawn_map.update(stream, self._tracker.map) if drawn_map is not None else []
         drift, previous = self._tracker.drift_of(frame), self._previous
         self._previous = frame
 
@@ -396,7 +458,8 @@ def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
 
 def _final(summary: UnitSummary) -> str:
     unit, table = summary.unit, summary.table
+    means = (f"{m.symbol} {table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
     return (
-        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, VSS {table.vss:.3f},"
-        f" SBD {table.sbd:.4f} bits, H {table.entropy:.4f} (K = {table.K})"
+        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, {', '.join(means)}"
+        f" (K = {table.K})"
     )

@@ -11,6 +11,7 @@ import rerun as rr
 
 from semstab.engine.units import Plan
 from semstab.errors import DataError
+from semstab.measures import ENTROPY, VSS
 from semstab.recording.entities import Clock, path
 from semstab.results import RECURRENT, Unit
 from semstab.task import Task
@@ -19,8 +20,8 @@ SERIES = {
     "drift": "Mean drift of updates (bits)",
     "flicker_percent": "Flicker (%)",
     "compensated_flicker": "Flicker, motion-compensated (%)",
-    "map_vss": "Mean VSS so far (0 to 1)",
-    "map_entropy": "Mean entropy so far (0 to 1)",
+    "map_vss": f"Mean {VSS.word} so far (0 to {VSS.largest:g})",
+    "map_entropy": f"Mean {ENTROPY.word} so far (0 to {ENTROPY.largest:g})",
     "map_recurrent": f"Share OP >= {RECURRENT} so far (0 to 1)",
     "new_voxels": "New voxels",
     "updated_voxels": "Updated voxels",

@@ -36,6 +36,10 @@ class Target:
 
     file: Path
     viewer: str | None = None
+    name: str | None = None
+    """Of a recording of which the file is a part; it has none where it is whole."""
+    final: Path | None = None
+    """The whole recording, of which the file is a part."""
 
     @classmethod
     def parse(cls, text: str | None, default: Path) -> Target:
@@ -61,7 +65,7 @@ class Target:
 
     def open(self) -> rr.RecordingStream:
         """A stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
-        stream = rr.RecordingStream("semstab")
+        stream = rr.RecordingStream("semstab", recording_id=self.name)
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             # In place, not renamed when it is whole: a viewer can follow the run, and a killed run leaves a recording.
@@ -93,13 +97,18 @@ class Target:
         return rr.GrpcSink(url)
 
 
-def viewer_command() -> list[str]:
-    """What starts the viewer that came with the SDK, for this machine only. Raises ConfigError where it is missing."""
+def rerun_program() -> str:
+    """The program that came with the SDK. Raises ConfigError where it is missing."""
     beside = Path(sys.executable).with_name("rerun")
     found = str(beside) if beside.exists() else shutil.which("rerun")
     if found is None:
         raise ConfigError("the rerun viewer is not installed; pip install rerun-sdk, or record into a file")
-    return [found, "--bind", "127.0.0.1"]
+    return found
+
+
+def viewer_command() -> list[str]:
+    """What starts the viewer, for this machine only. Raises ConfigError where it is missing."""
+    return [rerun_program(), "--bind", "127.0.0.1"]
 
 
 def _spawn(url: str) -> None:

@@ -19,40 +19,58 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 
 from semstab.backends import GrowingMap
 from semstab.labels import LabelSpace
+from semstab.measures import ENTROPY, SBD, VSS, Measure, mean_drift, measures
 from semstab.metrics import CATEGORY_COLORS
 from semstab.metrics.category import categorise
-from semstab.metrics.voxelwise import mean_drift
 from semstab.recording.kernels import read_off
 from semstab.results import RECURRENT
 from semstab.voxels import VoxelTable
 
-# The largest SBD there is, 0.311 bits: a voxel's second frame sees a class that its first one did not see at all.
-SBD_MAX = 1.5 - 0.75 * math.log2(3)
-
 
 @dataclass(frozen=True)
-class Measure:
-    """How a number of each voxel is shown; ranges are fixed, so that a colour means the same in every recording."""
+class Look:
+    """What a map is coloured by; ranges are fixed, so that a colour means the same in every recording.
 
+    tab    its name where there is little room; `title` is that of its views
+    range  of the values that the colour map spans; None where voxels have a colour of their own
+    """
+
+    tab: str
     title: str
-    colormap: rr.components.Colormap
-    range: tuple[float, float]
+    colormap: rr.components.Colormap | None = None
+    range: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, measure: Measure) -> Look:
+        """Of a measure: 'SBD (0 to 0.31 bits; black: seen once)'."""
+        low, high = measure.range
+        ends = f"{low:.2g}{' and less' if low > 0 else ''} to {high:.2g}{' and more' if high < measure.largest else ''}"
+        once = "; black: seen once" if measure.lowest_op == 2 else ""
+        once = f"; black: OP < {measure.lowest_op}" if measure.lowest_op > 2 else once
+        title = f"{measure.title} ({f'{ends} {measure.unit}'.strip()}{once})"
+        colors = rr.components.Colormap
+        return cls(measure.title, title, colors.Viridis if measure.better == "higher" else colors.Plasma, measure.range)
 
 
-MEASURES = {
-    "vss": Measure("VSS (0.5 and less to 1)", rr.components.Colormap.Viridis, (0.5, 1.0)),
-    "sbd": Measure(f"SBD (0 to {SBD_MAX:.2f} bits; black: seen once)", rr.components.Colormap.Plasma, (0.0, SBD_MAX)),
-    "entropy": Measure("Entropy (0 to 0.5 and more)", rr.components.Colormap.Plasma, (0.0, 0.5)),
-    "op": Measure("OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
-}
-TITLES = {
-    "class": "dominant class",
-    **{name: measure.title for name, measure in MEASURES.items()},
-    "category": f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})",
-}
-"""What the maps are coloured by, and what their views are called."""
+def looks() -> dict[str, Look]:
+    """What the maps can be coloured by."""
+    category = f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})"
+    return {
+        "class": Look("Class", "dominant class"),
+        **{measure.key: Look.of(measure) for measure in measures()},
+        "op": Look("OP", "OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
+        "category": Look("Category", category),
+    }
 
-TABS = {"class": "Class", "vss": "VSS", "sbd": "SBD", "entropy": "Entropy", "op": "OP", "category": "Category"}
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What the measures of n voxels are computed from, as `VoxelTable` has it."""
+
+    op: npt.NDArray[np.int32]
+    evidence: npt.NDArray[np.float64]
+    drift_sum: npt.NDArray[np.float64]
+
 
 MAX_VOXELS = 2_000_000
 """Drawn of one map; at its end a larger one is thinned."""
@@ -97,7 +115,7 @@ class Drawn:
     index   (n, 3) int32 relative to the map's origin: small, so that the viewer's float32 keeps them exact
     size    edge of a voxel, metres
     colors  (n,) uint32 by dominant class and by category, 'class' and 'category'
-    values  (n,) float32 of each of MEASURES
+    values  (n,) float32 of each measure and of OP
     """
 
     index: npt.NDArray[np.int32]
@@ -120,7 +138,10 @@ class Drawn:
         label, vss, bits = np.empty(n, dtype=np.uint16), np.empty(n), np.empty(n)
         read_off(evidence, label, vss, bits)
         sbd = mean_drift(drift_sum, op)
-        values: dict[str, npt.NDArray[Any]] = {"vss": vss, "sbd": sbd, "entropy": bits / math.log2(K), "op": op}
+        read = {VSS: vss, SBD: sbd, ENTROPY: bits / math.log2(K)}  # in one pass over the evidence
+        voxels = Columns(op, evidence, drift_sum)
+        values: dict[str, npt.NDArray[Any]] = {m.key: read[m] if m in read else m.of(voxels) for m in measures()}
+        values["op"] = op
         colors = {
             "class": packed(classes.colors)[label],
             "category": packed(CATEGORY_COLORS)[categorise(op, sbd, bits)],
@@ -162,10 +183,8 @@ def visualizer(name: str) -> rr.blueprint.Visualizer:
 
 def defaults(name: str) -> list[rr.VoxelGridMap]:
     """How a view colours the values of a measure."""
-    if name not in MEASURES:
-        return []
-    measure = MEASURES[name]
-    return [rr.VoxelGridMap.from_fields(colormap=measure.colormap, value_range=measure.range)]
+    look = looks()[name]
+    return [] if look.range is None else [rr.VoxelGridMap.from_fields(colormap=look.colormap, value_range=look.range)]
 
 
 def thinned(index: npt.NDArray[np.int64]) -> tuple[int, npt.NDArray[np.int64]]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.averages import ENOUGH, Pooled, by_backbone, pooled
 from semstab.findings import Finding
+from semstab.measures import VSS
 from semstab.metrics import macro_mean
 from semstab.records import Record, Result
 from semstab.tables.stability import comparable
@@ -35,7 +36,7 @@ def _once(voxels: Pooled) -> Iterator[str]:
     if not math.isnan(voxels.once):
         yield (
             f"{voxels.once:.0%} of the voxels were seen once. They look stable because no second look could contradict"
-            " them: read VSS, SBD and entropy where voxels recur (OP>=3)."
+            " them: read every measure where voxels recur (OP>=3)."
         )
 
 
@@ -43,8 +44,8 @@ def _recurrent(backbone: str, voxels: Pooled) -> Iterator[str]:
     if voxels.recurrent.voxels >= ENOUGH:
         yield (
             f"Where {backbone} had three looks or more ({voxels.recurrent.share:.0%} of its voxels),"
-            f" {1 - voxels.recurrent.vss:.1%} of the evidence goes against the voxel's own class; over all voxels it"
-            f" seems to be {1 - voxels.every.vss:.1%}."
+            f" {1 - voxels.recurrent[VSS]:.1%} of the evidence goes against the voxel's own class; over all voxels it"
+            f" seems to be {1 - voxels.every[VSS]:.1%}."
         )
     else:
         yield f"{backbone} has {voxels.recurrent.voxels:,} voxels with three looks or more: too few to judge it by."
@@ -52,13 +53,13 @@ def _recurrent(backbone: str, voxels: Pooled) -> Iterator[str]:
 
 def _verdict(records: Sequence[Record]) -> Iterator[str]:
     """The verdict on a backbone; of several scenes, in how many each level was reached."""
-    judged = [record for record in records if record.statistics]
+    judged = [record.statistics.verdict for record in records if record.statistics is not None]
     if len(judged) == 1:
-        yield f"{judged[0].statistics['verdict']['line']}."
+        yield f"{judged[0].line}."
     elif judged:
-        levels = Counter(record.statistics["verdict"]["level"] for record in judged)
+        levels = Counter(verdict.level for verdict in judged)
         parts = (f"{level} in {n} scene{'' if n == 1 else 's'}" for level, n in levels.items())
-        yield f"Verdict on {judged[0].unit.backbone}: {', '.join(parts)}."
+        yield f"Verdict on {records[0].unit.backbone}: {', '.join(parts)}."
 
 
 def _ranking(result: Result) -> Iterator[str]:
@@ -67,8 +68,8 @@ def _ranking(result: Result) -> Iterator[str]:
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
     if not means or any(voxels.recurrent.voxels < ENOUGH for voxels in means.values()):
         return
-    every = _order({name: voxels.every.vss for name, voxels in means.items()})
-    recurrent = _order({name: voxels.recurrent.vss for name, voxels in means.items()})
+    every = _order({name: voxels.every[VSS] for name, voxels in means.items()})
+    recurrent = _order({name: voxels.recurrent[VSS] for name, voxels in means.items()})
     taxonomy = records[0].summary.taxonomy
     if every == recurrent:
         yield f"In one taxonomy ({taxonomy}) the order by VSS is {every}, over all voxels and for OP>=3 alike."
@@ -100,10 +101,10 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
         tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
         if len(tables) < 2:
             continue
-        steadiest = max(tables, key=lambda name: tables[name].vss)
+        steadiest = max(tables, key=lambda name: tables[name][VSS])
         if steadiest == min(tables, key=lambda name: tables[name].mean_op):
             yield (
-                f"{backbone} looks steadiest in {steadiest} (VSS {tables[steadiest].vss:.3f}), which is also the scene"
+                f"{backbone} looks steadiest in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
                 f" seen least: {tables[steadiest].mean_op:.2f} frames a voxel."
             )
 

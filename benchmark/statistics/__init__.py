@@ -4,16 +4,13 @@ Pure functions of a VoxelTable and its Events. `describe` says everything about 
 several; docs/metrics.md derives each measure.
 """
 
-from semstab.statistics.agreement import ClassAgreement, class_agreement, fleiss_kappa, krippendorff_alpha, psa
+from semstab.comparison_model import BackboneComparison
+from semstab.statistics.agreement import class_agreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.backbones import compare_backbones
-from semstab.statistics.blocks import BlockBootstrap, Blocks, Estimate, spatial_blocks
-from semstab.statistics.ceiling import Losses, ceiling, losses, rendered
+from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
+from semstab.statistics.ceiling import ceiling, losses, rendered
 from semstab.statistics.comparison import coverage, paired, sign_flip_test, standardised
-from semstab.statistics.content import estimate_at, nulls, number_at
 from semstab.statistics.correctness import (
-    Correctness,
-    Quadrants,
-    Reliability,
     Truth,
     correctness,
     join_truth,
@@ -34,11 +31,22 @@ from semstab.statistics.drift import (
 )
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.uncertainty import Uncertainty, decompose
-from semstab.statistics.verdict import Verdict, verdict
+from semstab.statistics.verdict import verdict
+from semstab.statistics_model import (
+    ClassAgreement,
+    Correctness,
+    Estimate,
+    Losses,
+    MapStatistics,
+    Quadrants,
+    Reliability,
+    StabilityVerdict,
+)
 
 __all__ = [
     "RULES",
     "Analysis",
+    "BackboneComparison",
     "BlockBootstrap",
     "Blocks",
     "ClassAgreement",
@@ -47,12 +55,13 @@ __all__ = [
     "Flips",
     "Fused",
     "Losses",
+    "MapStatistics",
     "Quadrants",
     "Reliability",
     "SceneDrift",
+    "StabilityVerdict",
     "Truth",
     "Uncertainty",
-    "Verdict",
     "VoxelDrift",
     "analyse",
     "benjamini_hochberg",
@@ -63,7 +72,6 @@ __all__ = [
     "coverage",
     "decompose",
     "describe",
-    "estimate_at",
     "expected_sbd",
     "fleiss_kappa",
     "flips",
@@ -71,8 +79,6 @@ __all__ = [
     "join_truth",
     "krippendorff_alpha",
     "losses",
-    "nulls",
-    "number_at",
     "paired",
     "psa",
     "quadrants",

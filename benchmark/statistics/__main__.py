@@ -12,6 +12,7 @@ from semstab.config import read_yaml
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import SemstabError
 from semstab.files import read_json, write_json
+from semstab.json_form import to_json
 from semstab.metrics.summary import STRATA
 from semstab.results import Unit
 from semstab.statistics.backbones import compare_backbones
@@ -54,15 +55,15 @@ def _statistics(run: Path, maps: Path | None, seed: int) -> dict[str, Any]:
             found = analyse(
                 tables[name], events.get(name), reference, limit=reference, name=name, seed=seed, edges=edges
             )
-            content["maps"].append({"scene": scene, "backbone": name, "backend": backend} | found.summary)
+            content["maps"].append({"scene": scene, "backbone": name, "backend": backend, **to_json(found.summary)})
             _say(f"{scene}, {name}, {backend}", lines(found.summary))
             if maps is not None:
                 tables[name].save(maps / f"{unit.slug}.parquet", found.maps)
         backbones = {name: table for name, table in tables.items() if name != GROUND_TRUTH}
         if len(backbones) > 1:
             logged = events if set(backbones) <= set(events) else None
-            compared = compare_backbones(backbones, logged, truth, seed=seed)
-            content["comparisons"].append({"scene": scene, "backend": backend} | compared)
+            compared = compare_backbones(backbones, logged, truth, scene=scene, seed=seed)
+            content["comparisons"].append({"backend": backend, **to_json(compared)})
             _say(f"{scene}, {backend}: {', '.join(backbones)}", comparison_lines(compared))
     return content
 

@@ -6,14 +6,18 @@ probability that a class drawn from s_t equals one drawn from s_u.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
+from semstab.measures import Quantity
+from semstab.statistics_model import ClassAgreement
 from semstab.voxels import Events, VoxelTable
 
 Float64 = npt.NDArray[np.float64]
+
+PSA = Quantity(key="psa", title="PSA", better="higher")
+KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
+ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(2, 4))
 
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""
@@ -94,19 +98,6 @@ def alpha_of(sums: Float64) -> Float64:
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 3:] ** 2).sum(axis=-1) - sums[..., 2]) / (n * (n - 1))
     return _beyond_chance(ratio_of(sums[..., :2]), expected)
-
-
-@dataclass(frozen=True)
-class ClassAgreement:
-    """Agreement on one class against all others, over the voxels with OP >= 2; NaN where undefined.
-
-    observations is the evidence for the class in these voxels, in frames.
-    """
-
-    name: str
-    observations: float
-    kappa: float
-    alpha: float
 
 
 def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[ClassAgreement, ...]:

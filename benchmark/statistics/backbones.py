@@ -1,30 +1,29 @@
-"""Several backbones' maps of one scene beside each other, as content for JSON."""
+"""Several backbones' maps of one scene beside each other."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.comparison_model import BackboneComparison, RuleComparison, Standardised
 from semstab.errors import ConfigError
+from semstab.measures import Measure, Quantity, measures
+from semstab.metrics.matching import require_same_map
 from semstab.statistics import fusion_rules
 from semstab.statistics.comparison import (
     EDGES,
-    LOWER_IS_BETTER,
-    MEASURES,
     Tables,
     coverage,
     paired,
     repeated_rows,
     standard_weights,
     standardised,
+    voxelwise,
 )
-from semstab.statistics.content import mean, plain
-from semstab.statistics.correctness import Truth, correctness, join_truth
-from semstab.statistics.matching import require_same_map
+from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
+from semstab.statistics_model import RuleMeans
 from semstab.voxels import Events, VoxelTable
 
 SCHEMA = 1
@@ -35,10 +34,11 @@ def compare_backbones(
     events: Mapping[str, Events] | None = None,
     truth: VoxelTable | None = None,
     *,
+    scene: str = "",
     seed: int = 0,
     block_size: float | None = None,
-) -> dict[str, Any]:
-    """Compare several backbones' maps of one scene, as content for JSON; at least two.
+) -> BackboneComparison:
+    """Compare several backbones' maps of one scene; at least two.
 
     coverage      what each map holds
     standardised  means at a common distribution of OP, each map with all its voxels
@@ -49,43 +49,53 @@ def compare_backbones(
     if len(tables) < 2:
         raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
     weights = standard_weights(tables)
-    everywhere = {measure: standardised(tables, measure, seed=seed, weights=weights) for measure in MEASURES}
-    content: dict[str, Any] = {
-        "schema": SCHEMA,
-        "seed": seed,
-        "backbones": list(tables),
-        "coverage": coverage(tables),
-        "standardised": {"edges": list(EDGES), "weights": weights.tolist(), "values": everywhere},
-        "paired": paired(tables, truth, seed=seed, block_size=block_size),
-        "fusion_rules": None if events is None else _ranking_by_rule(tables, events, truth),
-    }
-    return {key: plain(value) for key, value in content.items()}
+    everywhere = {m.key: standardised(tables, m, seed=seed, weights=weights) for m in voxelwise()}
+    return BackboneComparison(
+        scene=scene,
+        schema=SCHEMA,
+        seed=seed,
+        backbones=tuple(tables),
+        coverage=coverage(tables),
+        standardised=Standardised(EDGES, tuple(weights.tolist()), everywhere),
+        paired=paired(tables, truth, seed=seed, block_size=block_size),
+        fusion_rules=None if events is None else _by_rule(tables, events, truth),
+    )
 
 
-def _ranking_by_rule(tables: Tables, events: Mapping[str, Events], truth: VoxelTable | None) -> dict[str, Any]:
+def _by_rule(tables: Tables, events: Mapping[str, Events], truth: VoxelTable | None) -> RuleComparison:
     """Each rule's means on the common voxels with OP >= 2, and the order of the backbones that follows, best first."""
     rows = repeated_rows(tables)
-    values: dict[str, dict[str, dict[str, float]]] = {rule: {} for rule in fusion_rules.RULES}
+    values: dict[str, dict[str, RuleMeans]] = {rule: {} for rule in fusion_rules.RULES}
     for (name, table), own in zip(tables.items(), rows, strict=True):
         require_same_map(table, events[name])
         known = None if truth is None else join_truth(table, truth)
+        where = np.zeros(len(table), dtype=np.bool_)
+        where[own] = True
         for rule in fusion_rules.RULES:
-            values[rule][name] = _values(fusion_rules.fuse(events[name], rule), own, known)
-    measures = next(iter(values[fusion_rules.RULES[0]].values()))
-    orders = {measure: {rule: _order(found, measure) for rule, found in values.items()} for measure in measures}
-    changes = {measure: len(set(map(tuple, by_rule.values()))) > 1 for measure, by_rule in orders.items()}
-    return {"voxels": len(rows[0]), "values": values, "orders": orders, "order_changes": changes}
+            values[rule][name] = rule_means(fusion_rules.fuse(events[name], rule), where, known)
+    orders = {
+        quantity.key: {rule: _order(quantity, take, found) for rule, found in values.items()}
+        for quantity, take in _judged_by(truth is not None).items()
+    }
+    changes = {key: len(set(by_rule.values())) > 1 for key, by_rule in orders.items()}
+    return RuleComparison(len(rows[0]), values, orders, changes)
 
 
-def _values(fused: fusion_rules.Fused, rows: npt.NDArray[np.int64], truth: Truth | None) -> dict[str, float]:
-    values = {"vss": mean(fused.vss[rows]), "sbd": mean(fused.sbd[rows]), "entropy": mean(fused.entropy[rows])}
-    if truth is not None:
-        known = rows[truth.known[rows]]
-        right = correctness(fused.belief[known], truth.label[known])
-        values |= {"accuracy": right.accuracy, "miou": right.miou, "ece": right.ece}
-    return values
+def _judged_by(truth: bool) -> dict[Quantity, Callable[[RuleMeans], float]]:
+    """What puts backbones into an order."""
+    measured: dict[Quantity, Callable[[RuleMeans], float]] = {measure: _mean_of(measure) for measure in measures()}
+    right: dict[Quantity, Callable[[RuleMeans], float]] = {
+        ACCURACY: lambda row: row.accuracy,
+        MIOU: lambda row: row.miou,
+        ECE: lambda row: row.ece,
+    }
+    return measured | (right if truth else {})
 
 
-def _order(values: Mapping[str, Mapping[str, float]], measure: str) -> list[str]:
-    sign = 1 if measure in (*LOWER_IS_BETTER, "ece") else -1
-    return sorted(values, key=lambda name: (math.isnan(values[name][measure]), sign * values[name][measure]))
+def _mean_of(measure: Measure) -> Callable[[RuleMeans], float]:
+    return lambda row: row[measure]
+
+
+def _order(quantity: Quantity, take: Callable[[RuleMeans], float], found: Mapping[str, RuleMeans]) -> tuple[str, ...]:
+    values = {name: take(row) for name, row in found.items()}
+    return tuple(sorted(values, key=lambda name: (math.isnan(values[name]), quantity.sign * values[name])))

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.statistics.matching import voxel_keys
+from semstab.metrics.matching import voxel_keys
+from semstab.statistics_model import Estimate
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -20,18 +21,6 @@ LEAST_BLOCKS = 32
 LEVEL = 0.95
 REPLICATES = 2000
 ROUNDING = 1e-9
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value with its 95 % confidence interval; NaN where undefined."""
-
-    value: float
-    low: float
-    high: float
-
-
-UNDEFINED = Estimate(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, eq=False)

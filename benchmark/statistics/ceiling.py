@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +18,10 @@ from semstab.errors import DataError
 from semstab.frames import Frame
 from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.metrics import dominant
+from semstab.metrics.matching import shared_rows, voxel_keys
 from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import BlockBootstrap, Estimate, spatial_blocks
-from semstab.statistics.matching import shared_rows, voxel_keys
+from semstab.statistics.blocks import BlockBootstrap, spatial_blocks
+from semstab.statistics_model import Estimate, Losses
 from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
@@ -63,21 +63,6 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
         seen = np.full(view.shape, labels.ignore, dtype=labels.dtype)
         seen[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
         yield dataclasses.replace(frame, labels=seen, scores=None)
-
-
-@dataclass(frozen=True)
-class Losses:
-    """The pairwise disagreement 1 - PSA over voxels with OP >= 2 in both maps, and whose it is.
-
-    share is geometry's part of the total. Negative parts of the model mean that its labels agree better than the
-    view-independent ones: it errs alike in all views.
-    """
-
-    voxels: int
-    total: Estimate
-    geometry: Estimate
-    model: Estimate
-    share: Estimate
 
 
 def losses(table: VoxelTable, limit: VoxelTable, *, seed: int = 0) -> Losses:

@@ -5,34 +5,29 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.comparison_model import MapCoverage, Paired, PairedDifference, Rank, Ranking
 from semstab.errors import ConfigError
-from semstab.metrics import dominant, entropy, sbd, vss
+from semstab.measures import Quantity, dominant, measures
+from semstab.metrics.matching import require_same_grid, shared_rows
 from semstab.results import RECURRENT
-from semstab.statistics.agreement import alpha_columns, alpha_of, psa, ratio_of
+from semstab.statistics.agreement import ALPHA, PSA, alpha_columns, alpha_of, psa, ratio_of
 from semstab.statistics.blocks import (
     LEAST_BLOCKS,
     REPLICATES,
     BlockBootstrap,
-    Estimate,
     Statistic,
     spatial_blocks,
 )
-from semstab.statistics.correctness import join_truth
-from semstab.statistics.matching import require_same_grid, shared_rows
+from semstab.statistics.correctness import ACCURACY, join_truth
+from semstab.statistics_model import Estimate
 from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Tables = Mapping[str, VoxelTable]
-
-MEASURES: Mapping[str, Callable[[VoxelTable], Float64]] = {"psa": psa, "vss": vss, "sbd": sbd, "entropy": entropy}
-"""Measures with one value a voxel. Higher is better for psa, vss and alpha, lower for sbd and entropy."""
-
-LOWER_IS_BETTER = ("sbd", "entropy")
 
 EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
 """Upper edges of the strata of OP that comparisons are standardised by; OP = 1 is left out."""
@@ -40,21 +35,7 @@ EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
 FLIPS = 9999
 
 
-@dataclass(frozen=True)
-class Coverage:
-    """What a backbone's map covers. `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
-
-    backbone: str
-    voxels: int
-    observations: int
-    mean_op: float
-    repeated: int
-    recurrent: int
-    common_share: float
-    alone: int
-
-
-def coverage(tables: Tables) -> tuple[Coverage, ...]:
+def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
     """Coverage of each backbone's map; common_share is the part of its voxels that all maps hold."""
     common = len(shared_rows(*tables.values())[0])
     rows = []
@@ -64,7 +45,7 @@ def coverage(tables: Tables) -> tuple[Coverage, ...]:
             elsewhere[shared_rows(table, other)[0]] = True
         n, observations = len(table), int(table.op.sum(dtype=np.int64))
         rows.append(
-            Coverage(
+            MapCoverage(
                 backbone=name,
                 voxels=n,
                 observations=observations,
@@ -76,6 +57,17 @@ def coverage(tables: Tables) -> tuple[Coverage, ...]:
             )
         )
     return tuple(rows)
+
+
+def voxelwise() -> dict[Quantity, Callable[[VoxelTable], Float64]]:
+    """What is compared and has one value a voxel (n,), NaN where undefined."""
+    return {PSA: psa, **{measure: measure.of for measure in measures()}}
+
+
+def compared(*, truth: bool) -> tuple[Quantity, ...]:
+    """All that is compared, in the order of the tables; what needs ground truth only where there is some."""
+    quantities = (PSA, ALPHA, *measures(), ACCURACY)
+    return tuple(quantity for quantity in quantities if truth or quantity.needs != "truth")
 
 
 # --- At the same number of observations -------------------------------------------------------------------------------
@@ -93,7 +85,7 @@ def standard_weights(tables: Tables, edges: Sequence[int] = EDGES) -> Float64:
 
 
 def standardised(
-    tables: Tables, measure: str, *, edges: Sequence[int] = EDGES, seed: int = 0, weights: Float64 | None = None
+    tables: Tables, measure: Quantity, *, edges: Sequence[int] = EDGES, seed: int = 0, weights: Float64 | None = None
 ) -> dict[str, Estimate]:
     """A measure's mean in each map, as it would be if all had the common distribution of OP (direct standardisation).
 
@@ -115,8 +107,9 @@ def standardised(
     for name, table in tables.items():
         columns = np.zeros((len(table), 2 * S))
         stratum = _stratum(table, edges)
-        again = np.flatnonzero(stratum)
-        columns[again, stratum[again] - 1] = MEASURES[measure](table)[again]
+        values = voxelwise()[measure](table)
+        again = np.flatnonzero((stratum > 0) & ~np.isnan(values))
+        columns[again, stratum[again] - 1] = values[again]
         columns[again, S + stratum[again] - 1] = 1.0
         bootstrap = BlockBootstrap(spatial_blocks(table.index, table.voxel_size), seed=seed)
         estimates[name] = bootstrap.estimate(columns, weighted, (0.0, 1.0))
@@ -131,60 +124,6 @@ def _stratum(table: VoxelTable, edges: Sequence[int]) -> npt.NDArray[np.int64]:
 
 
 # --- On the same places -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A measure of backbone a minus that of b on the voxels that all saw twice or more.
-
-    p_value  of the paired sign-flip test over blocks, for measures with one value a voxel; p_holm corrects it for the
-             number of pairs (Holm 1979)
-    """
-
-    measure: str
-    a: str
-    b: str
-    difference: Estimate
-    p_value: float
-    p_holm: float
-
-
-@dataclass(frozen=True)
-class Rank:
-    """A backbone's place, 1 being the best, with the range that holds 95 % of the resamples.
-
-    best is the share of the resamples in which it is first.
-    """
-
-    backbone: str
-    value: float
-    rank: int
-    low: int
-    high: int
-    best: float
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """The backbones by one measure on common voxels, the best first."""
-
-    measure: str
-    ranks: tuple[Rank, ...]
-
-
-@dataclass(frozen=True)
-class Paired:
-    """Backbones on the voxels that every one of them observed at least twice.
-
-    values  the measures by name ('psa', 'vss', 'sbd', 'entropy', 'alpha', 'accuracy') and backbone
-    """
-
-    voxels: int
-    blocks: int
-    block_size: float
-    values: Mapping[str, Mapping[str, Estimate]]
-    differences: tuple[Difference, ...]
-    rankings: tuple[Ranking, ...]
 
 
 def repeated_rows(tables: Tables) -> list[npt.NDArray[np.int64]]:
@@ -217,8 +156,8 @@ def paired(
     values, differences, rankings = {}, [], []
     for measure, statistic in statistics.items():
         sums = columns[measure]
-        bounds = (-1.0, 1.0) if measure == "alpha" else (0.0, 1.0)
-        values[measure] = {name: bootstrap.estimate(sums[name], statistic, bounds) for name in tables}
+        bounds = (-1.0, 1.0) if measure is ALPHA else (0.0, 1.0)
+        values[measure.key] = {name: bootstrap.estimate(sums[name], statistic, bounds) for name in tables}
         differences += _differences(measure, statistic, sums, bootstrap, seed, flips)
         rankings.append(_ranking(measure, statistic, sums, bootstrap))
     return Paired(len(rows[0]), blocks.count, blocks.size, values, tuple(differences), tuple(rankings))
@@ -226,41 +165,45 @@ def paired(
 
 def _columns(
     tables: Tables, rows: Sequence[npt.NDArray[np.int64]], truth: VoxelTable | None
-) -> tuple[dict[str, dict[str, Float64]], dict[str, Statistic]]:
+) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
     """By measure: each backbone's columns on the common voxels, and what makes the measure of their sums."""
-    statistics: dict[str, Statistic] = {**dict.fromkeys(MEASURES, ratio_of), "alpha": alpha_of}
-    if truth is not None:
-        statistics["accuracy"] = ratio_of
-    columns: dict[str, dict[str, Float64]] = {measure: {} for measure in statistics}
+    quantities = compared(truth=truth is not None)
+    statistics: dict[Quantity, Statistic] = {q: alpha_of if q is ALPHA else ratio_of for q in quantities}
+    columns: dict[Quantity, dict[str, Float64]] = {measure: {} for measure in statistics}
+    for measure, values in voxelwise().items():
+        own = [values(table)[r] for table, r in zip(tables.values(), rows, strict=True)]
+        known = ~np.isnan(own).any(axis=0)
+        columns[measure] = {
+            name: np.stack([np.where(known, value, 0.0), known], axis=1)
+            for name, value in zip(tables, own, strict=True)
+        }
     for (name, table), r in zip(tables.items(), rows, strict=True):
-        for measure, values in MEASURES.items():
-            columns[measure][name] = np.stack([values(table)[r], np.ones(len(r))], axis=1)
-        columns["alpha"][name] = alpha_columns(table)[r]
+        columns[ALPHA][name] = alpha_columns(table)[r]
         if truth is not None:
             true = join_truth(table, truth)
             right = np.stack([true.known & (dominant(table) == true.label), true.known], axis=1)
-            columns["accuracy"][name] = right[r].astype(np.float64)
+            columns[ACCURACY][name] = right[r].astype(np.float64)
     return columns, statistics
 
 
 def _differences(
-    measure: str,
+    measure: Quantity,
     statistic: Statistic,
     columns: Mapping[str, Float64],
     bootstrap: BlockBootstrap,
     seed: int,
     flips: int,
-) -> list[Difference]:
+) -> list[PairedDifference]:
     found = []
     for a, b in itertools.combinations(columns, 2):
         both = np.concatenate([columns[a], columns[b]], axis=1)
         estimate = bootstrap.estimate(both, _difference_of(statistic, columns[a].shape[1]))
         p = math.nan
-        if measure != "alpha":
+        if measure is not ALPHA:
             p = sign_flip_test(bootstrap.blocks.sums(columns[a][:, :1] - columns[b][:, :1])[:, 0], seed, flips)
         found.append((a, b, estimate, p))
     corrected = holm([p for *_, p in found])
-    return [Difference(measure, *row, p_holm) for row, p_holm in zip(found, corrected, strict=True)]
+    return [PairedDifference(measure.key, *row, p_holm) for row, p_holm in zip(found, corrected, strict=True)]
 
 
 def _difference_of(statistic: Statistic, C: int) -> Statistic:
@@ -300,17 +243,18 @@ def holm(p: Sequence[float]) -> list[float]:
     return corrected
 
 
-def _ranking(measure: str, statistic: Statistic, columns: Mapping[str, Float64], bootstrap: BlockBootstrap) -> Ranking:
-    sign = 1.0 if measure in LOWER_IS_BETTER else -1.0
+def _ranking(
+    measure: Quantity, statistic: Statistic, columns: Mapping[str, Float64], bootstrap: BlockBootstrap
+) -> Ranking:
     values = {name: float(statistic(own.sum(axis=0))) for name, own in columns.items()}
-    resampled = np.stack([sign * bootstrap.replicates(own, statistic) for own in columns.values()])
+    resampled = np.stack([measure.sign * bootstrap.replicates(own, statistic) for own in columns.values()])
     ranks = 1 + (resampled[None] < resampled[:, None]).sum(axis=1)
     ranks = ranks[:, ~np.isnan(resampled).any(axis=0)]
-    order = sorted(values, key=lambda name: (math.isnan(values[name]), sign * values[name]))
+    order = sorted(values, key=lambda name: (math.isnan(values[name]), measure.sign * values[name]))
     rows = []
     for place, name in enumerate(order, start=1):
         own = ranks[list(columns).index(name)]
         low, high = np.quantile(own, [0.025, 0.975], method="inverted_cdf") if own.size else (1, len(columns))
         best = float(np.mean(own == 1)) if own.size else math.nan
         rows.append(Rank(name, values[name], place, int(low), int(high), best))
-    return Ranking(measure, tuple(rows))
+    return Ranking(measure.key, tuple(rows))

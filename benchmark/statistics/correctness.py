@@ -10,15 +10,23 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.information import normalise
-from semstab.metrics import dominant, strata
+from semstab.measures import MeasureMeans, Quantity, dominant, measures
+from semstab.metrics import strata
+from semstab.metrics.matching import shared_rows
 from semstab.results import RECURRENT
 from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import UNDEFINED, BlockBootstrap, Estimate
-from semstab.statistics.matching import shared_rows
+from semstab.statistics.blocks import BlockBootstrap
+from semstab.statistics.fusion_rules import Fused
+from semstab.statistics_model import UNDEFINED, Correctness, Estimate, Quadrants, Reliability, RuleMeans
 from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+
+ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
+MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
+ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
+BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
 
 STABLE = 0.8
 """A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
@@ -54,34 +62,6 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
     return Truth(label >= 0, label)
 
 
-@dataclass(frozen=True)
-class Reliability:
-    """One bin of the reliability diagram: voxels whose largest belief lies in (low, high]."""
-
-    low: float
-    high: float
-    voxels: int
-    confidence: float
-    accuracy: float
-
-
-@dataclass(frozen=True)
-class Correctness:
-    """How right the fused labels of a group of voxels are; NaN where no voxel has a true class.
-
-    miou   mean over the classes that are true or predicted somewhere, of intersection over union
-    ece    expected calibration error: mean |accuracy - confidence| over 15 bins of the largest belief, by voxels
-    brier  mean over voxels of sum_k (p_k - y_k)^2, 0 to 2
-    """
-
-    name: str
-    voxels: int
-    accuracy: float
-    miou: float
-    ece: float
-    brier: float
-
-
 def correctness(belief: Float64, label: npt.NDArray[np.int64], name: str = "all") -> Correctness:
     """Of beliefs (n, K) and true classes (n,)."""
     if not len(belief):
@@ -91,6 +71,17 @@ def correctness(belief: Float64, label: npt.NDArray[np.int64], name: str = "all"
     ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in bins if row.voxels) / len(belief)
     brier = ((belief - np.eye(belief.shape[1])[label]) ** 2).sum(axis=1).mean()
     return Correctness(name, len(belief), float(right.mean()), miou(belief, label), float(ece), float(brier))
+
+
+def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
+    """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
+    values = {measure: measure.of(fused) for measure in measures()}
+    means = MeasureMeans.over(values, fused.op, where)
+    if truth is None:
+        return RuleMeans(means)
+    known = where & truth.known
+    right = correctness(fused.belief[known], truth.label[known])
+    return RuleMeans(means, right.accuracy, right.miou, right.ece, right.brier)
 
 
 def miou(belief: Float64, label: npt.NDArray[np.int64]) -> float:
@@ -123,21 +114,6 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
     groups = [("all", 1, np.iinfo(np.int32).max), *strata(edges)]
     rows = [(name, truth.known & (table.op >= low) & (table.op <= high)) for name, low, high in groups]
     return tuple(correctness(belief[where], truth.label[where], name) for name, where in rows)
-
-
-@dataclass(frozen=True)
-class Quadrants:
-    """Shares of the voxels with OP >= 3 and a true class that are stable or not, right or wrong.
-
-    wrong_of_stable is the share of the stable voxels that are wrong: what to expect where the map looks safe.
-    """
-
-    voxels: int
-    stable_right: Estimate
-    stable_wrong: Estimate
-    unstable_right: Estimate
-    unstable_wrong: Estimate
-    wrong_of_stable: Estimate
 
 
 def quadrants(table: VoxelTable, truth: Truth, bootstrap: BlockBootstrap, *, stable: float = STABLE) -> Quadrants:

@@ -1,4 +1,4 @@
-"""Everything that the statistics say of one map, as content for JSON and as maps."""
+"""Everything that the statistics say of one map, and as maps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.information import normalise
-from semstab.metrics import dominant, sbd, strata, vss
+from semstab.measures import MeasureMeans, dominant, mean, measures, sbd, vss
+from semstab.metrics import strata
+from semstab.metrics.matching import require_same_map, rows_of
 from semstab.metrics.summary import STRATA
 from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
@@ -23,21 +25,19 @@ from semstab.statistics.agreement import (
     psa,
     ratio_of,
 )
-from semstab.statistics.blocks import UNDEFINED, BlockBootstrap, Estimate, spatial_blocks
+from semstab.statistics.blocks import BlockBootstrap, spatial_blocks
 from semstab.statistics.ceiling import losses
-from semstab.statistics.content import mean, plain
 from semstab.statistics.correctness import (
     Truth,
     by_stratum,
-    correctness,
     join_truth,
     quadrants,
     reliability,
+    rule_means,
     stable_wrong,
 )
 from semstab.statistics.drift import (
     TESTABLE,
-    SceneDrift,
     VoxelDrift,
     benjamini_hochberg,
     expected_sbd,
@@ -46,9 +46,23 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
-from semstab.statistics.matching import require_same_map, rows_of
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
+from semstab.statistics_model import (
+    UNDEFINED,
+    BlockCut,
+    CorrectnessStatistics,
+    DriftStatistics,
+    DriftTests,
+    EntropyParts,
+    Estimate,
+    FlipRates,
+    FrameAgreement,
+    MapStatistics,
+    Repeated,
+    RuleOutcome,
+    StratumStatistics,
+)
 from semstab.voxels import Events, VoxelTable
 
 SCHEMA = 1
@@ -61,9 +75,9 @@ Maps = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What the statistics say of a map: `summary` for JSON, `maps` with one value a voxel (n,), NaN where undefined."""
+    """What the statistics say of a map; `maps` have one value a voxel (n,), NaN where undefined."""
 
-    summary: dict[str, Any]
+    summary: MapStatistics
     maps: Maps
 
 
@@ -76,8 +90,8 @@ def describe(
     name: str = "",
     seed: int = 0,
     edges: Sequence[int] = STRATA,
-) -> dict[str, Any]:
-    """All statistics of one map as content for JSON: the `summary` of `analyse`, which takes the same arguments."""
+) -> MapStatistics:
+    """All statistics of one map: the `summary` of `analyse`, which takes the same arguments."""
     return analyse(table, events, truth, limit=limit, name=name, seed=seed, edges=edges).summary
 
 
@@ -114,36 +128,37 @@ def analyse(
     drift = _drift(table, events, means, maps, seed)
     uncertainty = _uncertainty(table, means, maps)
     right = None if known is None else _correctness(table, known, means, maps, edges, seed)
-    repeated = int(np.count_nonzero(again))
+    repeats = int(np.count_nonzero(again))
+    repeated = Repeated(repeats, repeats / len(table) if len(table) else math.nan)
     judged = verdict(
         name or "backbone",
-        alpha=agreement["alpha"],
-        psa=agreement["psa"],
-        voxels=repeated,
-        share=repeated / len(table) if len(table) else math.nan,
+        alpha=agreement.alpha,
+        psa=agreement.psa,
+        voxels=repeated.voxels,
+        share=repeated.share,
         blocks=blocks.count,
-        wrong_of_stable=UNDEFINED if right is None else right["quadrants"].wrong_of_stable,
+        wrong_of_stable=UNDEFINED if right is None else right.quadrants.wrong_of_stable,
     )
-    summary = {
-        "schema": SCHEMA,
-        "name": name,
-        "seed": seed,
-        "K": table.K,
-        "voxel_size": table.voxel_size,
-        "voxels": len(table),
-        "observations": int(table.op.sum(dtype=np.int64)),
-        "repeated": {"voxels": repeated, "share": repeated / len(table) if len(table) else math.nan},
-        "blocks": {"count": blocks.count, "size": blocks.size},
-        "verdict": judged,
-        "agreement": agreement,
-        "drift": drift,
-        "uncertainty": uncertainty,
-        "geometry": None if limit is None else losses(table, limit, seed=seed),
-        "correctness": right,
-        "fusion_rules": None if events is None else _fusion_rules(table, events, known),
-        "strata": _strata(table, maps, edges),
-    }
-    return Analysis(plain(summary), maps)
+    summary = MapStatistics(
+        schema=SCHEMA,
+        name=name,
+        seed=seed,
+        K=table.K,
+        voxel_size=table.voxel_size,
+        voxels=len(table),
+        observations=int(table.op.sum(dtype=np.int64)),
+        repeated=repeated,
+        blocks=BlockCut(blocks.count, blocks.size),
+        verdict=judged,
+        agreement=agreement,
+        drift=drift,
+        uncertainty=uncertainty,
+        geometry=None if limit is None else losses(table, limit, seed=seed),
+        correctness=right,
+        fusion_rules=None if events is None else _fusion_rules(table, events, known),
+        strata=_strata(table, maps, edges),
+    )
+    return Analysis(summary, maps)
 
 
 # --- Sections ---------------------------------------------------------------------------------------------------------
@@ -169,34 +184,35 @@ class _Means:
         return self.bootstrap.estimate(columns, statistic, bounds)
 
 
-def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> dict[str, Any]:
+def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> FrameAgreement:
     repeated = rows_of(table, means.again)
-    return {
-        "psa": means.mean(maps["psa"]),
-        "kappa": means.function(kappa_columns(repeated), kappa_of, (-1.0, 1.0)),
-        "alpha": means.function(alpha_columns(repeated), alpha_of, (-1.0, 1.0)),
-        "vss": means.mean(vss(table)),
-        "classes": class_agreement(repeated) if events is None else class_agreement(table, events),
-    }
+    return FrameAgreement(
+        psa=means.mean(maps["psa"]),
+        kappa=means.function(kappa_columns(repeated), kappa_of, (-1.0, 1.0)),
+        alpha=means.function(alpha_columns(repeated), alpha_of, (-1.0, 1.0)),
+        vss=means.mean(vss(table)),
+        classes=class_agreement(repeated) if events is None else class_agreement(table, events),
+    )
 
 
-def _drift(table: VoxelTable, events: Events | None, means: _Means, maps: Maps, seed: int) -> dict[str, Any]:
+def _drift(table: VoxelTable, events: Events | None, means: _Means, maps: Maps, seed: int) -> DriftStatistics:
     """Against its null; without events only for one-hot evidence, and without tests."""
     drift = None if events is None else voxel_drift(table, events, seed=seed)
     null = expected_sbd(table) if drift is None else drift.null
     maps |= {"sbd_null": null, "sbd_excess": sbd(table) - null}
     known = ~np.isnan(null)
-    found: dict[str, Any] = {
-        "voxels": int(known.sum()),
-        "sbd": means.mean(np.where(known, sbd(table), np.nan)),
-        "null": means.mean(null),
-        "excess": means.mean(maps["sbd_excess"], (-1.0, 1.0)),
-        "tests": None,
-        "flips": None,
-    }
-    if drift is None or events is None:
-        return found
-    changes = flips(events)
+    tested = None if drift is None or events is None else _tests(table, events, drift, means, maps, seed)
+    return DriftStatistics(
+        voxels=int(known.sum()),
+        sbd=means.mean(np.where(known, sbd(table), np.nan)),
+        null=means.mean(null),
+        excess=means.mean(maps["sbd_excess"], (-1.0, 1.0)),
+        tests=tested,
+        flips=None if events is None else _flips(events, means, maps),
+    )
+
+
+def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, maps: Maps, seed: int) -> DriftTests:
     tested = table.op >= TESTABLE
     maps |= {
         "drift_p": drift.p_value,
@@ -204,32 +220,31 @@ def _drift(table: VoxelTable, events: Events | None, means: _Means, maps: Maps, 
         "trend": drift.trend,
         "trend_p": drift.trend_p,
         "trend_q": benjamini_hochberg(np.where(tested, drift.trend_p, np.nan)),
-        "flip_rate": changes.rate,
-        "frames_since_flip": changes.since,
     }
-    found["tests"] = _tests(table, drift, scene_drift(table, events, drift, seed=seed), means, maps)
-    found["flips"] = {
-        "rate": means.mean(changes.rate),
-        "null": means.mean(changes.null),
-        "excess": means.mean(changes.rate - changes.null, (-1.0, 1.0)),
-        "frames_since": means.mean(changes.since, (0.0, math.inf)),
-    }
-    return found
-
-
-def _tests(table: VoxelTable, drift: VoxelDrift, scene: SceneDrift, means: _Means, maps: Maps) -> dict[str, Any]:
+    scene = scene_drift(table, events, drift, seed=seed)
     one_way, by_chance, all_of_it = trend_columns(table, drift).T
     excess = np.stack([one_way - by_chance, all_of_it], axis=1)[means.again]
-    return {
-        "sbd_p": scene.p_value,
-        "trend": scene.trend,
-        "trend_null": scene.trend_null,
-        "trend_excess": means.function(excess, ratio_of, (-1.0, 1.0)),
-        "trend_p": scene.trend_p,
-        "tested_voxels": int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
-        "unusual_sbd_voxels": _discoveries(maps["drift_q"]),
-        "drifting_voxels": _discoveries(maps["trend_q"]),
-    }
+    return DriftTests(
+        sbd_p=scene.p_value,
+        trend=scene.trend,
+        trend_null=scene.trend_null,
+        trend_excess=means.function(excess, ratio_of, (-1.0, 1.0)),
+        trend_p=scene.trend_p,
+        tested_voxels=int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
+        unusual_sbd_voxels=_discoveries(maps["drift_q"]),
+        drifting_voxels=_discoveries(maps["trend_q"]),
+    )
+
+
+def _flips(events: Events, means: _Means, maps: Maps) -> FlipRates:
+    changes = flips(events)
+    maps |= {"flip_rate": changes.rate, "frames_since_flip": changes.since}
+    return FlipRates(
+        rate=means.mean(changes.rate),
+        null=means.mean(changes.null),
+        excess=means.mean(changes.rate - changes.null, (-1.0, 1.0)),
+        frames_since=means.mean(changes.since, (0.0, math.inf)),
+    )
 
 
 def _discoveries(q: Float64) -> int:
@@ -237,62 +252,54 @@ def _discoveries(q: Float64) -> int:
         return int(np.count_nonzero(q <= FALSE_DISCOVERIES))
 
 
-def _uncertainty(table: VoxelTable, means: _Means, maps: Maps) -> dict[str, Any]:
+def _uncertainty(table: VoxelTable, means: _Means, maps: Maps) -> EntropyParts:
     parts = decompose(table)
     maps |= {"entropy_within": parts.within, "entropy_between": parts.between}
-    return {
-        "entropy": means.mean(parts.total),
-        "within": means.mean(parts.within),
-        "between": means.mean(parts.between),
-    }
+    return EntropyParts(means.mean(parts.total), means.mean(parts.within), means.mean(parts.between))
 
 
 def _correctness(
     table: VoxelTable, truth: Truth, means: _Means, maps: Maps, edges: Sequence[int], seed: int
-) -> dict[str, Any]:
+) -> CorrectnessStatistics:
     maps |= {"true_label": truth.label, "stable_wrong": stable_wrong(table, truth)}
     right = np.where(truth.known, dominant(table) == truth.label, np.nan)
     belief, counted = normalise(table.evidence), truth.known & means.again
     everywhere = spatial_blocks(table.index, table.voxel_size, size=means.bootstrap.blocks.size)
-    return {
-        "accuracy": means.mean(right),
-        "strata": by_stratum(table, truth, edges),
-        "reliability": reliability(belief[counted], truth.label[counted]),
-        "quadrants": quadrants(table, truth, BlockBootstrap(everywhere, seed=seed)),
-    }
+    return CorrectnessStatistics(
+        accuracy=means.mean(right),
+        strata=by_stratum(table, truth, edges),
+        reliability=reliability(belief[counted], truth.label[counted]),
+        quadrants=quadrants(table, truth, BlockBootstrap(everywhere, seed=seed)),
+    )
 
 
-def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> list[dict[str, Any]]:
+def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
     """Means over the voxels with OP >= 2 under each rule."""
     again = table.op >= 2
     usual = fusion_rules.labels(normalise(table.evidence))
     rows = []
     for rule in fusion_rules.RULES:
         fused = fusion_rules.fuse(events, rule)
-        label = fusion_rules.labels(fused.belief)
-        row: dict[str, Any] = {
-            "rule": rule,
-            "vss": mean(fused.vss[again]),
-            "sbd": mean(fused.sbd[again]),
-            "entropy": mean(fused.entropy[again]),
-            "relabelled_share": mean((label != usual)[again]),
-        }
-        if truth is not None:
-            known = again & truth.known
-            right = correctness(fused.belief[known], truth.label[known])
-            row |= {"accuracy": right.accuracy, "miou": right.miou, "ece": right.ece, "brier": right.brier}
-        rows.append(row)
-    return rows
+        relabelled = fusion_rules.labels(fused.belief) != usual
+        rows.append(RuleOutcome(rule, rule_means(fused, again, truth), mean(relabelled[again])))
+    return tuple(rows)
 
 
-def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> list[dict[str, Any]]:
-    within, between = maps["entropy_within"], maps["entropy_between"]
-    columns = {"vss": vss(table), "sbd": sbd(table), "entropy": within + between} | {
-        name: maps[name] for name in ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_between")
-    }
+def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> tuple[StratumStatistics, ...]:
+    values = {measure: measure.of(table) for measure in measures()}
     rows = []
     for name, low, high in strata(edges):
         where = (table.op >= low) & (table.op <= high)
-        means = {key: mean(values[where]) for key, values in columns.items()}
-        rows.append({"name": name, "voxels": int(np.count_nonzero(where))} | means)
-    return rows
+        rows.append(
+            StratumStatistics(
+                name,
+                int(np.count_nonzero(where)),
+                MeasureMeans.over(values, table.op, where),
+                psa=mean(maps["psa"][where]),
+                sbd_null=mean(maps["sbd_null"][where]),
+                sbd_excess=mean(maps["sbd_excess"][where]),
+                entropy_within=mean(maps["entropy_within"][where]),
+                entropy_between=mean(maps["entropy_between"][where]),
+            )
+        )
+    return tuple(rows)

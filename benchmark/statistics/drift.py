@@ -13,13 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.metrics import sbd
+from semstab.measures import Quantity, mean, sbd
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.content import mean
 from semstab.voxels import Events, VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+
+FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
 LEAST_DRAWS, MOST_DRAWS, ENOUGH_HITS = 100, 1999, 20
 """Random orders of a voxel: at least, at most, and how many in a tail settle its p-value."""
@@ -206,11 +207,12 @@ def benjamini_hochberg(p: Float64) -> Float64:
     NaN is not a test. It holds for independent tests and for those that depend positively (Benjamini and Yekutieli
     2001), as neighbouring voxels do.
     """
+    from scipy.stats import false_discovery_control
+
     adjusted = np.full(len(p), np.nan)
     tested = np.flatnonzero(~np.isnan(p))
-    order = tested[np.argsort(p[tested], kind="stable")]
-    scaled = p[order] * len(order) / np.arange(1, len(order) + 1)
-    adjusted[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
+    if len(tested):
+        adjusted[tested] = false_discovery_control(p[tested])
     return adjusted
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.information import entropy_bits, normalise
+from semstab.information import normalise
 from semstab.statistics.agreement import ONE_HOT
 from semstab.voxels import Events
 
@@ -24,18 +24,21 @@ FLOOR = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """A map fused by one rule.
+    """A map fused by one rule, of which every measure can be computed: `VSS.of(fused)`.
 
-    belief  (n, K) after the last observation
-    vss     (n,) its largest entry
-    sbd     (n,) mean Jensen-Shannon divergence of successive beliefs, bits; NaN where OP < 2
-    entropy (n,) of the belief, in units of log K
+    belief     (n, K) after the last observation
+    op         (n,) int32 observations
+    drift_sum  (n,) sum of the Jensen-Shannon divergences of successive beliefs, bits
     """
 
     belief: Float64
-    vss: Float64
-    sbd: Float64
-    entropy: Float64
+    op: npt.NDArray[np.int32]
+    drift_sum: Float64
+
+    @property
+    def evidence(self) -> Float64:
+        """The belief."""
+        return self.belief
 
 
 def fuse(events: Events, rule: str, *, floor: float = FLOOR) -> Fused:
@@ -58,9 +61,7 @@ def fuse(events: Events, rule: str, *, floor: float = FLOOR) -> Fused:
     kernels.in_chunks(
         kernels.fuse_by_rule, starts, evidence, rule in ("product", "geometric"), rule != "product", belief, drift_sum
     )
-    op = np.diff(starts)
-    sbd = np.divide(drift_sum, op - 1, out=np.full(n, np.nan), where=op >= 2)
-    return Fused(belief, belief.max(axis=1, initial=0.0), sbd, entropy_bits(belief) / np.log2(K))
+    return Fused(belief, np.diff(starts).astype(np.int32), drift_sum)
 
 
 def labels(belief: Float64) -> npt.NDArray[np.int64]:

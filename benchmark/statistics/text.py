@@ -4,130 +4,152 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
-Row = tuple[str, Any, str]
+from semstab.comparison_model import BackboneComparison
+from semstab.measures import measures
+from semstab.statistics.agreement import ALPHA, KAPPA
+from semstab.statistics.comparison import compared
+from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
+from semstab.statistics_model import Estimate, MapStatistics, RuleOutcome
+
+Row = tuple[str, Estimate | float, str]
+Cell = str | float
 WIDTH = 80
 
-STRATA_KEYS = ("name", "voxels", "psa", "vss", "sbd", "sbd_null", "entropy_within", "entropy_between")
-RULE_KEYS = ("rule", "vss", "sbd", "entropy", "relabelled_share", "accuracy", "ece")
 
-
-def lines(summary: Mapping[str, Any]) -> list[str]:
-    """The content that `describe` returns, in lines."""
-    repeated, blocks = summary["repeated"], summary["blocks"]
+def lines(found: MapStatistics) -> list[str]:
+    """What `describe` says of a map."""
+    repeated, blocks = found.repeated, found.blocks
     head = [
-        *textwrap.wrap(summary["verdict"]["line"], WIDTH),
+        *textwrap.wrap(found.verdict.line, WIDTH),
         "",
-        f"{repeated['voxels']} of {summary['voxels']} voxels seen twice or more; intervals at 95 % from"
-        f" {blocks['count']} blocks of {blocks['size']:.4g} m",
+        f"{repeated.voxels} of {found.voxels} voxels seen twice or more; intervals at 95 % from"
+        f" {blocks.count} blocks of {blocks.size:.4g} m",
         "",
         f"{'':<34}{'value':>9}   {'interval':<20}",
     ]
-    rows = [*_agreement(summary), *_drift(summary), *_uncertainty(summary), *_geometry(summary), *_correctness(summary)]
-    return [*head, *(_line(*row) for row in rows), *_tables(summary)]
+    rows = [*_agreement(found), *_drift(found), *_uncertainty(found), *_geometry(found), *_correctness(found)]
+    return [*head, *(_line(*row) for row in rows), *_tables(found)]
 
 
-def comparison_lines(content: Mapping[str, Any]) -> list[str]:
-    """The content that `compare_backbones` returns, in lines."""
-    paired = content["paired"]
+def comparison_lines(found: BackboneComparison) -> list[str]:
+    """What `compare_backbones` says of several."""
+    paired = found.paired
     out = [
-        f"{paired['voxels']} voxels that all saw twice or more; {paired['blocks']} blocks of"
-        f" {paired['block_size']:.4g} m",
+        f"{paired.voxels} voxels that all saw twice or more; {paired.blocks} blocks of {paired.block_size:.4g} m",
         "",
-        *_table(content["coverage"], ("backbone", "voxels", "observations", "mean_op", "repeated", "common_share")),
+        *_table(
+            ("backbone", "voxels", "observations", "mean_op", "repeated", "common_share"),
+            [(r.backbone, r.voxels, r.observations, r.mean_op, r.repeated, r.common_share) for r in found.coverage],
+        ),
         "",
         f"{'difference on common voxels':<34}{'value':>9}   {'interval':<20}{'p (Holm)':>10}",
     ]
-    out += [
-        _line(f"{row['measure']}: {row['a']} - {row['b']}", row["difference"], _p("p", row["p_holm"]))
-        for row in paired["differences"]
-    ]
-    for measure, values in content["standardised"]["values"].items():
-        out += [_line(f"{measure}, standardised: {name}", value) for name, value in values.items()]
-    for ranking in paired["rankings"]:
-        order = (f"{r['rank']}. {r['backbone']} (first in {_share(r['best'])})" for r in ranking["ranks"])
-        out.append(f"by {ranking['measure']}: {', '.join(order)}")
-    if rules := content["fusion_rules"]:
-        changed = [measure for measure, changes in rules["order_changes"].items() if changes]
+    out += [_line(f"{r.measure}: {r.a} - {r.b}", r.difference, _p("p", r.p_holm)) for r in paired.differences]
+    for quantity in compared(truth=False):
+        own = {name: found.standardised.of(quantity, name) for name in found.backbones}
+        if quantity.key in found.standardised.values:
+            out += [_line(f"{quantity.key}, standardised: {name}", value) for name, value in own.items()]
+    for ranking in paired.rankings:
+        order = (f"{r.rank}. {r.backbone} (first in {_share(r.best)})" for r in ranking.ranks)
+        out.append(f"by {ranking.measure}: {', '.join(order)}")
+    if (rules := found.fusion_rules) is not None:
+        changed = [measure for measure, changes in rules.order_changes.items() if changes]
         out.append(f"another fusion rule changes the order by: {', '.join(changed) or 'no measure'}")
     return out
 
 
-def _agreement(summary: Mapping[str, Any]) -> list[Row]:
-    found = summary["agreement"]
+def _agreement(found: MapStatistics) -> list[Row]:
     return [
-        ("pairwise agreement (PSA)", found["psa"], ""),
-        ("Fleiss' kappa", found["kappa"], ""),
-        ("Krippendorff's alpha", found["alpha"], ""),
-        ("VSS", found["vss"], ""),
+        ("pairwise agreement (PSA)", found.agreement.psa, ""),
+        ("Fleiss' kappa", found.agreement.kappa, ""),
+        ("Krippendorff's alpha", found.agreement.alpha, ""),
+        ("VSS", found.agreement.vss, ""),
     ]
 
 
-def _drift(summary: Mapping[str, Any]) -> list[Row]:
-    drift = summary["drift"]
-    tests, flips = drift["tests"] or {}, drift["flips"]
+def _drift(found: MapStatistics) -> list[Row]:
+    drift, tests, flips = found.drift, found.drift.tests, found.drift.flips
     rows: list[Row] = [
-        ("SBD, bits", drift["sbd"], ""),
-        ("SBD in random order", drift["null"], ""),
-        ("excess drift", drift["excess"], _p("p", tests.get("sbd_p", math.nan))),
+        ("SBD, bits", drift.sbd, ""),
+        ("SBD in random order", drift.null, ""),
+        ("excess drift", drift.excess, "" if tests is None else _p("p", tests.sbd_p)),
     ]
-    if tests:
-        found = f"{tests['drifting_voxels']} of {tests['tested_voxels']} voxels drift"
+    if tests is not None:
+        drifting = f"{tests.drifting_voxels} of {tests.tested_voxels} voxels drift"
         rows += [
-            ("disagreement that goes one way", tests["trend"], ""),
-            ("  beyond random order", tests["trend_excess"], f"{_p('p', tests['trend_p'])}; {found}"),
+            ("disagreement that goes one way", tests.trend, ""),
+            ("  beyond random order", tests.trend_excess, f"{_p('p', tests.trend_p)}; {drifting}"),
         ]
-    if flips:
-        rows += [("flip rate", flips["rate"], ""), ("  beyond random order", flips["excess"], "")]
+    if flips is not None:
+        rows += [("flip rate", flips.rate, ""), ("  beyond random order", flips.excess, "")]
     return rows
 
 
-def _uncertainty(summary: Mapping[str, Any]) -> list[Row]:
-    found = summary["uncertainty"]
+def _uncertainty(found: MapStatistics) -> list[Row]:
     return [
-        ("entropy", found["entropy"], ""),
-        ("  within frames", found["within"], ""),
-        ("  between frames", found["between"], ""),
+        ("entropy", found.uncertainty.entropy, ""),
+        ("  within frames", found.uncertainty.within, ""),
+        ("  between frames", found.uncertainty.between, ""),
     ]
 
 
-def _geometry(summary: Mapping[str, Any]) -> list[Row]:
-    found = summary["geometry"]
-    if not found:
+def _geometry(found: MapStatistics) -> list[Row]:
+    if found.geometry is None:
         return []
     return [
-        ("disagreement 1 - PSA", found["total"], ""),
-        ("  of geometry", found["geometry"], ""),
-        ("  of the model", found["model"], ""),
+        ("disagreement 1 - PSA", found.geometry.total, ""),
+        ("  of geometry", found.geometry.geometry, ""),
+        ("  of the model", found.geometry.model, ""),
     ]
 
 
-def _correctness(summary: Mapping[str, Any]) -> list[Row]:
-    found = summary["correctness"]
-    if not found:
+def _correctness(found: MapStatistics) -> list[Row]:
+    if found.correctness is None:
         return []
-    quadrants = found["quadrants"]
-    names = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
+    shares = found.correctness.quadrants
     return [
-        ("accuracy", found["accuracy"], ""),
-        *((f"{name.replace('_', ', ')} (OP >= 3)", quadrants[name], "") for name in names),
-        ("wrong among the stable", quadrants["wrong_of_stable"], ""),
+        ("accuracy", found.correctness.accuracy, ""),
+        ("stable, right (OP >= 3)", shares.stable_right, ""),
+        ("stable, wrong (OP >= 3)", shares.stable_wrong, ""),
+        ("unstable, right (OP >= 3)", shares.unstable_right, ""),
+        ("unstable, wrong (OP >= 3)", shares.unstable_wrong, ""),
+        ("wrong among the stable", shares.wrong_of_stable, ""),
     ]
 
 
-def _tables(summary: Mapping[str, Any]) -> Iterable[str]:
-    yield from ("", *_table(summary["strata"], STRATA_KEYS))
-    if found := summary["correctness"]:
-        yield from ("", *_table(found["strata"], ("name", "voxels", "accuracy", "miou", "ece", "brier")))
-    yield from ("", *_table(summary["agreement"]["classes"], ("name", "observations", "kappa", "alpha")))
-    if rules := summary["fusion_rules"]:
-        yield from ("", *_table(rules, [key for key in RULE_KEYS if key in rules[0]]))
+def _tables(found: MapStatistics) -> Iterable[str]:
+    yield from ("", *_strata(found))
+    if found.correctness is not None:
+        strata = [(r.name, r.voxels, r.accuracy, r.miou, r.ece, r.brier) for r in found.correctness.strata]
+        yield from ("", *_table(("name", "voxels", *(q.key for q in (ACCURACY, MIOU, ECE, BRIER))), strata))
+    classes = [(r.name, r.observations, r.kappa, r.alpha) for r in found.agreement.classes]
+    yield from ("", *_table(("name", "observations", KAPPA.key, ALPHA.key), classes))
+    if found.fusion_rules:
+        yield from ("", *_rules(found.fusion_rules, known=found.correctness is not None))
 
 
-def _table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[str]:
-    cells = [keys, *([_cell(row[key]) for key in keys] for row in rows)]
+def _strata(found: MapStatistics) -> list[str]:
+    keys = (measure.key for measure in measures())
+    rows: list[Sequence[Cell]] = [
+        (r.name, r.voxels, r.psa, *r.means.of_all(), r.sbd_null, r.entropy_within, r.entropy_between)
+        for r in found.strata
+    ]
+    return _table(("name", "voxels", "psa", *keys, "sbd_null", "entropy_within", "entropy_between"), rows)
+
+
+def _rules(outcomes: Sequence[RuleOutcome], *, known: bool) -> list[str]:
+    """How right each rule is only where that is known."""
+    keys = ("rule", *(measure.key for measure in measures()), "relabelled_share", ACCURACY.key, ECE.key)
+    rows: list[Sequence[Cell]] = [
+        (r.rule, *r.values.means.of_all(), r.relabelled_share, r.values.accuracy, r.values.ece) for r in outcomes
+    ]
+    return _table(keys, rows) if known else _table(keys[:-2], [row[:-2] for row in rows])
+
+
+def _table(keys: Sequence[str], rows: Sequence[Sequence[Cell]]) -> list[str]:
+    cells = [keys, *([_cell(cell) for cell in row] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(keys))]
     first, *rest = widths
     return [
@@ -136,17 +158,17 @@ def _table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[str]:
     ]
 
 
-def _cell(value: Any) -> str:
+def _cell(value: Cell) -> str:
     if isinstance(value, float):
         return "-" if math.isnan(value) else f"{value:.0f}" if abs(value) >= 1000 else f"{value:z.4f}"
     return str(value)
 
 
-def _line(name: str, estimate: Any, note: str = "") -> str:
-    if not isinstance(estimate, Mapping):
+def _line(name: str, estimate: Estimate | float, note: str = "") -> str:
+    if not isinstance(estimate, Estimate):
         return f"{name:<34}{_cell(estimate):>9}   {'':<20}{note}".rstrip()
-    interval = f"{_cell(estimate['low'])} to {_cell(estimate['high'])}"
-    return f"{name:<34}{_cell(estimate['value']):>9}   {interval:<20}{note}".rstrip()
+    interval = f"{_cell(estimate.low)} to {_cell(estimate.high)}"
+    return f"{name:<34}{_cell(estimate.value):>9}   {interval:<20}{note}".rstrip()
 
 
 def _p(name: str, value: float) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-from semstab.statistics.blocks import UNDEFINED, Estimate
+from semstab.statistics_model import UNDEFINED, Estimate, StabilityVerdict
 
 RELIABLE = 0.8
 """Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""
@@ -32,14 +31,6 @@ ADVICE = {
 ONE_CLASS = "hardly more than one class was predicted, so that agreement says nothing"
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What the evidence says of a backbone on a scene: a key of ADVICE, and the line that gives the reason."""
-
-    level: str
-    line: str
-
-
 def verdict(
     backbone: str,
     *,
@@ -49,7 +40,7 @@ def verdict(
     share: float,
     blocks: int,
     wrong_of_stable: Estimate = UNDEFINED,
-) -> Verdict:
+) -> StabilityVerdict:
     """Judge by the intervals, never by values alone, from voxels with OP >= 2 only.
 
     alpha, psa       of these voxels
@@ -61,7 +52,7 @@ def verdict(
     support = f"{voxels} places seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
         enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
-        return Verdict(level, f"{backbone}: no verdict, {ONE_CLASS if enough else ADVICE[level]}; {support}")
+        return StabilityVerdict(level, f"{backbone}: no verdict, {ONE_CLASS if enough else ADVICE[level]}; {support}")
     found = [
         f"two frames agree on {psa.value:.0%} of the places ({psa.low:.0%} to {psa.high:.0%})",
         f"alpha {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f})",
@@ -69,7 +60,7 @@ def verdict(
     if not math.isnan(wrong_of_stable.low):
         wrong = wrong_of_stable
         found.append(f"{wrong.value:.0%} of the stable places are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
-    return Verdict(level, f"{backbone}: {level}, {ADVICE[level]}: {', '.join(found)}; {support}")
+    return StabilityVerdict(level, f"{backbone}: {level}, {ADVICE[level]}: {', '.join(found)}; {support}")
 
 
 def _level(alpha: Estimate, wrong_of_stable: Estimate, voxels: int, blocks: int) -> str:

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
+from semstab.comparison_model import BackboneComparison, MapCoverage
 from semstab.records import Result
-from semstab.statistics import estimate_at, number_at
+from semstab.statistics.comparison import compared
+from semstab.tables.statistics import INTERVALS
 from semstab.tables.table import Column, Group, Row, Table
 
-MEASURES = {
-    "psa": "PSA",
-    "alpha": "alpha",
-    "vss": "VSS",
-    "sbd": "SBD",
-    "entropy": "entropy",
-    "accuracy": "accuracy",
-}
 _COMMON = "On the voxels that every backbone saw twice or more."
-_INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
 
 
 def comparison(result: Result) -> list[Table]:
@@ -36,18 +26,15 @@ def _differences(result: Result) -> Table:
     )
     caption = (
         f"{_COMMON} p: of a paired test that flips the sign of a block's difference, corrected for the number of pairs."
-        f" {_INTERVALS}"
+        f" {INTERVALS}"
     )
-    groups = tuple(Group(found["scene"], _difference_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
 
 
-def _difference_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
-    rows = sorted(found["paired"]["differences"], key=lambda row: list(MEASURES).index(row["measure"]))
-    return tuple(
-        (row["a"], row["b"], MEASURES[row["measure"]], estimate_at(row, "difference"), number_at(row, "p_holm"))
-        for row in rows
-    )
+def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
+    return tuple((row.a, row.b, words[row.measure], row.difference, row.p_holm) for row in found.paired.differences)
 
 
 def _ranking(result: Result) -> Table:
@@ -62,30 +49,27 @@ def _ranking(result: Result) -> Table:
     )
     caption = (
         f"Same places: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
-        f" strata of OP weighted by those of all maps together. {_INTERVALS}"
+        f" strata of OP weighted by those of all maps together. {INTERVALS}"
     )
-    groups = tuple(Group(found["scene"], _ranking_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
     return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
 
 
-def _ranking_rows(found: Mapping[str, Any]) -> tuple[Row, ...]:
-    rankings = {ranking["measure"]: ranking["ranks"] for ranking in found["paired"]["rankings"]}
-    rows: list[Row] = []
-    for measure, name in MEASURES.items():
-        for rank in rankings.get(measure, ()):
-            backbone = rank["backbone"]
-            rows.append(
-                (
-                    name,
-                    rank["rank"],
-                    backbone,
-                    f"{rank['low']} to {rank['high']}",
-                    100 * number_at(rank, "best"),
-                    estimate_at(found, "paired", "values", measure, backbone),
-                    estimate_at(found, "standardised", "values", measure, backbone),
-                )
-            )
-    return tuple(rows)
+def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    quantities = {quantity.key: quantity for quantity in compared(truth=True)}
+    return tuple(
+        (
+            quantities[ranking.measure].word,
+            rank.rank,
+            rank.backbone,
+            f"{rank.low} to {rank.high}",
+            100 * rank.best,
+            found.paired.of(quantities[ranking.measure])[rank.backbone],
+            found.standardised.of(quantities[ranking.measure], rank.backbone),
+        )
+        for ranking in found.paired.rankings
+        for rank in ranking.ranks
+    )
 
 
 def _coverage(result: Result) -> Table:
@@ -99,22 +83,17 @@ def _coverage(result: Result) -> Table:
         Column("alone", "in no other", 0),
     )
     caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
-    groups = tuple(
-        Group(
-            found["scene"],
-            tuple(
-                (
-                    row["backbone"],
-                    row["voxels"],
-                    number_at(row, "mean_op"),
-                    row["repeated"],
-                    row["recurrent"],
-                    100 * number_at(row, "common_share"),
-                    row["alone"],
-                )
-                for row in found["coverage"]
-            ),
-        )
-        for found in result.comparisons
-    )
+    groups = tuple(Group(found.scene, tuple(map(_coverage_row, found.coverage))) for found in result.comparisons)
     return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
+
+
+def _coverage_row(row: MapCoverage) -> Row:
+    return (
+        row.backbone,
+        row.voxels,
+        row.mean_op,
+        row.repeated,
+        row.recurrent,
+        100 * row.common_share,
+        row.alone,
+    )

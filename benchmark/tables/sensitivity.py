@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from semstab.averages import ENOUGH, Level, Sweep, complete_scenes, levels, swept
+from semstab.averages import ENOUGH, Level, Sweep, complete_scenes, levels, over_all, over_recurrent, swept
+from semstab.measures import SBD, VSS, measures
 from semstab.records import Result
-from semstab.tables.stability import SBD_OVER
+from semstab.statistics.agreement import ALPHA, PSA
+from semstab.tables.stability import SBD_OVER, of_measures
 from semstab.tables.table import Column, Group, Row, Table
 
 
@@ -21,12 +23,8 @@ def _table(result: Result, sweep: Sweep) -> Table:
         Column("voxels", "Voxels", 0),
         Column("mean_op", "Mean OP", 2),
         Column("recurrent_percent", "OP>=3 (%)", 2),
-        Column("vss", "VSS", 4, "higher", over="All voxels"),
-        Column("sbd", "SBD", 4, "lower", over="All voxels"),
-        Column("entropy", "Entropy", 4, "lower", over="All voxels"),
-        Column("recurrent_vss", "VSS", 4, "higher", over="OP>=3"),
-        Column("recurrent_sbd", "SBD", 4, "lower", over="OP>=3"),
-        Column("recurrent_entropy", "Entropy", 4, "lower", over="OP>=3"),
+        *of_measures(compared=True, over="All voxels"),
+        *of_measures(compared=True, prefix="recurrent_", over="OP>=3"),
         Column("note", "Note"),
     )
     backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
@@ -47,10 +45,8 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
     columns = (
         Column("value", sweep.header),
         Column("mean_op", "Mean OP", 2),
-        Column("vss", "VSS, all voxels", 4, "higher"),
-        Column("sbd", "SBD", 4, "lower"),
-        Column("psa", "PSA", 4, "higher"),
-        Column("alpha", "Alpha", 4, "higher"),
+        Column("vss", "VSS, all voxels", VSS.digits[1], VSS.better),
+        *(Column.of(quantity, compared=True) for quantity in (SBD, PSA, ALPHA)),
         Column("sbd_excess", "SBD excess", 4, signed=True),
     )
     by_backbone = {name: levels(result, sweep.name, name) for name in result.backbones}
@@ -74,7 +70,7 @@ def _agreement_row(sweep: Sweep, level: Level) -> Row:
     return (
         sweep.text(level.value),
         level.mean(lambda p: p.mean_op),
-        spread(lambda p: p.every.vss),
+        spread(over_all(VSS)),
         spread(lambda p: p.drift),
         spread(lambda p: p.psa),
         spread(lambda p: p.alpha),
@@ -90,11 +86,7 @@ def _row(sweep: Sweep, level: Level) -> Row:
         level.mean(lambda p: p.voxels),
         level.mean(lambda p: p.mean_op),
         spread(lambda p: 100 * p.recurrent.share),
-        spread(lambda p: p.every.vss),
-        spread(lambda p: p.every.sbd),
-        spread(lambda p: p.every.entropy),
-        spread(lambda p: p.recurrent.vss),
-        spread(lambda p: p.recurrent.sbd),
-        spread(lambda p: p.recurrent.entropy),
+        *(spread(over_all(measure)) for measure in measures()),
+        *(spread(over_recurrent(measure)) for measure in measures()),
         "" if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH else "few",
     )

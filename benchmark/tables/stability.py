@@ -6,21 +6,20 @@ from collections.abc import Sequence
 
 from semstab.averages import ENOUGH, by_backbone, pooled
 from semstab.config import SHARED
+from semstab.measures import measures
 from semstab.metrics import macro_mean
 from semstab.records import Record, Result
-from semstab.results import Means
+from semstab.results import Means, TableSummary
 from semstab.tables.table import Column, Group, Row, Table
 
 VOXELS = Column("voxels", "Voxels", 0)
 SHARE = Column("share_percent", "Voxels (%)", 2)
-SBD = Column("sbd", "SBD", 4, "lower")
-ENTROPY = Column("entropy", "Entropy", 4, "lower")
 SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
 
 
-def vss(digits: int) -> Column:
-    """VSS: the paper prints 3 decimals in its main tables, 4 where it compares."""
-    return Column("vss", "VSS", digits, "higher")
+def of_measures(*, compared: bool = False, prefix: str = "", over: str = "") -> list[Column]:
+    """A column a measure: the paper prints more decimals where it compares."""
+    return [Column.of(measure, compared=compared, prefix=prefix, over=over) for measure in measures()]
 
 
 def scenes(result: Result) -> list[Table]:
@@ -33,9 +32,7 @@ def scenes(result: Result) -> list[Table]:
         VOXELS,
         Column("points", "Sampled Points", 0),
         Column("mean_op", "Mean OP", 2),
-        vss(3),
-        SBD,
-        ENTROPY,
+        *of_measures(),
     )
     groups = tuple(
         Group(name, tuple(_scene_row(record) for record in rows), _scene_total(rows) if len(rows) > 1 else None)
@@ -53,7 +50,7 @@ def persistence(result: Result) -> list[Table]:
     records = result.select()
     if not records:
         return []
-    columns = (Column("persistence", "Persistence"), VOXELS, SHARE, vss(3), SBD, ENTROPY)
+    columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
     groups = []
     for name, rows in by_backbone(records).items():
         together = pooled(rows)
@@ -70,7 +67,7 @@ def classes(result: Result) -> list[Table]:
     records = result.select()
     if not records:
         return []
-    columns = (Column("class", "Class"), VOXELS, vss(3), SBD, ENTROPY, Column("note", "Note"))
+    columns = (Column("class", "Class"), VOXELS, *of_measures(), Column("note", "Note"))
     groups = tuple(
         Group(name, tuple(_class_row(row) for row in pooled(rows).classes))
         for name, rows in by_backbone(records).items()
@@ -87,7 +84,7 @@ def cross_backbone(result: Result) -> list[Table]:
     records = comparable(result)
     if not records:
         return []
-    columns = (Column("over", "Means over"), VOXELS, SHARE, vss(4), SBD, ENTROPY)
+    columns = (Column("over", "Means over"), VOXELS, SHARE, *of_measures(compared=True))
     groups = tuple(Group(name, _comparison_rows(rows)) for name, rows in by_backbone(records).items())
     caption = (
         f"{settings(records)} Macro: each scene counts once. Pooled: the voxels of all scenes together; compare the"
@@ -112,7 +109,7 @@ def settings(records: Sequence[Record]) -> str:
 
 def _scene_row(record: Record) -> Row:
     table = record.summary.table
-    return record.unit.scene, table.voxels, table.points, table.mean_op, table.vss, table.sbd, table.entropy
+    return record.unit.scene, table.voxels, table.points, table.mean_op, *table.means.of_all()
 
 
 def _scene_total(records: Sequence[Record]) -> Row:
@@ -122,26 +119,28 @@ def _scene_total(records: Sequence[Record]) -> Row:
         sum(table.voxels for table in tables),
         sum(table.points for table in tables),
         macro_mean([table.mean_op for table in tables]),
-        macro_mean([table.vss for table in tables]),
-        macro_mean([table.sbd for table in tables]),
-        macro_mean([table.entropy for table in tables]),
+        *_macro(tables),
     )
 
 
+def _macro(tables: Sequence[TableSummary]) -> list[float]:
+    """The macro mean of each measure."""
+    return [macro_mean([table[measure] for table in tables]) for measure in measures()]
+
+
 def _means_row(row: Means) -> Row:
-    return row.name, row.voxels, 100 * row.share, row.vss, row.sbd, row.entropy
+    return row.name, row.voxels, 100 * row.share, *row.means.of_all()
 
 
 def _class_row(row: Means) -> Row:
     note = "" if row.voxels >= ENOUGH else "rare" if row.voxels else "absent"
-    return row.name, row.voxels, row.vss, row.sbd, row.entropy, note
+    return row.name, row.voxels, *row.means.of_all(), note
 
 
 def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
     tables, together = [record.summary.table for record in records], pooled(records)
-    macro = [macro_mean([getattr(table, name) for table in tables]) for name in ("vss", "sbd", "entropy")]
     return (
-        ("all voxels, macro", together.voxels, 100.0, *macro),
+        ("all voxels, macro", together.voxels, 100.0, *_macro(tables)),
         ("all voxels, pooled", *_means_row(together.every)[1:]),
         ("OP>=3, pooled", *_means_row(together.recurrent)[1:]),
     )

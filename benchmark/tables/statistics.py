@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 from semstab.averages import by_backbone
+from semstab.measures import ENTROPY, VSS
 from semstab.metrics import macro_mean
 from semstab.records import Record, Result
-from semstab.statistics import Estimate, estimate_at, number_at
+from semstab.statistics.agreement import ALPHA, KAPPA, PSA
+from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.verdict import ADVICE
+from semstab.statistics_model import UNDEFINED, DriftTests, Estimate, MapStatistics
 from semstab.tables.table import Column, Group, Row, Table
 
 SCENE = Column("scene", "Scene")
@@ -18,26 +21,23 @@ REPEATED = Column("repeated_voxels", "Voxels", 0)
 INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
 SEEN_TWICE = "Over the voxels seen twice or more."
 
-Number = Callable[[Record], float | Estimate]
+T = TypeVar("T")
+Number = Callable[[MapStatistics], float | Estimate]
 
 
 def temporal_agreement(result: Result) -> list[Table]:
     """Do frames agree about a place? Measures that do not depend on OP."""
     columns = (
         REPEATED,
-        Column("vss", "VSS", 3, "higher"),
-        Column("psa", "PSA", 3, "higher"),
-        Column("kappa", "Kappa", 2, "higher"),
-        Column("alpha", "Alpha", 2, "higher"),
-        Column("flip_rate", "Flip rate", 3, "lower"),
+        *map(Column.of, (VSS, PSA, KAPPA, ALPHA, FLIP_RATE)),
     )
-    numbers = (
-        number("repeated", "voxels"),
-        number("agreement", "vss", "value"),
-        estimate("agreement", "psa"),
-        number("agreement", "kappa", "value"),
-        estimate("agreement", "alpha"),
-        number("drift", "flips", "rate", "value"),
+    numbers: tuple[Number, ...] = (
+        lambda found: found.repeated.voxels,
+        lambda found: found.agreement.vss.value,
+        lambda found: found.agreement.psa,
+        lambda found: found.agreement.kappa.value,
+        lambda found: found.agreement.alpha,
+        lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
     )
     caption = (
         f"{SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel; kappa (Fleiss) and alpha (Krippendorff):"
@@ -55,10 +55,9 @@ def class_agreement(result: Result) -> list[Table]:
     columns = (
         Column("class", "Class"),
         Column("observations", "Observations", 0),
-        Column("kappa", "Kappa", 2, "higher"),
-        Column("alpha", "Alpha", 2, "higher"),
+        *map(Column.of, (KAPPA, ALPHA)),
     )
-    groups = tuple(Group(name, _class_rows(records)) for name, records in judged.items())
+    groups = tuple(Group(name, _class_rows(rows)) for name, rows in judged.items())
     caption = (
         f"{SEEN_TWICE} Each class against all others; observations are the evidence for it, in frames, of all scenes."
         " Macro means: each scene counts once."
@@ -80,19 +79,19 @@ def drift(result: Result) -> list[Table]:
         Column("drifting_voxels", "drifting", 0, over="Voxels"),
         Column("tested_voxels", "tested", 0, over="Voxels"),
     )
-    numbers = (
-        number("drift", "voxels"),
-        number("drift", "sbd", "value"),
-        number("drift", "null", "value"),
-        estimate("drift", "excess"),
-        number("drift", "tests", "sbd_p"),
-        number("drift", "tests", "trend"),
-        number("drift", "tests", "trend_null"),
-        number("drift", "tests", "trend_p"),
-        number("drift", "tests", "drifting_voxels"),
-        number("drift", "tests", "tested_voxels"),
+    numbers: tuple[Number, ...] = (
+        lambda found: found.drift.voxels,
+        lambda found: found.drift.sbd.value,
+        lambda found: found.drift.null.value,
+        lambda found: found.drift.excess,
+        tested(lambda tests: tests.sbd_p),
+        tested(lambda tests: tests.trend),
+        tested(lambda tests: tests.trend_null),
+        tested(lambda tests: tests.trend_p),
+        tested(lambda tests: tests.drifting_voxels),
+        tested(lambda tests: tests.tested_voxels),
     )
-    logged = any((record.statistics.get("drift") or {}).get("tests") for record in result.select())
+    logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())
     one_class = f"{SEEN_TWICE[:-1]}, each frame as one class; the others need a log (statistics: true)."
     seen = SEEN_TWICE if logged else one_class
     tests = (
@@ -110,21 +109,20 @@ def drift(result: Result) -> list[Table]:
 def uncertainty(result: Result) -> list[Table]:
     """The entropy of the belief, within frames and between them."""
     columns = (
-        Column("entropy", "Entropy", 4, "lower"),
+        Column.of(ENTROPY),
         Column("within", "within frames", 4, "lower"),
         Column("between", "between frames", 4, "lower"),
         Column("within_percent", "within (%)", 0),
     )
 
-    def share(record: Record) -> float:
-        entropy = number_at(record.statistics, "uncertainty", "entropy", "value")
-        within = number_at(record.statistics, "uncertainty", "within", "value")
-        return 100 * within / entropy if entropy else math.nan
+    def share(found: MapStatistics) -> float:
+        entropy = found.uncertainty.entropy.value
+        return 100 * found.uncertainty.within.value / entropy if entropy else math.nan
 
-    numbers = (
-        estimate("uncertainty", "entropy"),
-        estimate("uncertainty", "within"),
-        estimate("uncertainty", "between"),
+    numbers: tuple[Number, ...] = (
+        lambda found: found.uncertainty.entropy,
+        lambda found: found.uncertainty.within,
+        lambda found: found.uncertainty.between,
         share,
     )
     caption = (
@@ -142,13 +140,13 @@ def verdicts(result: Result) -> list[Table]:
     columns = (
         SCENE,
         Column("verdict", "Verdict"),
-        Column("alpha", "Alpha", 2, "higher"),
+        Column.of(ALPHA),
         Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
         Column("advice", "What to do"),
     )
-    groups = tuple(Group(name, tuple(_verdict_row(record) for record in records)) for name, records in judged.items())
+    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
     caption = (
         f"{SEEN_TWICE} Decided by the intervals: stable where alpha is at least 0.8, usable from 0.667, unstable below;"
         " misleading where more than 5% of the stable places are wrong, which only ground truth tells."
@@ -161,100 +159,90 @@ def verdicts(result: Result) -> list[Table]:
 
 
 def by_scene(
-    result: Result,
-    name: str,
-    title: str,
-    caption: str,
-    columns: Sequence[Column],
-    numbers: Sequence[Number],
-    section: str = "agreement",
+    result: Result, name: str, title: str, caption: str, columns: Sequence[Column], numbers: Sequence[Number]
 ) -> list[Table]:
-    """One row a scene, and the macro mean of several; columns that no unit has a number for are left out."""
-    judged = judged_records(result, section)
-    records = [record for rows in judged.values() for record in rows]
-    known = [k for k, take in enumerate(numbers) if not all(math.isnan(_value(take(record))) for record in records)]
+    """One row a scene, and the macro mean of several; columns and units that have no number are left out."""
+    cells = {
+        backbone: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
+        for backbone, rows in judged_records(result).items()
+    }
+    cells = {backbone: {scene: row for scene, row in rows.items() if _known(row)} for backbone, rows in cells.items()}
+    known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
     if not known:
         return []
 
-    def row(scene: str, cells: Sequence[float | Estimate]) -> Row:
-        return scene, *(cells[k] for k in known)
+    def row(scene: str, of: Sequence[float | Estimate]) -> Row:
+        return scene, *(of[k] for k in known)
 
     groups = tuple(
         Group(
             backbone,
-            tuple(row(record.unit.scene, [take(record) for take in numbers]) for record in rows),
-            row("Mean", [_mean(take, rows) for take in numbers]) if len(rows) > 1 else None,
+            tuple(row(scene, own) for scene, own in rows.items()),
+            row("Mean", _means(list(rows.values()))) if len(rows) > 1 else None,
         )
-        for backbone, rows in judged.items()
+        for backbone, rows in cells.items()
+        if rows
     )
     return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
 
 
-def judged_records(result: Result, section: str = "agreement") -> dict[str, list[Record]]:
-    """The base units by backbone whose statistics have that section."""
-    return by_backbone(record for record in result.select() if record.statistics.get(section))
+def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
+    """The base units that have statistics, with these, by backbone."""
+    judged = {
+        backbone: [(record, record.statistics) for record in records if record.statistics is not None]
+        for backbone, records in by_backbone(result.select()).items()
+    }
+    return {backbone: rows for backbone, rows in judged.items() if rows}
 
 
-def number(*path: str) -> Number:
-    """The number at a path of keys in a unit's statistics."""
-    return lambda record: number_at(record.statistics, *path)
-
-
-def estimate(*path: str) -> Number:
-    """The estimate at a path of keys in a unit's statistics."""
-    return lambda record: estimate_at(record.statistics, *path)
-
-
-def percent(*path: str) -> Number:
-    """The estimate of a share at a path of keys, in percent."""
-
-    def hundredfold(record: Record) -> Estimate:
-        share = estimate_at(record.statistics, *path)
-        return Estimate(100 * share.value, 100 * share.low, 100 * share.high)
-
-    return hundredfold
+def tested(take: Callable[[DriftTests], float]) -> Number:
+    """A number of the drift's tests; NaN where there are none."""
+    return lambda found: math.nan if found.drift.tests is None else take(found.drift.tests)
 
 
 def _value(found: float | Estimate) -> float:
     return found.value if isinstance(found, Estimate) else found
 
 
-def _mean(take: Number, records: Sequence[Record]) -> float:
-    return macro_mean([_value(take(record)) for record in records])
+def _known(row: Sequence[float | Estimate]) -> list[int]:
+    """Which of the numbers are defined."""
+    return [k for k, cell in enumerate(row) if not math.isnan(_value(cell))]
 
 
-def rows_of(records: Sequence[Record], *path: str) -> dict[str, list[Mapping[str, Any]]]:
-    """The rows of a list in the units' statistics by their first entry, a name."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
-    for record in records:
-        rows: Any = record.statistics
-        for key in path:
-            rows = rows[key]
-        for row in rows:
-            found.setdefault(next(iter(row.values())), []).append(row)
+def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
+    """The macro mean of each column."""
+    return [macro_mean([_value(cell) for cell in column]) for column in zip(*rows, strict=True)]
+
+
+def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
+    """The rows of several units by their name, in order of appearance."""
+    found: dict[str, list[T]] = {}
+    for row in rows:
+        found.setdefault(name(row), []).append(row)
     return found
 
 
-def means(rows: Sequence[Mapping[str, Any]], *keys: str) -> list[float]:
-    """The macro mean of each of these entries."""
-    return [macro_mean([number_at(row, key) for row in rows]) for key in keys]
-
-
-def _class_rows(records: Sequence[Record]) -> tuple[Row, ...]:
+def _class_rows(judged: Sequence[tuple[Record, MapStatistics]]) -> tuple[Row, ...]:
+    by_name = grouped((row for _, found in judged for row in found.agreement.classes), lambda row: row.name)
     return tuple(
-        (name, sum(number_at(row, "observations") for row in rows), *means(rows, "kappa", "alpha"))
-        for name, rows in rows_of(records, "agreement", "classes").items()
+        (
+            name,
+            sum(row.observations for row in rows),
+            macro_mean([row.kappa for row in rows]),
+            macro_mean([row.alpha for row in rows]),
+        )
+        for name, rows in by_name.items()
     )
 
 
-def _verdict_row(record: Record) -> Row:
-    level = str(record.statistics["verdict"]["level"])
+def _verdict_row(record: Record, found: MapStatistics) -> Row:
+    right = found.correctness
     return (
         record.unit.scene,
-        level,
-        estimate_at(record.statistics, "agreement", "alpha"),
-        percent("correctness", "quadrants", "wrong_of_stable")(record),
-        number_at(record.statistics, "repeated", "voxels"),
-        100 * number_at(record.statistics, "repeated", "share"),
-        ADVICE[level],
+        found.verdict.level,
+        found.agreement.alpha,
+        UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
+        found.repeated.voxels,
+        100 * found.repeated.share,
+        ADVICE[found.verdict.level],
     )

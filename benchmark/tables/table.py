@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semstab.averages import Spread
+from semstab.measures import Quantity
 from semstab.statistics import Estimate
 
 UNDEFINED = "--"
@@ -34,6 +35,12 @@ class Column:
     signed: bool = False
     scientific: bool = False
     over: str = ""
+
+    @classmethod
+    def of(cls, quantity: Quantity, *, compared: bool = False, prefix: str = "", over: str = "") -> Column:
+        """Of a measure: with the decimals of a summary, or of a comparison."""
+        digits = quantity.digits[compared]
+        return cls(prefix + quantity.key, quantity.title, digits, quantity.better, over=over)
 
     def number(self, value: float) -> str:
         """The rounded number; UNDEFINED where there is none."""

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from semstab.frames import Frame, Intrinsics
+from semstab.measures import SBD_MAX
 from semstab.metrics import entropy, sbd, vss
 from semstab.voxels import VoxelTable
 
@@ -30,7 +31,7 @@ LOOKING = {
 H_THIRD = math.log2(3) - 2 / 3
 """Entropy of (2/3, 1/3) in bits: 2/3 log2(3/2) + 1/3 log2 3."""
 
-JS_HALF = 1.5 - 0.75 * math.log2(3)
+JS_HALF = SBD_MAX
 """D_JS((1, 0), (1/2, 1/2)) = 0.31128 bits: with m = (3/4, 1/4) it is H(m) - (H(1, 0) + H(1/2, 1/2)) / 2.
 
 H(m) = 3/4 log2(4/3) + 1/4 log2 4 = 2 - 3/4 log2 3, and the other two entropies are 0 and 1.

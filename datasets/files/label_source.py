@@ -18,6 +18,7 @@ from semstab.labels import LabelSpace
 logger = logging.getLogger("semstab")
 
 Kind = Literal["labels", "scores", "masks"]
+KINDS: tuple[Kind, ...] = ("labels", "scores")
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES, "masks": MASK_SUFFIXES}
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
 REGIONS = "regions/{backbone}/{name}"
@@ -65,7 +66,7 @@ def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) 
     base = place.folder if options.labels_root is None else options.labels_root
     if not base.is_dir():
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
-    for kind in ("labels", "scores"):
+    for kind in KINDS:
         for backbone, template in _templates(kind, options, place, base).items():
             source = _source(kind, base, template, names, folders)
             name = f"{backbone}-scores" if kind == "scores" and not isinstance(options.scores, dict) else backbone
@@ -76,11 +77,26 @@ def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) 
             elif names:
                 logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(names[0])[0])
     if not found and (options.labels or options.scores or options.labels_root):
-        logger.warning("%s: no label maps in %s fit the options labels and scores", place.name, base)
+        logger.warning(
+            "%s: no label maps in %s fit the options labels and scores; looked for %s",
+            place.name, base, ", ".join(label_paths(options, place, names)),
+        )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in found:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
         source = _source("labels", place.folder, truth.filled(scene=place.below_root), names, folders)
         found |= {GROUND_TRUTH: source} if source.files else {}
+    return found
+
+
+def label_paths(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> list[str]:
+    """Where label maps and scores are looked for: the paths of the first frame, with BACKBONE for any name."""
+    base, found = options.labels_root or place.folder, []
+    for kind in KINDS:
+        said = _said(kind, options)
+        for template in said.values() if isinstance(said, dict) else [said] if said else []:
+            name = template.replace("{scene}", place.below_root).replace("{backbone}", "BACKBONE")
+            path = base / name.replace("{name}", names[0] if names else "NAME")
+            found.append(str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}"))
     return found
 
 
@@ -111,19 +127,25 @@ def find_masks(options: FileOptions, place: ScenePlace, names: Sequence[str]) ->
     return _source("masks", place.folder, template, names, Folders()).files
 
 
+def _said(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
+    """The template of every backbone, or one of each by its name; None where there are none of that kind."""
+    said = options.labels if kind == "labels" else options.scores
+    if said is not None:
+        return said
+    if options.labels_root is not None:
+        return SEPARATE if kind == "labels" else None
+    return DEFAULTS[kind]
+
+
 def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) -> dict[str, str]:
     """By backbone, a template in which only {name} is left."""
-    said = options.labels if kind == "labels" else options.scores
+    said = _said(kind, options)
     if isinstance(said, dict):
         templates = {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in said.items()}
         return {key: template.filled(scene=place.below_root) for key, template in templates.items()}
-    if said is None and options.labels_root is not None:
-        if kind == "scores":
-            return {}
-        said = SEPARATE
-    template = Template(
-        kind, DEFAULTS[kind] if said is None else said, ("scene", "backbone", "name"), ("backbone", "name")
-    )
+    if said is None:
+        return {}
+    template = Template(kind, said, ("scene", "backbone", "name"), ("backbone", "name"))
     return matching_folders(base, template, "backbone", scene=place.below_root)
 
 

@@ -11,10 +11,11 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.label_source import ScenePlace
 from semstab.datasets.files.messages import nearest
 from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.scene import FileScene, FrameSource
+from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.label_ids import translated, without_labels, without_scores
 from semstab.datasets.files.label_source import (
     LABEL_SPACE_FILE,
     LabelSource,
@@ -20,11 +21,12 @@ from semstab.datasets.files.label_source import (
     find_masks,
     find_regions,
     find_sources,
+    label_paths,
     label_space,
 )
 from semstab.datasets.files.messages import listed, nearest
 from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.templates import Folders, inside
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.colmap_depth import read_depth_map
 from semstab.datasets.formats.images import MILLIMETRES, read_color, read_depth, read_labels, read_mask, read_scores
@@ -37,39 +39,10 @@ from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
 from semstab.datasets.views.same_view import fitted
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame, Intrinsics
-from semstab.labels import IGNORE_16BIT, LabelSpace, ignore_id
-
-NO_ID = IGNORE_16BIT - 1
-"""In a table of class ids: an id that is not in it."""
+from semstab.labels import LabelSpace
 
 PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table"}
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
-
-
-@dataclass(frozen=True, eq=False)
-class FrameSource:
-    """Where one frame comes from.
-
-    name          what path templates call it
-    depth         the file
-    pose_file     the file that holds its pose, or all poses
-    camera        of the depth image
-    pose          (4, 4) in the dataset's convention, where it is not in a file of its own
-    label_camera  of the images that label maps belong to, where that is another one
-    color         the file that it has, or would have; None where that is not known
-    depth_scale   units in a metre, where the dataset's own files say so
-    timestamp     seconds
-    """
-
-    name: str
-    depth: Path
-    pose_file: Path
-    camera: Camera
-    pose: Poses | None = None
-    label_camera: Camera | None = None
-    color: Path | None = None
-    depth_scale: float | None = None
-    timestamp: float | None = None
 
 
 class FileScene(Scene):
@@ -90,6 +63,9 @@ class FileScene(Scene):
         names = [frame.name for frame in frames]
         if len(set(names)) < len(names):
             raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
+        for frame in frames:  # files of predictions are called so
+            if ".." in frame.name or frame.name.startswith("/"):
+                inside(place.folder, place.folder, frame.name, str(frame.pose_file))
         self.name = place.name
         self.folder = place.folder
         self.options = options
@@ -103,6 +79,7 @@ class FileScene(Scene):
         self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
+        self.label_paths = tuple(label_paths(options, place, names))
         self._masks = find_masks(options, place, names)
         self._folders = Folders()
         self._spaces: dict[str, LabelSpace | None] = {}
@@ -285,18 +262,16 @@ class FileScene(Scene):
     def _labels(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Labels:
         labels = read_labels(path, self._space(backbone), self._read)
         if backbone in self._class_ids:
-            labels = _translated(labels, self._class_ids[backbone], path)
+            labels = translated(labels, self._class_ids[backbone], path)
         if void := self.options.void_ids.get(backbone):
-            labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
+            labels = without_labels(labels, void)
         return self._stored(index, labels, shape, path, "labels are")
 
     def _scores(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Scores:
         scores = read_scores(path, self.options.scores_layout or "KHW", (shape[0], shape[1]), self._read)
         if void := self.options.void_ids.get(backbone):
             space = self._space(backbone)
-            ids = range(scores.shape[2]) if space is None else space.ids
-            ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
-            scores = np.where(ignored[..., None], scores.dtype.type(0), scores)
+            scores = without_scores(scores, range(scores.shape[2]) if space is None else space.ids, void)
         return self._stored(index, scores, shape, path, "scores are")
 
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
@@ -363,11 +338,3 @@ class FileScene(Scene):
         if not 0 <= index < len(self):
             raise ConfigError(f"{self.folder}: there is no frame {index}; it has {len(self)}, counted from 0")
         return self._frames[index]
-
-
-def _translated(labels: Labels, table: npt.NDArray[np.uint16], path: Path) -> Labels:
-    """table[labels]. Raises DataError for an id that the table does not have."""
-    translated: Labels = table[labels]
-    if (unknown := translated == NO_ID).any():
-        raise DataError(f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?")
-    return translated

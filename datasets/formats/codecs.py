@@ -27,10 +27,13 @@ from semstab.datasets.formats.disk import AGAIN
 from semstab.errors import DataError, one_line
 
 MAX_PIXELS = 2**28
+MAX_IMAGE_BYTES = 2**29
+"""Of a decoded image: RGB of 178 megapixels."""
 
 # --- PNG ------------------------------------------------------------------------------------------------------------
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 PNG_KINDS: Mapping[int, str] = {0: "grey", 2: "RGB", 3: "palette", 4: "grey+alpha", 6: "RGBA"}
 
 
@@ -125,7 +128,7 @@ def parse_png(path: Path, data: bytes) -> Png:
     width, height, bits, color_type, *_ = header = struct.unpack(">IIBBBBB", chunks[0][1])
     if color_type not in PNG_KINDS or bits not in (1, 2, 4, 8, 16):
         raise DataError(f"{path}: the PNG header is damaged (colour type {color_type}, {bits} bits); {AGAIN}")
-    _check_pixels(path, width, height)
+    _check_pixels(path, width, height, PNG_CHANNELS[color_type] * max(1, bits // 8))
     return Png(path, header, chunks)
 
 
@@ -139,7 +142,7 @@ def decode_jpeg(path: Path, data: bytes) -> npt.NDArray[np.uint8]:
     damage = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error, ZeroDivisionError)
     try:
         image = JpegImagePlugin.JpegImageFile(io.BytesIO(data))
-        _check_pixels(path, *image.size)
+        _check_pixels(path, *image.size, 3)
         return np.array(image.convert("RGB"))
     except DataError:
         raise
@@ -226,7 +229,8 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
     return image
 
 
-def _check_pixels(path: Path, width: int, height: int) -> None:
+def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1) -> None:
     """Before memory is allocated for what a header claims."""
-    if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
-        raise DataError(f"{path}: claims {width}x{height} pixels (at most {MAX_PIXELS} are read); is it damaged?")
+    most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
+    if not (width > 0 and height > 0 and width * height <= most):
+        raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")

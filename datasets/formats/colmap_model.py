@@ -21,6 +21,7 @@ from semstab.datasets.formats.text_tables import to_number
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import Poses, from_quaternions
 from semstab.errors import DataError
+from semstab.files import open_file
 from semstab.frames import Intrinsics
 
 MODELS = (
@@ -184,7 +185,7 @@ def _name(file: BufferedReader, path: Path) -> str:
 
 def _opened(path: Path) -> BufferedReader:
     try:
-        return path.open("rb")
+        return open_file(path)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 

@@ -9,16 +9,21 @@ from collections.abc import Container
 from pathlib import Path
 
 from semstab.errors import DataError
+from semstab.files import open_file, read_limited
 
 AGAIN = "copy or export it again"
+MAX_BYTES = 2**32
 DIGEST = "sha256"
 """Processors have instructions for it: there it takes half of blake2b's time."""
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file. Raises DataError where it cannot be read, is empty, or is a Git LFS pointer."""
+def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
+    """The content of a file of at most `limit` bytes.
+
+    Raises DataError where it cannot be read, is no file, too large or empty, or is a Git LFS pointer.
+    """
     try:
-        data = path.read_bytes()
+        data = read_limited(path, limit)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if not data:
@@ -36,7 +41,7 @@ def digest(data: bytes) -> bytes:
 def file_digest(path: Path) -> bytes:
     """The same of a file that was not read. Raises DataError where it cannot be."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return hashlib.file_digest(file, DIGEST).digest()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.formats.arrays import decode_array
+from semstab.datasets.formats.arrays import MAX_SCORE_BYTES, decode_array
 from semstab.datasets.formats.codecs import Png, decode_exr, decode_jpeg, decode_tiff, parse_png
 from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.views.resampling import Labels
@@ -25,6 +25,8 @@ MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
+PIXELS_AT_ONCE = 2**20
+"""Of a label map of colours: looking them up takes many times the memory of the image."""
 
 Size = tuple[int, int]
 Read = Callable[[Path], bytes]
@@ -82,7 +84,7 @@ def read_scores(
     `size` is (H, W) of the depth, to recognise the other layout. Raises DataError where the file has another
     type or layout, or is damaged.
     """
-    scores = decode_array(path, read(path), "scores")
+    scores = decode_array(path, read(path), "scores", MAX_SCORE_BYTES)
     if scores.ndim != 3 or scores.dtype.kind != "f":
         raise DataError(
             f"{path}: scores must be float16 or float32 with three axes, got {scores.dtype} of shape {scores.shape}"
@@ -147,14 +149,22 @@ def _opaque(path: Path, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def _labels_by_color(path: Path, rgb: npt.NDArray[np.uint8], space: LabelSpace) -> Labels:
-    ids = _ids_by_color(space)[_packed(rgb)]
-    if (unknown := ids == NO_CLASS).any():
-        y, x = np.argwhere(unknown)[0]
+    table, (H, W) = _ids_by_color(space), rgb.shape[:2]
+    ids = np.empty((H, W), dtype=np.uint8 if max(space.ids) < IGNORE_8BIT else np.uint16)
+    rows, count, first = max(1, PIXELS_AT_ONCE // W), 0, (0, 0)
+    for top in range(0, H, rows):
+        found = table[_packed(rgb[top : top + rows])]
+        if (unknown := found == NO_CLASS).any():
+            y, x = np.argwhere(unknown)[0]
+            first = first if count else (top + int(y), int(x))
+            count += int(np.count_nonzero(unknown))
+        ids[top : top + rows] = found
+    if count:
         raise DataError(
-            f"{path}: colour {tuple(rgb[y, x].tolist())} at pixel ({x}, {y}) ({np.count_nonzero(unknown)} pixels) is no"
+            f"{path}: colour {tuple(rgb[first].tolist())} at pixel ({first[1]}, {first[0]}) ({count} pixels) is no"
             f" class of '{space.name}'; set taxonomy to the one whose colours the image has"
         )
-    return ids.astype(np.uint8) if max(space.ids) < IGNORE_8BIT else ids
+    return ids
 
 
 @functools.lru_cache(maxsize=2)

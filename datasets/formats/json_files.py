@@ -19,9 +19,7 @@ MAX_JSON_BYTES = 2**28
 
 def read_object(path: Path) -> dict[str, Any]:
     """The object in a file. Raises DataError where there is none."""
-    data = read_bytes(path)
-    if len(data) > MAX_JSON_BYTES:
-        raise DataError(f"{path}: {len(data)} bytes are too many for such a file; is it the right one?")
+    data = read_bytes(path, MAX_JSON_BYTES)
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as error:

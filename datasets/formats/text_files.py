@@ -46,9 +46,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def _numbers(path: Path) -> list[float]:
-    data = read_bytes(path)
-    if len(data) > MAX_TEXT_BYTES:
-        raise DataError(f"{path}: {len(data)} bytes are too many for one matrix; write one file a frame")
+    data = read_bytes(path, MAX_TEXT_BYTES)
     words = data.decode("utf-8-sig", errors="replace").replace(",", " ").split()
     try:
         return [float(word) for word in words]

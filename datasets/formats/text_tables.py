@@ -20,9 +20,7 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
 
     Raises DataError where the file cannot be read or is larger than any such table.
     """
-    data = read_bytes(path)
-    if len(data) > MAX_TABLE_BYTES:
-        raise DataError(f"{path}: {len(data)} bytes are too many for such a table; is it the right file?")
+    data = read_bytes(path, MAX_TABLE_BYTES)
     for number, line in enumerate(data.decode("utf-8-sig", errors="replace").split("\n"), start=1):
         text = line.strip()
         if text and not text.startswith("#"):

@@ -10,7 +10,9 @@ import numpy as np
 from semstab import backends
 from semstab.files import write_json, write_text
 from semstab.frames import Frame, Intrinsics
-from semstab.metrics import entropy, sbd, summarise, vss
+from semstab.json_form import to_json
+from semstab.measures import measures
+from semstab.metrics import summarise
 from semstab.tables import tables, to_csv, to_latex, to_markdown
 
 FILE = Path(__file__).parent / "small_map.json"
@@ -46,10 +48,10 @@ def golden(backend="numpy"):
             del report[name]
     table = fusion.table()
     columns = {name: value for name, value in vars(table).items() if isinstance(value, np.ndarray)}
-    columns |= {"vss": vss(table), "sbd": sbd(table), "entropy": entropy(table)}
+    columns |= {measure.key: measure.of(table) for measure in measures()}
     return {
         "voxels": {name: column.tolist() for name, column in columns.items()},
-        "summary": dataclasses.asdict(summarise(table)),
+        "summary": to_json(summarise(table)),
         "reports": reports,
     }
 

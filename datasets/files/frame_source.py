@@ -1,0 +1,35 @@
+"""Where one frame of a sequence of files comes from: what a reader lists."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.poses import Poses
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSource:
+    """Where one frame comes from.
+
+    name          what path templates call it
+    depth         the file
+    pose_file     the file that holds its pose, or all poses
+    camera        of the depth image
+    pose          (4, 4) in the dataset's convention, where it is not in a file of its own
+    label_camera  of the images that label maps belong to, where that is another one
+    color         the file that it has, or would have; None where that is not known
+    depth_scale   units in a metre, where the dataset's own files say so
+    timestamp     seconds
+    """
+
+    name: str
+    depth: Path
+    pose_file: Path
+    camera: Camera
+    pose: Poses | None = None
+    label_camera: Camera | None = None
+    color: Path | None = None
+    depth_scale: float | None = None
+    timestamp: float | None = None

@@ -1,0 +1,118 @@
+"""What a check points out though it may be right: values that mean 'no depth', and labels off the edges of depth."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from posed_writer import write_posed
+from room_scene import CLASSES, Room, walk, write
+from typer.testing import CliRunner
+
+from semstab.check import check
+from semstab.check.registration import depth_edges, find_offset, grey_levels, image_edges
+from semstab.check.sentinels import find_sentinel
+from semstab.cli import app
+from semstab.datasets import open_dataset
+from semstab.plan import load_config, resolve
+
+DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
+
+
+def remarks(root, **options):
+    dataset = {"name": "posed_folder", "options": {"root": str(root), **options}}
+    (checked,) = check(resolve(load_config(None, {"dataset": dataset, "check_geometry": False})))
+    return checked.remarks
+
+
+# --- no depth
+
+
+def with_gaps(z, value=65.535):
+    z = np.round(z, 3)
+    z[10:20, 30:50] = value
+    return z
+
+
+def test_65535_in_16_bits_is_pointed_out(tmp_path):
+    room = Room(walk(6), told_depth=with_gaps)
+    sources = {name: [room.frame(i, name) for i in range(6)] for name in ("net", "gt")}
+    folder = write_posed(tmp_path / "room", [f"{i:03d}" for i in range(6)], sources, classes=list(CLASSES))
+    (remark,) = remarks(folder)
+    assert "2.9% of the pixels with depth have the value 65535 (65.54 m), and nothing lies between it and " in remark
+    assert remark.endswith(f"it means 'no depth'; set invalid_depth: [65535] (set it in {folder}/scene.yaml)")
+    assert remarks(folder, invalid_depth=[65535]) == ()
+    result = CliRunner().invoke(app, ["check", "--data", str(folder)], env={"COLUMNS": "80", "NO_COLOR": "1"})
+    assert "look: 2.9% of the pixels with depth have the value 65535" in result.stdout
+
+
+def test_far_walls_and_noise_are_depth(tmp_path):
+    assert remarks(write(tmp_path / "room", Room(walk(6)))) == ()
+    rng = np.random.default_rng(0)
+    assert find_sentinel([rng.uniform(1, 9, (50, 60)).astype(np.float32)], 1.0) is None
+    assert find_sentinel([np.full((5, 6), 2, np.float32)], 1000.0) is None
+    assert find_sentinel([np.zeros((5, 6), np.float32)], 1000.0) is None
+    assert find_sentinel([], 1000.0) is None
+
+
+# --- registration
+
+
+def zoomed(image, scale, x=0.0):
+    H, W = image.shape
+    about = np.array([[scale, 0, (1 - scale) * (W - 1) / 2 + x], [0, scale, (1 - scale) * (H - 1) / 2]])
+    return cv2.warpAffine(image, about, (W, H), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+
+class Unregistered(Room):
+    """Labels as a colour camera of another focal length has them, or one beside the depth camera."""
+
+    def __init__(self, scale, x=0.0):
+        super().__init__(walk(12))
+        self.change = (scale, x)
+
+    def frame(self, index, backbone, *, color=True):
+        frame = super().frame(index, "gt", color=color)
+        return dataclasses.replace(frame, labels=zoomed(np.array(frame.labels), *self.change))
+
+
+@pytest.mark.parametrize(("scale", "x"), [(525 / 585, 0), (585 / 525, 0), (1, 6), (1, -7)])
+def test_labels_that_are_not_registered_are_pointed_out(tmp_path, scale, x):
+    (remark,) = remarks(write(tmp_path / "room", Unregistered(scale, x)))
+    assert remark.startswith("labels of net look as if they were not registered to the depth: their edges lie on")
+    enlarged = float(remark.partition("enlarged ")[2].split()[0])
+    assert enlarged == pytest.approx(1 / scale, abs=0.05)
+
+
+def test_labels_that_are_registered_are_not(tmp_path):
+    assert remarks(write(tmp_path / "room", Unregistered(1))) == ()
+
+
+def test_edges_that_have_nothing_to_do_with_each_other_are_not():
+    rng = np.random.default_rng(1)
+    depths = [np.kron(rng.uniform(1, 5, (9, 12)), np.ones((8, 8))).astype(np.float32) for _ in range(10)]
+    noise = [np.kron(rng.random((18, 24)) < 0.2, np.ones((4, 4))) > 0 for _ in range(10)]
+    assert find_offset(list(zip(depths, noise, strict=True))) is None
+    assert find_offset([(depth, depth_edges(depth)) for depth in depths]) is None
+    assert find_offset([]) is None
+
+
+@pytest.mark.parametrize("name", ["apc_shelf", "hololens", "brighton"])
+def test_real_data_are_registered_and_have_no_such_values(name):
+    if not (DATA / name).is_dir():
+        pytest.skip(f"no {DATA / name}; set SEMSTAB_DATA to the folder that holds {name}/")
+    assert remarks(DATA / name) == ()
+
+
+def test_real_images_of_another_focal_length_are_pointed_out():
+    if not (DATA / "hololens").is_dir():
+        pytest.skip(f"no {DATA / 'hololens'}; set SEMSTAB_DATA to the folder that holds hololens/")
+    scene = open_dataset("posed_folder", {"root": DATA / "hololens"}).scene("hololens")
+    greys = {k: grey_levels(scene.image(k)) for k in range(0, 96, 6)}
+    for scale in (525 / 585, 585 / 525):
+        pairs = [(scene.depth(k), image_edges(zoomed(grey, scale))) for k, grey in greys.items()]
+        assert find_offset(pairs).scale == pytest.approx(1 / scale, abs=0.03)

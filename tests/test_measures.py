@@ -1,0 +1,173 @@
+"""A measure is declared once: one that is registered here, at run time, is found in everything that a run writes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import rerun as rr
+import tiny_study
+from rich.console import Console
+
+import semstab
+from semstab.averages import describe, levels
+from semstab.config import Config
+from semstab.errors import ConfigError
+from semstab.measures import VSS, Measure, measures, register, registered
+from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
+from semstab.plots.histograms import histograms
+from semstab.plots.judgement import statistics_figures
+from semstab.plots.maps import draw_stability
+from semstab.plots.sweeps import draw_sweep
+from semstab.recording import Recording, looks
+from semstab.recording.voxel_maps import defaults
+from semstab.study import run_study
+from semstab.study.folder import load_study_result
+from semstab.tables import tables, to_csv
+from semstab.terminal import print_summary
+from semstab.voxels import VoxelTable
+
+
+def second_largest(table):
+    """The second largest belief (n,), where a voxel was seen three times or more."""
+    belief = np.sort(table.evidence / table.evidence.sum(axis=1, keepdims=True), axis=1)[:, -2]
+    return np.where(table.op >= 3, belief, np.nan)
+
+
+RIVAL = Measure(
+    key="rival", title="Rival", short="R2", unit="parts", better="lower", digits=(2, 5), of=second_largest,
+    range=(0.0, 0.4), lowest_op=3, largest=0.5,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def registered_rival():
+    with registered(RIVAL):
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, registered_rival):
+    """A run of two backends with statistics and a recording: its result and folder."""
+    base = tmp_path_factory.mktemp("rival")
+    root, out = tiny_study.write(base / "data" / "wall"), base / "run"
+    config = Config.build(
+        {
+            "dataset": {"name": "posed_folder", "options": {"root": str(root)}}, "voxel_size": 0.25,
+            "backends": ["numba"], "check": "numpy", "statistics": True,
+        }
+    )  # fmt: skip
+    return semstab.run(config, out=out, observers=[Recording(out / "recording.rrd")]), out
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory, registered_rival):
+    """A study with a sweep and statistics: its result and folder."""
+    base = tmp_path_factory.mktemp("rivals")
+    config = tiny_study.configure(
+        tiny_study.write(base / "data" / "wall"), statistics=True, sweeps={"voxel_size": [0.25, 0.5]}
+    )
+    return run_study(config, base / "study"), base / "study"
+
+
+def test_the_summary_has_its_means_and_reads_them_back(run, study) -> None:
+    result, out = run
+    summary = json.loads((out / "summary.json").read_text())
+    entry, table = summary["runs"][0], VoxelTable.load(out / "voxels" / "wall__a__numba.parquet")
+    values = second_largest(table)
+    assert entry["rival"] == pytest.approx(np.nanmean(values))
+    assert entry["recurrent"]["rival_voxels"] == np.count_nonzero(table.op >= 3)
+    assert entry["strata"][0]["rival"] is None
+    assert result.runs[0].table[RIVAL] == entry["rival"]
+    assert all("rival" in row["differences"] for row in summary["agreement"])
+    found, folder = study
+    again = load_study_result(folder)
+    assert [row.summary.table[RIVAL] for row in again.records] == [row.summary.table[RIVAL] for row in found.records]
+    assert again.records[0].summary.table.recurrent.defined(RIVAL) > 0
+
+
+def test_parquet_has_it_voxel_by_voxel(run) -> None:
+    path = run[1] / "voxels" / "wall__b__numpy.parquet"
+    values = pq.read_table(path, columns=["rival"]).column("rival").to_numpy()
+    np.testing.assert_array_equal(values, second_largest(VoxelTable.load(path)))
+
+
+def test_the_terminal_shows_it(run) -> None:
+    result, _ = run
+    text = io.StringIO()
+    print_summary(result, Console(file=text, width=120))
+    scenes, strata, agreement = (
+        text.getvalue().partition(head)[2] for head in ("numba, voxels", "by obs", "agreement:")
+    )
+    for part in (scenes, strata):
+        assert "rival ↓" in part.partition("──")[0]
+        assert "parts" in part.partition("──")[0]
+    assert f" {result.runs[0].table[RIVAL]:.2f} " in scenes
+    assert "|ΔR2|" in agreement
+    assert "R2 rival" in agreement
+
+
+def test_tables_and_the_comparison_have_it(study) -> None:
+    found = {table.name: list(csv.DictReader(io.StringIO(to_csv(table)))) for table in tables(study[0])}
+    base = {record.unit.backbone: record.summary.table for record in study[0].select()}
+    for name in ("scenes", "persistence", "classes", "cross_backbone", "fusion", "sensitivity_voxel_size", "rules"):
+        assert all("rival" in row for row in found[name]), name
+    assert [float(row["rival"]) for row in found["scenes"]] == [round(t[RIVAL], 2) for t in base.values()]
+    assert all(float(row["max_rival"]) < 1e-9 for row in found["agreement"])
+    (difference,) = (row for row in found["comparison"] if row["measure"] == "rival")
+    low, value, high = (float(difference[f"difference{part}"]) for part in ("_low", "", "_high"))
+    assert low <= value <= high
+    first, second = (float(row["value"]) for row in found["comparison_ranking"] if row["measure"] == "rival")
+    assert first <= second  # less of it is better
+
+
+def titles(figure) -> list[str]:
+    return [axes.get_title(loc="left") or axes.get_ylabel() for axes in figure.axes]
+
+
+def test_figures_show_it(study) -> None:
+    result, _ = study
+    table = result.select()[0].table()
+    found = {"a": histograms(table)}
+    swept = {"a": levels(result, "voxel_size", "a")}
+    panels = (
+        draw_ecdf(found, informative(found.values())),
+        draw_persistence(found),
+        draw_sweep(describe("voxel_size"), swept),
+        draw_stability(table, (0, -1, 0)),
+        next(figure for figure in statistics_figures(result, []) if figure.name == "comparison").draw(),
+    )
+    for figure in panels:
+        assert any("rival" in title.lower() for title in titles(figure)), titles(figure)
+    (shown,) = (axes for axes in panels[2].axes if axes.get_title(loc="left").endswith("Rival (parts)"))
+    means = [level.mean(lambda p: p.every[RIVAL]) for level in swept["a"]]
+    assert shown.containers[0].lines[0].get_ydata() == pytest.approx(means)
+
+
+def test_the_recording_colours_by_it(run) -> None:
+    look = looks()["rival"]
+    assert look.title == "Rival (0 to 0.4 and more parts; black: OP < 3)"
+    (archetype,) = defaults("rival")
+    assert archetype.value_range.as_arrow_array().to_pylist() == [[0.0, 0.4]]  # type: ignore[union-attr]
+    (store,) = rr.chunk.RrdReader(run[1] / "recording.rrd").recordings()
+    columns = {
+        name
+        for chunk in rr.chunk.RrdReader(run[1] / "recording.rrd").stream(store=store)
+        if "/map/a/" in chunk.entity_path
+        for name in chunk.to_record_batch().schema.names
+    }
+    assert "rival:values" in columns
+
+
+def test_it_is_gone_when_the_block_ends() -> None:
+    before = measures()
+    other = Measure(key="other", title="Other", better="higher", of=VSS.of, range=(0.0, 1.0))
+    with registered(other):
+        assert measures() == (*before, other)
+        with pytest.raises(ConfigError, match="there is a measure 'other' already"):
+            register(other)
+    assert measures() == before
