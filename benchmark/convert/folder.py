@@ -130,7 +130,7 @@ class SceneFolder:
         labels, scores = (self._label_path("", backbone, soft).parent for soft in (False, True))
         return scores.is_dir() and not labels.is_dir()
 
-    def write_geometry(self, name: str, frame: Frame, color: npt.NDArray[np.uint8] | None) -> None:
+    def write_geometry(self, name: str, frame: Frame) -> None:
         """Write what a frame shows beside labels.
 
         Raises DepthFormatError, or DataError where its intrinsics are not those of the frames before.
@@ -140,8 +140,8 @@ class SceneFolder:
         if stored is None:
             raise DepthFormatError
         self._require_same_camera(frame)
-        if color is not None:
-            write_png(self.path / "color" / f"{name}.png", np.ascontiguousarray(color[..., ::-1]))
+        if frame.color is not None:
+            write_png(self.path / "color" / f"{name}.png", np.ascontiguousarray(frame.color[..., ::-1]))
         if frame.mask is not None:
             write_png(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
         write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.T_wc))
