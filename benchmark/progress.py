@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console
@@ -14,6 +15,9 @@ from semstab.engine.units import Plan, Planned
 from semstab.records import Failure, Result
 from semstab.task import Task
 
+SECONDS_A_LINE = 10.0
+"""Where there is no terminal for a bar, progress is a line that often."""
+
 
 class ProgressBar(Observer):
     """One bar for all of it, in frames that go into maps."""
@@ -23,6 +27,7 @@ class ProgressBar(Observer):
         self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
         self.work = self.bar.add_task("starting", total=None)
         self.notes: list[str] = []
+        self._said = time.monotonic()
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
         """Show the bar: the frames of every unit that is to be computed are its total."""
@@ -31,7 +36,8 @@ class ProgressBar(Observer):
             self.bar.console.print(f"kept from before: {len(kept)} of {len(units)} units", style="dim")
         missing = units.keys() - {each.identity for each in kept}
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
-        self.bar.start()
+        if self.bar.console.is_interactive:
+            self.bar.start()
 
     def geometry_checked(self, task: Task, verdict: Verdict) -> None:
         """Remember, until the run is through, what could not be told."""
@@ -41,16 +47,23 @@ class ProgressBar(Observer):
     def advanced(self, frames: int, what: str) -> None:
         """So many frames further."""
         self.bar.update(self.work, advance=frames, description=what[:40])
+        if not self.bar.console.is_interactive and time.monotonic() - self._said > SECONDS_A_LINE:
+            self._said = time.monotonic()
+            (work,) = self.bar.tasks
+            self.bar.console.print(
+                f"{what}: {work.completed:.0f} of {work.total:.0f} frames", markup=False, soft_wrap=True
+            )
 
     def run_finished(self, result: Result) -> None:
         """Take the bar away, and say what could not be told."""
         self.close()
         for note in self.notes if not result.failures else ():
-            self.bar.console.print(note, style="dim", soft_wrap=True)
+            self.bar.console.print(note, style="dim", soft_wrap=True, markup=False)
 
     def close(self) -> None:
         """Take the bar away, also where the run was interrupted."""
-        self.bar.stop()
+        if self.bar.live.is_started:
+            self.bar.stop()
 
 
 def failure_lines(result: Result) -> Iterator[str]:
@@ -75,4 +88,4 @@ def _named(failure: Failure) -> str:
     if failure.variation.sweep == BASE:
         return ""
     value = failure.variation.value
-    return f"{failure.variation.sweep} {failure.unit.backend if value is None else value}"
+    return f"{failure.variation.sweep} {failure.unit.backend if value is None else f'{value:g}'}"

@@ -285,7 +285,7 @@ def test_rules_of_ones_own(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("classes: [a]\nrest: b\nrules: [{name: c}]", "rules.yaml: : the rule 'c' has no class of that name"),
+        ("classes: [a]\nrest: b\nrules: [{name: c}]", "rules.yaml: the rule 'c' has no class of that name"),
         ("classes: [a]\nrest: b\nrules: [{name: a, hew: {min: 1}}]", "unknown setting .*hew'; did you mean 'hue'"),
         ("classes: [a]", "rest: field required"),
     ],

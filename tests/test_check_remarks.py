@@ -18,7 +18,7 @@ from semstab.check.registration import depth_edges, find_offset, grey_levels, im
 from semstab.check.sentinels import find_sentinel
 from semstab.cli import app
 from semstab.datasets import open_dataset
-from semstab.plan import load_config, resolve
+from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 

@@ -376,7 +376,7 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
 
 def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    content = {"dataset": {"name": "posed_folder", "options": {"root": str(folder)}}, "backend": "numpy"}
+    content = {"dataset": {"name": "posed_folder", "options": {"root": str(folder)}}, "backends": ["numpy"]}
     file = tmp_path / "room.yaml"
     file.write_text(yaml.safe_dump(content | {"backbones": ["net"]}))
     refused = bench("study", file, "--out", tmp_path / "study", "-q")
@@ -391,7 +391,7 @@ def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
 def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
     seen = []
 
-    class Watching(semstab.pipeline.Observer):
+    class Watching(semstab.engine.Observer):
         def geometry_checked(self, task, verdict):
             seen.append((task.scene.name, verdict.state))
 

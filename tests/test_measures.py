@@ -16,6 +16,7 @@ from rich.console import Console
 import semstab
 from semstab.averages import describe, levels
 from semstab.config import Config
+from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
 from semstab.measures import VSS, Measure, measures, register, registered
 from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
@@ -25,8 +26,6 @@ from semstab.plots.maps import draw_stability
 from semstab.plots.sweeps import draw_sweep
 from semstab.recording import Recording, looks
 from semstab.recording.voxel_maps import defaults
-from semstab.study import run_study
-from semstab.study.folder import load_study_result
 from semstab.tables import tables, to_csv
 from semstab.terminal import print_summary
 from semstab.voxels import VoxelTable
@@ -85,7 +84,7 @@ def test_the_summary_has_its_means_and_reads_them_back(run, study) -> None:
     assert result.runs[0].table[RIVAL] == entry["rival"]
     assert all("rival" in row["differences"] for row in summary["agreement"])
     found, folder = study
-    again = load_study_result(folder)
+    again = load_result(folder)
     assert [row.summary.table[RIVAL] for row in again.records] == [row.summary.table[RIVAL] for row in found.records]
     assert again.records[0].summary.table.recurrent.defined(RIVAL) > 0
 

@@ -283,7 +283,7 @@ def test_a_run_reads_a_dataset_and_the_command_line_says_what_is_wrong_with_it(t
     options = {"root": str(tmp_path / "data"), "classes": CLASSES}
     dataset = {"name": "hololens", "options": options}
     config = load_config(overrides={"dataset": dataset, "backends": ["numpy"], "check": None, "voxel_size": 0.1})
-    (summary,) = run(config, out=tmp_path / "out").groups[0].runs
+    (summary,) = run(config, out=tmp_path / "out").runs
     assert (summary.unit.scene, summary.unit.backbone, summary.frames) == ("data", "net", COUNT)
     assert VoxelTable.load(tmp_path / f"out/voxels/{summary.unit.slug}.parquet").op.max() > 1
     (tmp_path / f"data/labels/net/{names[COUNT - 1]}.png").write_bytes(raw_png(60_000, 60_000, 8, 0, b""))

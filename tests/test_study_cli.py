@@ -80,16 +80,16 @@ def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file,
 
 
 def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
-    arguments = (file, "--set", "backends=[numba]", "--set", "backbones=[a]", "--only", "backends")
+    arguments = (file, "--set", "backends=[numpy, numba]", "--set", "backbones=[a]", "--only", "backends")
     out, errors = study(*arguments, "--set", "statistics=true", cwd=tmp_path)
-    files = ("report.html", "manifest.json", "study.yaml", "tables/scenes.csv", "figures/persistence.png")
+    files = ("report.html", "manifest.json", "config.yaml", "tables/scenes.csv", "figures/persistence.png")
     for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex", "figures/correctness.svg"):
         assert (tmp_path / "studies/tiny" / name).exists()
     assert max(len(line) for line in (out + errors).splitlines()) <= 80
     assert "agree" in out
     assert "seen once" in out
     assert "a: no verdict, too few places were seen twice" in " ".join(out.split())
-    assert "study folder: studies/tiny" in out
+    assert "folder: studies/tiny" in out
     page = (tmp_path / "studies/tiny/report.html").read_text()
     assert {"table-quadrants", "table-verdicts", "figure-correctness"} <= set(re.findall(r'id="([^"]+)"', page))
     runs = json.loads((tmp_path / "studies/tiny/summary.json").read_text())["runs"]
@@ -116,7 +116,7 @@ def test_failing_units_are_one_line_each_and_the_others_are_reported(root, file,
     out, errors = study(*arguments, cwd=tmp_path, code=2)
     wall = tmp_path / "wall"
     of_b, of_a = errors.splitlines()
-    assert of_b.startswith(f"error: wall, b: base numpy and 2 more: {wall}/labels/b/0002.png: not a PNG image")
+    assert of_b.startswith(f"error: wall, b: voxel_size 0.25 and 1 more: {wall}/labels/b/0002.png: not a PNG image")
     assert of_a.startswith(f"error: wall, a: frame_count 10: {wall}/depth/0003.png: not a PNG image")
     assert "seen once" in out
     assert (tmp_path / "out" / "report.html").exists()
@@ -128,12 +128,12 @@ def test_nothing_but_failures_is_still_a_summary(root, file, tmp_path) -> None:
         (root / f"labels/{name}/0002.png").write_bytes(b"no image")
     out, errors = study(file, "--out", "out", "--only", "base", cwd=tmp_path, code=2)
     assert len(errors.splitlines()) == 3
-    assert out == "study folder: out\n"
+    assert out == "folder: out\n"
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["runs"] == []
 
 
 def test_backends_that_disagree_end_with_their_own_code(file, tmp_path) -> None:
-    settings = ("backends=[numba]", "backbones=[a]", "tolerance=0", "voxel_size=0.7")
+    settings = ("backends=[numpy, numba]", "backbones=[a]", "tolerance=0", "voxel_size=0.7")
     arguments = [word for setting in settings for word in ("--set", setting)]
     _, errors = study(file, *arguments, "--only", "backends", "--quiet", cwd=tmp_path, code=3)
     assert errors == "error: the backends disagree; the agreement in studies/tiny/summary.json says where\n"
@@ -150,7 +150,7 @@ def test_backends_that_disagree_end_with_their_own_code(file, tmp_path) -> None:
             ["tiny.yaml", "--jobs", "2", "--scheduler", "tcp://x:1"],
             "--jobs and --scheduler: the scheduler's workers do",
         ),
-        (["tiny.yaml", "--out", "wall"], "is not empty and holds no study; choose another folder"),
+        (["tiny.yaml", "--out", "wall"], "is not empty and holds no run or study; choose another folder"),
     ],
 )
 def test_bad_input_is_one_line(file, tmp_path, arguments, message) -> None:

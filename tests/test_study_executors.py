@@ -19,6 +19,7 @@ from semstab.engine.jobs import Job
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, MissingDependencyError
+from semstab.settings import resolve
 
 BACKBONES = ("a", "b", "c", "d")
 
@@ -105,7 +106,7 @@ class Deadly:
 
 
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
-    config = tiny_study.resolve(configure(root, sweeps={}, backends=["numpy"]))
+    config = resolve(tiny_study.configure(root, sweeps={}, backends=["numpy"]))
     fine = [Job("wall", cell.unit.backbone, (cell.request(),), "start", tmp_path) for cell in make_plan(config).units]
     jobs = [fine[0], Job("wall", "x", (Deadly(),), "start", tmp_path), *fine[1:]]
     found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs, Observers([]))}
@@ -152,7 +153,7 @@ def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> N
 
 def test_a_script_without_a_main_guard_is_told_so(root, tmp_path) -> None:
     (tmp_path / "script.py").write_text(
-        "from semstab.engine import *\n"
+        "from semstab.config import Config\nfrom semstab.engine import LocalProcesses, run_study\n"
         f"config = Config.build({tiny_study.content(root)!r})\n"
         "run_study(config, 'out', executor=LocalProcesses(2))\n"
     )

@@ -72,13 +72,15 @@ class Figure:
         """Draw it and write FOLDER/NAME.png and .svg, byte for byte the same for the same content."""
         import matplotlib
 
-        paths = [folder / f"{self.name}.png", folder / f"{self.name}.svg"]
+        png, svg = folder / f"{self.name}.png", folder / f"{self.name}.svg"
         with matplotlib.rc_context(_STYLE):
             canvas = self.draw()
-            for path, metadata in zip(paths, ({"Software": None}, {"Date": None, "Creator": None}), strict=True):
-                with atomic_path(path) as temporary:
-                    canvas.savefig(temporary, dpi=DPI, metadata=metadata)
-        return paths
+            with atomic_path(png) as temporary:
+                canvas.savefig(temporary, dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
+            canvas.set_layout_engine("none")  # it is laid out by now; doing so again takes as long as drawing it
+            with atomic_path(svg) as temporary:
+                canvas.savefig(temporary, dpi=DPI, metadata={"Date": None, "Creator": None})
+        return [png, svg]
 
 
 def canvas(width: float, height: float) -> Canvas:

@@ -243,7 +243,7 @@ class FileScene(Scene):
     ) -> Frame:
         """The frame with labels or scores that have the depth's pixels."""
         source, timestamps = self._frame(index), self.timestamps
-        image = self._color_file(source) if color else None
+        image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
         mask = self._masks.get(source.name)
         known = {"depth": source.depth, "pose": source.pose_file, "color": image, "mask": mask} | dict(files or {})
         return Frame(
@@ -253,7 +253,7 @@ class FileScene(Scene):
             T_wc=self.T_wc(index),
             labels=labels,
             scores=scores,
-            color=None if image is None else read_color(image),
+            color=read_color(image) if color and image is not None else None,
             mask=None if mask is None else self._mask(index, mask, depth.shape),
             timestamp=None if timestamps is None else float(timestamps[index]),
             files={what: str(path) for what, path in known.items() if path is not None},
