@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from semstab.config import explain
-from semstab.errors import ConfigError
+from semstab.config import validated
 from semstab.labels import IGNORE_8BIT, LabelSpace
 from semstab.registry import Entry, Registry
 
@@ -80,16 +80,16 @@ class Backbone(Protocol):
     fit_frames    how many images `fit` wants, 0 for most
     """
 
-    label_space: LabelSpace | None
-    gives_scores: bool
-    fit_frames: int
+    label_space: LabelSpace | None = None
+    gives_scores: bool = False
+    fit_frames: int = 0
 
     def fit(self, images: Sequence[Image]) -> Backbone:
         """The backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
 
         Called once a sequence, before the first `predict`, whatever frames are predicted later.
         """
-        ...
+        return self
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """One prediction an image, in order, of the image's size. The images have one size.
@@ -104,6 +104,13 @@ class Backbone(Protocol):
         Predictions are kept and reused under it.
         """
         ...
+
+
+def image_digest(image: Image) -> str:
+    """A hash of an image's size and colours."""
+    content = hashlib.blake2b(repr(image.shape).encode(), digest_size=16)
+    content.update(np.ascontiguousarray(image).data)
+    return content.hexdigest()
 
 
 def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
@@ -122,10 +129,4 @@ def create(name: str, **options: Any) -> Backbone:
     Raises ConfigError for an unknown name or option, DataError for a model that cannot be loaded,
     MissingDependencyError where its packages are not installed.
     """
-    cls = REGISTRY.load(name)
-    model = cast("type[BaseModel]", cls.Options)
-    try:
-        validated = model.model_validate(options)
-    except ValidationError as error:
-        raise ConfigError(f"backbone '{name}': {explain(error, model)}") from error
-    return cast(Backbone, cls(validated))
+    return cast(Backbone, REGISTRY.load(name)(validated(options_model(name), options, f"backbone '{name}': ")))

@@ -111,6 +111,11 @@ class Checkpoint:
 AGAIN = "name a folder that save_pretrained wrote, or a hub id, of such a model"
 
 
+def bilinear(images: torch.Tensor, size: Any) -> torch.Tensor:
+    """Images (K, h, w) brought to (K, H, W), pixel areas aligned."""
+    return torch.nn.functional.interpolate(images[None], size=size, mode="bilinear", align_corners=False)[0]
+
+
 def checked_device(name: str) -> torch.device:
     """The device of that name. Raises ConfigError where torch has none."""
     try:

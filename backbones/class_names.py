@@ -15,7 +15,7 @@ import numpy as np
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.errors import ConfigError
 from semstab.files import parse_yaml
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelMapping, LabelSpace
+from semstab.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 
 Leniency = Literal["strict", "lenient"]
 
@@ -36,12 +36,12 @@ class Vocabulary:
 
     def matches(self, space: LabelSpace) -> bool:
         """Whether a model's classes come from this vocabulary."""
-        return {_key(name) for name in self.recognised_by} <= {key for name in space.classes for key in _keys(name)}
+        return {name_key(name) for name in self.recognised_by} <= {key for name in space.classes for key in _keys(name)}
 
     def target_of(self, name: str, leniency: Leniency) -> str | None:
         """The class of UAVid that a name is, None where it is none."""
         tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
-        found = {_key(member): target for table in tables for target, names in table.items() for member in names}
+        found = {name_key(member): target for table in tables for target, names in table.items() for member in names}
         return next((found[key] for key in _keys(name) if key in found), None)
 
 
@@ -61,10 +61,10 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
     ConfigError and names the class, lenient leaves the class out.
     """
     vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
-    rows, lost = [], []
+    known, rows, lost = target.row_of, [], []
     for name in source.classes:
         candidates = _candidates(name, vocabulary, leniency)
-        found = next((row for candidate in candidates if (row := _row(candidate, target)) is not None), None)
+        found = next((known[key] for key in map(name_key, candidates) if key in known), None)
         if found is None:
             lost.append(name)
         rows.append(None if found == LEFT_OUT else found)
@@ -76,10 +76,6 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
     return LabelMapping(source, target, tuple(rows))
 
 
-LEFT_OUT = -1
-"""The row of a class that the target ignores."""
-
-
 def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
     """What a class may be called in the target, the best first."""
     own = [name, *_parts(name)]
@@ -89,16 +85,7 @@ def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) ->
     return [*own, vocabulary.rest] if said is None else [said, *own]
 
 
-def _row(name: str, target: LabelSpace) -> int | None:
-    """The row of the class of that name or member, LEFT_OUT where it is ignored, None where it is not known."""
-    key = _key(name)
-    for row, (own, members) in enumerate(zip(target.classes, target.members, strict=True)):
-        if key in {_key(own), *(_key(member) for member in members)}:
-            return row
-    return LEFT_OUT if key in {_key(ignored) for ignored in target.ignored} else None
-
-
-class InTaxonomy:
+class InTaxonomy(Backbone):
     """A backbone whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
 
     Labels are the mapped classes of the model's own decision; scores of classes that fall together are added up.
@@ -111,7 +98,7 @@ class InTaxonomy:
         self._backbone = backbone
         self._leniency: Leniency = leniency
         self._mapping = class_mapping(backbone.label_space, target, leniency)
-        self.label_space: LabelSpace | None = dataclasses.replace(target, ids=tuple(range(len(target))))
+        self.label_space = dataclasses.replace(target, ids=tuple(range(len(target))))
         self.gives_scores = backbone.gives_scores
         self.fit_frames = backbone.fit_frames
 
@@ -133,20 +120,15 @@ class InTaxonomy:
         if prediction.scores is None:
             return Prediction(labels)
         scores = np.array(self._mapping.scores(prediction.scores, "prediction"), dtype=np.float32)
-        scores[labels == (IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT)] = 0
+        scores[labels == ignore_id(labels)] = 0
         return Prediction(labels, scores)
 
 
 def _keys(name: str) -> list[str]:
-    return [_key(name), *(_key(part) for part in _parts(name))]
+    return [name_key(name), *(name_key(part) for part in _parts(name))]
 
 
 def _parts(name: str) -> list[str]:
     """The synonyms of a name like 'door;double door' or 'building, edifice'."""
     parts = [part.strip() for part in re.split(r"[;,]", name)]
     return parts if len(parts) > 1 else []
-
-
-def _key(name: str) -> str:
-    """As `semstab.labels` compares names."""
-    return " ".join(name.replace("_", " ").replace("-", " ").lower().split())

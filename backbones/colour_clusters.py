@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
-from semstab.backbones import Image, Prediction
+from semstab.backbones import Backbone, Image, Prediction
 from semstab.config import Settings
 from semstab.errors import ConfigError
 from semstab.labels import IGNORE_8BIT, LabelSpace
@@ -51,7 +51,7 @@ class Codebook:
     variance: float
 
 
-class ColourClusters:
+class ColourClusters(Backbone):
     """Each pixel is the nearest cluster centre of its smoothed colour and local texture.
 
     Features are the CIE Lab colour smoothed by a Gaussian window, and the standard deviation of lightness in it. The
@@ -66,7 +66,7 @@ class ColourClusters:
         self.options = options
         self.fit_frames = options.fit_frames
         names = tuple(f"cluster {k}" for k in range(options.clusters))
-        self.label_space: LabelSpace | None = LabelSpace("colour clusters", names)
+        self.label_space = LabelSpace("colour clusters", names)
         self._codebook = codebook
 
     def fit(self, images: Sequence[Image]) -> ColourClusters:

@@ -6,10 +6,9 @@ import importlib.resources
 from pathlib import Path
 from typing import Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from semstab.config import Settings, explain, read_yaml
-from semstab.errors import ConfigError
+from semstab.config import Settings, read_yaml, validated
 from semstab.labels import LabelSpace
 
 SHIPPED = importlib.resources.files("semstab.configs") / "backbones" / "segearth_uavid.yaml"
@@ -64,7 +63,4 @@ class Prompts(Settings):
 def read_prompts(path: Path | None) -> Prompts:
     """The prompts of a file, those for UAVid where none is named. Raises ConfigError that names file and setting."""
     path = path or Path(str(SHIPPED))
-    try:
-        return Prompts.model_validate(read_yaml(path))
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error, Prompts)}") from error
+    return validated(Prompts, read_yaml(path), f"{path}: ")

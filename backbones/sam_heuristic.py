@@ -10,12 +10,11 @@ from typing import Any, Self
 import cv2
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.backbones.sam_proposals import Mask, SamOptions, SamProposer
-from semstab.config import Settings, explain, read_yaml
-from semstab.errors import ConfigError
+from semstab.config import Settings, read_yaml, validated
 from semstab.labels import LabelSpace
 
 HUES = 180
@@ -88,21 +87,15 @@ class SamHeuristicOptions(SamOptions):
     )
 
 
-class SamHeuristic:
+class SamHeuristic(Backbone):
     """Masks painted by area, the largest first, each in the class of the first rule that holds for it."""
 
     Options: type[BaseModel] = SamHeuristicOptions
-    gives_scores = False
-    fit_frames = 0
 
     def __init__(self, options: SamHeuristicOptions) -> None:
         self.rules = read_rules(options.rules)
-        self.label_space: LabelSpace | None = LabelSpace("sam heuristic", tuple(self.rules.names))
+        self.label_space = LabelSpace("sam heuristic", tuple(self.rules.names))
         self._proposer = SamProposer(options)
-
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """Itself."""
-        return self
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`; there are no scores."""
@@ -143,7 +136,4 @@ def read_rules(path: Path | None) -> Rules:
     """The rules of a file, those that ship where none is named. Raises ConfigError that names file and setting."""
     shipped = importlib.resources.files("semstab.configs") / "backbones" / "sam_heuristic.yaml"
     path = path or Path(str(shipped))
-    try:
-        return Rules.model_validate(read_yaml(path))
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error, Rules)}") from error
+    return validated(Rules, read_yaml(path), f"{path}: ")

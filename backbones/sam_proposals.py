@@ -6,8 +6,6 @@ the article, without the crops of its largest setting.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +16,11 @@ import numpy.typing as npt
 import torch
 import transformers
 from pydantic import Field
-from torch import nn
 
-from semstab.backbones import UNASSIGNED, Image
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions
+from semstab.backbones import UNASSIGNED, Image, image_digest
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.errors import DataError
-from semstab.files import atomic_path
+from semstab.files import atomic_path, content_key
 
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
@@ -108,7 +105,7 @@ class SamProposer:
         """The proposals of an image; `min_area` is left to whoever uses them."""
         if self.options.cache is None:
             return self._propose(image)
-        file = self.options.cache / self._key() / f"{_digest(image)}.npz"
+        file = self.options.cache / self._key() / f"{image_digest(image)}.npz"
         if file.is_file():
             with np.load(file) as kept:
                 return Proposals((int(kept["shape"][0]), int(kept["shape"][1])), *(kept[name] for name in KEPT))
@@ -121,7 +118,7 @@ class SamProposer:
     def _key(self) -> str:
         """Of the settings that proposals depend on."""
         settings = {name: value for name, value in self.identity().items() if name != "min_area"}
-        return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
+        return content_key(settings)
 
     @torch.inference_mode()
     def _propose(self, image: Image) -> Proposals:
@@ -178,9 +175,8 @@ def point_grid(side: int) -> Array:
 
 def full_size(logits: torch.Tensor, padded: Any, resized: Any, image: Any) -> torch.Tensor:
     """Mask logits (h, w) of the padded square, without the padding, at the image's size; bilinear each time."""
-    square = nn.functional.interpolate(logits[None, None], size=padded, mode="bilinear", align_corners=False)
-    inside = square[..., : resized[0], : resized[1]]
-    return nn.functional.interpolate(inside, size=image, mode="bilinear", align_corners=False)[0, 0]
+    square = bilinear(logits[None], padded)
+    return bilinear(square[..., : resized[0], : resized[1]], image)[0]
 
 
 def stability_score(logits: torch.Tensor, offset: float) -> float:
@@ -234,9 +230,3 @@ def _box(mask: Mask) -> tuple[int, int, int, int]:
     """Of a mask that is not empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
-
-
-def _digest(image: Image) -> str:
-    content = hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16)
-    content.update(str(image.shape).encode())
-    return content.hexdigest()

@@ -9,26 +9,18 @@ from pydantic import BaseModel
 
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.backbones.sam_proposals import SamOptions, SamProposer, region_map
-from semstab.labels import LabelSpace
 
 
-class SamRaw:
+class SamRaw(Backbone):
     """Regions 1, 2, ... from the largest mask to the smallest, smaller ones over larger ones, 0 where there is none.
 
     Ids mean nothing across frames: `semstab.metrics.matched_region_flicker` compares such maps.
     """
 
     Options: type[BaseModel] = SamOptions
-    gives_scores = False
-    fit_frames = 0
 
     def __init__(self, options: SamOptions) -> None:
-        self.label_space: LabelSpace | None = None
         self._proposer = SamProposer(options)
-
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """Itself."""
-        return self
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`; there are no scores."""

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from semstab.backbones import Backbone, Image, Labels, Prediction, create
 from semstab.backbones.sam_proposals import Proposals, SamOptions, SamProposer
 from semstab.errors import ConfigError
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.labels import ignore_id
 
 
 class SamVoteOptions(SamOptions):
@@ -21,7 +21,7 @@ class SamVoteOptions(SamOptions):
     voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {model: FOLDER}")
 
 
-class SamVote:
+class SamVote(Backbone):
     """Masks painted by area, the largest first, each in the label that most of its pixels have (ties: the lowest id).
 
     Pixels that the voter ignores do not vote; outside the masks its labels stay.
@@ -29,7 +29,6 @@ class SamVote:
     """
 
     Options: type[BaseModel] = SamVoteOptions
-    gives_scores = False
 
     def __init__(
         self, options: SamVoteOptions, proposer: SamProposer | None = None, voter: Backbone | None = None
@@ -39,7 +38,7 @@ class SamVote:
         if self._voter.label_space is None:
             raise ConfigError(f"sam-vote: the voter '{options.voter}' has no classes; choose one that has")
         self._proposer = proposer or SamProposer(options)
-        self.label_space: LabelSpace | None = self._voter.label_space
+        self.label_space = self._voter.label_space
         self.fit_frames = self._voter.fit_frames
 
     def fit(self, images: Sequence[Image]) -> Backbone:
@@ -62,11 +61,10 @@ class SamVote:
 
 def majority(labels: Labels, proposals: Proposals, min_area: int) -> Labels:
     """The labels (H, W) with each mask in the label that most of its pixels had, the largest mask first."""
-    ignore = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
     voted = labels.copy()
     for mask in proposals.by_area(min_area):
         inside = labels[mask]
-        votes = np.bincount(inside[inside != ignore])
+        votes = np.bincount(inside[inside != ignore_id(labels)])
         if votes.size:
             voted[mask] = votes.argmax()
     return voted

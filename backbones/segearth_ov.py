@@ -16,13 +16,12 @@ from pydantic import BaseModel, Field
 from torch import nn
 
 from semstab.backbones import Backbone, Image, Prediction, narrowed
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.backbones.dense_clip import dense_features
 from semstab.backbones.prompts import Prompts, read_prompts
 from semstab.backbones.simfeatup import SimFeatUp
 from semstab.backbones.windows import padded, slide
 from semstab.errors import ConfigError, DataError
-from semstab.labels import LabelSpace
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
@@ -43,7 +42,7 @@ class SegEarthOptions(ModelOptions):
     sharpness: float = Field(50.0, gt=0, description="factor of the likeness before the softmax")
 
 
-class SegEarthOV:
+class SegEarthOV(Backbone):
     """Likeness of each patch's feature to each class's sentences, in windows, averaged, softmaxed, thresholded.
 
     Without SimFeatUp's weights patches are upsampled bilinearly, which blurs small things.
@@ -51,12 +50,11 @@ class SegEarthOV:
 
     Options: type[BaseModel] = SegEarthOptions
     gives_scores = True
-    fit_frames = 0
 
     def __init__(self, options: SegEarthOptions) -> None:
         self.options = options
         self.prompts = read_prompts(options.prompts)
-        self.label_space: LabelSpace | None = self.prompts.label_space()
+        self.label_space = self.prompts.label_space()
         self.checkpoint = Checkpoint.find(options)
         self._model = self.checkpoint.load_model(transformers.CLIPModel, options)
         self.window = options.window or int(self._model.vision_model.config.image_size)
@@ -66,10 +64,6 @@ class SegEarthOV:
         self._queries = self._text_features(self.checkpoint.load(transformers.AutoTokenizer), self.prompts)
         self._class_of_query = torch.tensor([k for k, _ in self.prompts.queries], device=self._model.device)
         self._upsampler = _load_upsampler(options.upsampler, self._model)
-
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """Itself."""
-        return self
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
@@ -91,9 +85,7 @@ class SegEarthOV:
     def _prediction(self, image: Image, scores: bool) -> Prediction:
         pixels = torch.as_tensor(normalised(image, self.options.resize)).to(self._model.device, self._model.dtype)
         logits = slide(pixels, self.window, self.stride, self._window_logits)
-        full = nn.functional.interpolate(
-            logits[None].float(), size=image.shape[:2], mode="bilinear", align_corners=False
-        )[0]
+        full = bilinear(logits.float(), image.shape[:2])
         probability = self._class_probability((self.options.sharpness * full).softmax(dim=0))
         best, label = probability.max(dim=0)
         if self.prompts.background is not None:
@@ -118,10 +110,7 @@ class SegEarthOV:
             patches = self._upsampler(patches, pixels)
         cosine = torch.einsum("qd,dhw->qhw", self._queries, nn.functional.normalize(patches[0], dim=0))
         cosine = cosine + self.options.bias * (self._queries @ nn.functional.normalize(whole[0], dim=0))[:, None, None]
-        upsampled = nn.functional.interpolate(
-            cosine[None], size=pixels.shape[-2:], mode="bilinear", align_corners=False
-        )[0]
-        return upsampled[:, *place]
+        return bilinear(cosine, pixels.shape[-2:])[:, *place]
 
     @torch.inference_mode()
     def _text_features(self, tokenizer: Any, prompts: Prompts) -> torch.Tensor:

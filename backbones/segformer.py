@@ -10,10 +10,9 @@ from typing import Any, Literal
 import torch
 import transformers
 from pydantic import BaseModel, Field, PositiveInt
-from torch import nn
 
 from semstab.backbones import Backbone, Image, Prediction, narrowed
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.labels import LabelSpace
 
 Logits = Callable[[torch.Tensor], torch.Tensor]
@@ -36,7 +35,7 @@ class SegformerOptions(ModelOptions):
     engine: Literal["torch", "onnx"] = Field("torch", description="torch, or ONNX Runtime on the CPU")
 
 
-class Segformer:
+class Segformer(Backbone):
     """The checkpoint's logits, upsampled bilinearly to the image (Xie et al. 2021, NeurIPS, SegFormer).
 
     Its classes are those of the checkpoint's id2label.
@@ -44,19 +43,14 @@ class Segformer:
 
     Options: type[BaseModel] = SegformerOptions
     gives_scores = True
-    fit_frames = 0
 
     def __init__(self, options: SegformerOptions) -> None:
         self.options = options
         self.checkpoint = Checkpoint.find(options)
         self.processor = _processor(self.checkpoint)
         model = self.checkpoint.load_model(transformers.AutoModelForSemanticSegmentation, options)
-        self.label_space: LabelSpace | None = label_space(model.config.id2label, self.checkpoint.title)
+        self.label_space = label_space(model.config.id2label, self.checkpoint.title)
         self._logits = _engine(model, options)
-
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """Itself."""
-        return self
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
@@ -107,24 +101,19 @@ def argmax_upsampled(logits: torch.Tensor, size: tuple[int, ...]) -> torch.Tenso
     Class by class in chunks: 150 classes at 3840x2160 would take 5 GB at once.
     """
     step = max(1, CHUNK_BYTES // (4 * size[0] * size[1]))
-    best, label = upsampled(logits[:step], size).max(dim=0)
+    best, label = bilinear(logits[:step].float(), size).max(dim=0)
     for start in range(step, len(logits), step):
-        value, k = upsampled(logits[start : start + step], size).max(dim=0)
+        value, k = bilinear(logits[start : start + step].float(), size).max(dim=0)
         label = torch.where(value > best, k + start, label)
         best = torch.maximum(value, best)
     return label
-
-
-def upsampled(logits: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
-    """(K, h, w) to (K, H, W), bilinear, pixel areas aligned."""
-    return nn.functional.interpolate(logits[None].float(), size=size, mode="bilinear", align_corners=False)[0]
 
 
 def _prediction(logits: torch.Tensor, size: tuple[int, ...], scores: bool) -> Prediction:
     labels = narrowed(argmax_upsampled(logits, size).cpu().numpy(), len(logits))
     if not scores:
         return Prediction(labels)
-    probability = upsampled(logits, size).softmax(dim=0).permute(1, 2, 0).contiguous()
+    probability = bilinear(logits.float(), size).softmax(dim=0).permute(1, 2, 0).contiguous()
     return Prediction(labels, probability.cpu().numpy())
 
 

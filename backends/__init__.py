@@ -74,6 +74,7 @@ class FusionBackend(Protocol):
 
     def events(self) -> Events | None:
         """The log of observations, or None where the backend keeps none."""
+        return None
 
 
 @dataclass(frozen=True, eq=False)

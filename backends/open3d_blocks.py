@@ -15,6 +15,7 @@ import numpy.typing as npt
 import open3d.core as o3c
 from open3d.t.geometry import VoxelBlockGrid
 
+from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator, Observed
 from semstab.backends.shared.association import Int64, check_frame, check_settings
 from semstab.backends.shared.columns import update_rows
@@ -31,7 +32,7 @@ COPIED_BLOCKS = 1024
 """Blocks that move at a time when a map grows, so that the copy needs no second map's worth of memory."""
 
 
-class Open3DBlocks:
+class Open3DBlocks(FusionBackend):
     """Incremental fusion on voxel blocks; `grid` is the VoxelBlockGrid, its attributes named as VoxelTable's columns.
 
     A map reaches 2^20 voxels to either side of its first camera.
@@ -89,21 +90,8 @@ class Open3DBlocks:
         index = self._index_of(rows)
         order = np.lexsort(index.T[::-1])
         rows = rows[order]
-        columns = (
-            "op",
-            "evidence",
-            "drift_sum",
-            "pixels",
-            "first_frame",
-            "last_frame",
-            "self_sum",
-            "frame_entropy_sum",
-        )
-        values: dict[str, Any] = {name: self._read(name, rows) for name in columns}
+        values: dict[str, Any] = {name: self._read(name, rows) for name in self._attributes}
         return VoxelTable(**index_columns(index[order]), **values, voxel_size=self.voxel_size)
-
-    def events(self) -> None:
-        """None: the grid keeps sums, not the history."""
 
     def _new_grid(self, blocks: int) -> VoxelBlockGrid:
         """An empty grid with room for that many blocks."""

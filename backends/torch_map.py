@@ -11,6 +11,7 @@ import time
 import numpy.typing as npt
 import torch
 
+from semstab.backends import FusionBackend
 from semstab.backends.torch_parts.maps import TorchMaps
 from semstab.backends.torch_parts.storage import SLOT_BYTES
 from semstab.backends.torch_parts.views import DepthView, Image, TensorPrediction, evidence_of_frame
@@ -19,7 +20,7 @@ from semstab.results import FrameReport
 from semstab.voxels import VoxelTable
 
 
-class TorchMap:
+class TorchMap(FusionBackend):
     """Incremental fusion on a device; the same numbers run after run.
 
     A map reaches 2^20 voxels to either side of its first camera.
@@ -90,6 +91,3 @@ class TorchMap:
     def table(self) -> VoxelTable:
         """The map so far, brought to memory."""
         return self._maps.table("")
-
-    def events(self) -> None:
-        """None: the map keeps sums, not the history."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
 import stat
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
 import yaml
 
 from semstab.errors import ConfigError, DataError, one_line
@@ -54,6 +56,19 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: Any) -> None:
     """Write `value`, a dataclass for example, atomically as JSON; undefined numbers (NaN, infinity) become null."""
     write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
+    """Write a grey or BGR image atomically."""
+    import cv2
+
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def content_key(settings: Mapping[str, Any]) -> str:
+    """A hash of settings that JSON holds, in any order."""
+    return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def keep_only(written: Collection[Path], folder: Path) -> None:

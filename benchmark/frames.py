@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, flat
+from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 
 RIGID_TOLERANCE = 1e-3
 
@@ -133,7 +133,7 @@ class Frame:
     def ignore_id(self) -> int:
         """The id of a pixel without a label: 255, or 65535 in 16-bit maps."""
         if self.labels is not None:
-            return IGNORE_8BIT if self.labels.dtype == np.uint8 else IGNORE_16BIT
+            return ignore_id(self.labels)
         assert self.scores is not None
         return IGNORE_8BIT if self.scores.shape[2] <= IGNORE_8BIT else IGNORE_16BIT
 
@@ -150,24 +150,21 @@ class Frame:
     @property
     def nbytes(self) -> int:
         """Bytes of its images, the mask of valid pixels included."""
-        images = (self.depth, self.labels, self.scores, self.color, self.mask, self.left_out)
-        return self.depth.size + sum(image.nbytes for image in images if image is not None)
+        return self.depth.size + sum(image.nbytes for image in self._images.values())
+
+    @property
+    def _images(self) -> dict[str, npt.NDArray[Any]]:
+        """Those that the frame has, by field."""
+        images = {name: getattr(self, name) for name in ("depth", "labels", "scores", "color", "mask", "left_out")}
+        return {name: image for name, image in images.items() if image is not None}
 
     def every(self, stride: int) -> Frame:
         """The frame that keeps every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
         if stride == 1:
             return self
         pick = (slice(None, None, stride), slice(None, None, stride))
-        return dataclasses.replace(
-            self,
-            depth=self.depth[pick],
-            intrinsics=self.intrinsics.every(stride),
-            labels=None if self.labels is None else self.labels[pick],
-            scores=None if self.scores is None else self.scores[pick],
-            color=None if self.color is None else self.color[pick],
-            mask=None if self.mask is None else self.mask[pick],
-            left_out=None if self.left_out is None else self.left_out[pick],
-        )
+        kept: dict[str, Any] = {name: image[pick] for name, image in self._images.items()}
+        return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **kept)
 
     def where(self, what: str) -> str:
         """What an error message calls a field: its file where it has one, else the frame and the field."""

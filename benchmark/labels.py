@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import yaml
 
 from semstab.errors import ConfigError, DataError
-from semstab.files import MAX_YAML_BYTES, parse_yaml, read_limited
+from semstab.files import MAX_YAML_BYTES, parse_yaml, read_limited, write_text
 
 IGNORE_8BIT = 255
 IGNORE_16BIT = 65535
+LEFT_OUT = -1
+"""The row of a name that a label space ignores."""
 UNKNOWN = -1
 """In a mapping's table: an id that the source label space does not have."""
 
@@ -68,7 +71,7 @@ class LabelSpace:
             )
         if IGNORE_8BIT in self.ids and max(self.ids) == IGNORE_8BIT:
             raise ConfigError(f"taxonomy {self.name}: id 255 means 'ignore'; give the class another id")
-        names = [_key(name) for name in (*self.classes, *(m for ms in self.members for m in ms), *self.ignored)]
+        names = [name_key(name) for name in (*self.classes, *(m for ms in self.members for m in ms), *self.ignored)]
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise ConfigError(f"taxonomy {self.name}: '{repeated[0]}' is named twice")
 
@@ -114,21 +117,31 @@ class LabelSpace:
         classes = [{"name": n, "id": i, "color": list(c), "members": list(m)} for n, i, c, m in rows]
         return {"name": self.name, "classes": classes, "ignored": list(self.ignored)}
 
+    @property
+    def row_of(self) -> dict[str, int]:
+        """By `name_key` of its classes and their members the row of the class; LEFT_OUT of what it ignores."""
+        rows = {name_key(name): LEFT_OUT for name in self.ignored}
+        for row, (name, members) in enumerate(zip(self.classes, self.members, strict=True)):
+            rows |= {name_key(key): row for key in (name, *members)}
+        return rows
+
+    def save(self, path: str | Path) -> None:
+        """Write a taxonomy file."""
+        write_text(path, yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True))
+
     def mapping_to(self, target: LabelSpace) -> LabelMapping:
         """Map each class of this space to the class of `target` with its name, or among whose members it is.
 
         Raises ConfigError, naming them, where classes are mapped nowhere and are not listed as ignored.
         """
-        index = {_key(name): k for k, name in enumerate(target.classes)}
-        index.update({_key(m): k for k, members in enumerate(target.members) for m in members})
-        ignored = {_key(name) for name in target.ignored}
-        lost = [name for name in self.classes if _key(name) not in index and _key(name) not in ignored]
-        if lost:
+        known = target.row_of
+        if lost := [name for name in self.classes if name_key(name) not in known]:
             raise ConfigError(
                 f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {self.name};"
                 " add the name to a class's members, or to ignored"
             )
-        return LabelMapping(self, target, tuple(index.get(_key(name)) for name in self.classes))
+        rows = (known[name_key(name)] for name in self.classes)
+        return LabelMapping(self, target, tuple(None if row == LEFT_OUT else row for row in rows))
 
 
 @dataclass(frozen=True)
@@ -147,10 +160,10 @@ class LabelMapping:
 
     def named(self, names: Iterable[str]) -> tuple[int, ...]:
         """Positions of the source classes that have one of these names, or become a class that has."""
-        wanted = {_key(name) for name in names}
-        rows = {row for row, name in enumerate(self.target.classes) if _key(name) in wanted}
+        wanted = {name_key(name) for name in names}
+        rows = {row for row, name in enumerate(self.target.classes) if name_key(name) in wanted}
         pairs = zip(self.source.classes, self.rows, strict=True)
-        return tuple(k for k, (name, row) in enumerate(pairs) if _key(name) in wanted or row in rows)
+        return tuple(k for k, (name, row) in enumerate(pairs) if name_key(name) in wanted or row in rows)
 
     def labels(
         self, labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], where: str
@@ -221,10 +234,21 @@ def shipped_taxonomies() -> tuple[str, ...]:
     return tuple(sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml")))
 
 
+def ignore_id(labels: npt.NDArray[Any]) -> int:
+    """The id of a pixel without a label in a map of that type: 255, or 65535 in 16-bit maps."""
+    return IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+
+
+def fixed(array: Any) -> Any:
+    """The array contiguous and read-only, so that numba compiles one version for all."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
 def flat(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The image's values (n,), contiguous and read-only, so that numba compiles one version for all images."""
-    values = np.ascontiguousarray(image).reshape(-1)
-    values.flags.writeable = False
+    """The image's values (n,), fixed."""
+    values: npt.NDArray[Any] = fixed(image).reshape(-1)
     return values
 
 
@@ -264,7 +288,7 @@ def _taxonomy_text(name: str) -> tuple[str, str]:
         raise ConfigError(f"{path}: the taxonomy cannot be read ({error})") from error
 
 
-def _key(name: str) -> str:
+def name_key(name: str) -> str:
     """Names compare without case, surrounding space, and the choice between space, '_' and '-'."""
     return " ".join(name.replace("_", " ").replace("-", " ").lower().split())
 

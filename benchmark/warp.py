@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.frames import Frame
+from semstab.labels import fixed
 
 DEPTH_TOLERANCE = 0.01
 """Two views see the same surface where the depths that they give it differ by at most this share of its distance."""
@@ -55,7 +56,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
     rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
     pixel = np.empty((H, W), dtype=np.int32)
     look_up(
-        _fixed(frame.depth), rays, _motion(frame, other), _fixed(other.depth),
+        fixed(frame.depth), rays, _motion(frame, other), fixed(other.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
     )  # fmt: skip
     return Correspondence(pixel)
@@ -77,10 +78,3 @@ def _motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
     R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
     t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]
     return np.column_stack([R @ frame.T_wc[:3, :3], R @ t])
-
-
-def _fixed(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Contiguous and read-only, so that numba compiles one version."""
-    depth = np.ascontiguousarray(depth).view()
-    depth.flags.writeable = False
-    return depth

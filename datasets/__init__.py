@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, cast
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from semstab.config import DatasetConfig, explain
+from semstab.config import DatasetConfig, validated
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
-from semstab.errors import ConfigError
 from semstab.registry import Entry, Registry
 
 __all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Scene", "open_dataset", "options_model", "resolved"]
@@ -54,11 +53,7 @@ def resolved(config: DatasetConfig) -> DatasetConfig:
 
     Raises ConfigError for a dataset or an option that cannot be used.
     """
-    model = options_model(config.name)
-    try:
-        options = model.model_validate(config.options)
-    except ValidationError as error:
-        raise ConfigError(f"dataset '{config.name}', options: {explain(error, model)}") from error
+    options = validated(options_model(config.name), config.options, f"dataset '{config.name}', options: ")
     paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
     return config.model_copy(update={"options": options.model_copy(update=paths).model_dump(mode="json")})
 

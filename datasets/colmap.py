@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre, PoseConvention
+from semstab.datasets.files.options import FileOptions, PixelCentre, PoseConvention
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.templates import Folders, Template, inside
 from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
@@ -23,7 +23,6 @@ class ColmapOptions(FileOptions):
     """What the format says, and may be said otherwise."""
 
     pose_convention: PoseConvention = "world_to_camera"
-    camera_axes: CameraAxes = "opencv"
     pixel_centre: PixelCentre = 0.5
     model: str | None = Field(
         None, description="folder of the sparse model in the scene's; sparse, sparse/0 or the scene's own by default"

@@ -10,10 +10,10 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import CameraAxes, DepthScale, FileOptions, PoseConvention
-from semstab.datasets.files.reader import FileDataset, files_named, require_equal
+from semstab.datasets.files.options import DepthScale, FileOptions
+from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.text_files import read_intrinsics
-from semstab.datasets.formats.text_tables import read_table
+from semstab.datasets.formats.text_tables import read_matrices
 from semstab.datasets.views.cameras import Camera
 from semstab.errors import DataError
 
@@ -22,8 +22,6 @@ class HoloLensOptions(FileOptions):
     """What the format says, and may be said otherwise."""
 
     depth_scale: DepthScale = 1000
-    pose_convention: PoseConvention = "camera_to_world"
-    camera_axes: CameraAxes = "opencv"
 
 
 class HoloLens(FileDataset[HoloLensOptions]):
@@ -39,13 +37,9 @@ class HoloLens(FileDataset[HoloLensOptions]):
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a line of poses.txt. Raises DataError where there are not as many images."""
         camera = Camera(read_intrinsics(folder / "K.txt"))
-        path = folder / "poses.txt"
-        poses = read_table(path, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
+        poses = read_matrices(folder / "poses.txt")
         images = files_named(folder / "images", "", ".png")
         if not images:
             raise DataError(f"{folder / 'images'}: there is no PNG image; its name ties a pose to its depth")
-        require_equal(path, len(poses), len(images), "images")
-        return [
-            FrameSource(name, folder / f"depth/{name}.png", pose, path, camera, color=images[name])
-            for name, pose in zip(sorted(images), poses, strict=True)
-        ]
+        depth = {name: folder / f"depth/{name}.png" for name in sorted(images)}
+        return frames_of(folder, depth, camera, pose="poses.txt", color="images/{name}", poses=poses, what="images")

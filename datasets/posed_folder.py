@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from semstab.config import explain, read_yaml
+from semstab.config import read_yaml, validated
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
@@ -23,7 +23,6 @@ from semstab.datasets.formats.disk import files_by_stem, natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera
-from semstab.errors import ConfigError
 
 SETTINGS_FILE = "scene.yaml"
 MASKS = "mask/{name}"
@@ -63,8 +62,7 @@ class PosedFolder(FileDataset[PosedOptions]):
             FrameSource(
                 name=name,
                 depth=depth.get(name) or folder / f"depth/{name}{suffix}",
-                pose=(pose := poses.get(name) or folder / f"pose/{name}.txt"),
-                pose_file=pose,
+                pose_file=poses.get(name) or folder / f"pose/{name}.txt",
                 camera=camera,
                 color=colors.get(name) or folder / f"color/{name}{COLOR_SUFFIXES[0]}",
             )
@@ -84,10 +82,7 @@ class PosedFolder(FileDataset[PosedOptions]):
 def _said(path: Path) -> FileSettings:
     """What scene.yaml says; taxonomy files in it are relative to its folder."""
     content = read_yaml(path) if path.is_file() else {}
-    try:
-        said = FileSettings.model_validate({"masks": MASKS} | content)
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error, FileSettings)}") from error
+    said = validated(FileSettings, {"masks": MASKS} | content, f"{path}: ")
     own = {key: _beside(path, value) for key, value in said.taxonomies.items()}
     return said.model_copy(update={"taxonomy": said.taxonomy and _beside(path, said.taxonomy), "taxonomies": own})
 

@@ -13,20 +13,10 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import (
-    CameraAxes,
-    FileOptions,
-    FourIntrinsics,
-    GroundTruth,
-    PoseConvention,
-    UpAxis,
-    VoidIds,
-    zero_is_void,
-)
-from semstab.datasets.files.reader import FileDataset, files_named, require_equal
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.options import FileOptions, FourIntrinsics, GroundTruth, UpAxis, VoidIds, zero_is_void
+from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.json_files import number, read_object
-from semstab.datasets.formats.text_tables import read_table
+from semstab.datasets.formats.text_tables import read_matrices
 from semstab.datasets.views.cameras import Camera, camera_of
 from semstab.errors import DataError
 
@@ -43,16 +33,14 @@ class Export:
     size: tuple[int, int]
 
 
-NICE_SLAM = Export("traj.txt", "results/depth", "results/frame", 6553.5, (600, 600, 599.5, 339.5), (1200, 680))
-SEMANTIC_NERF = Export("traj_w_c.txt", "depth/depth_", "rgb/rgb_", 1000, (320, 320, 319.5, 239.5), (640, 480))
+NICE_SLAM = Export("traj.txt", "results/depth", "results/frame{name}", 6553.5, (600, 600, 599.5, 339.5), (1200, 680))
+SEMANTIC_NERF = Export("traj_w_c.txt", "depth/depth_", "rgb/rgb_{name}", 1000, (320, 320, 319.5, 239.5), (640, 480))
 EXPORTS = (NICE_SLAM, SEMANTIC_NERF)
 
 
 class ReplicaOptions(FileOptions):
     """What the formats say, and may be said otherwise; the depth scale is 6553.5 or 1000, by export."""
 
-    pose_convention: PoseConvention = "camera_to_world"
-    camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = "z"
     intrinsics: FourIntrinsics = None
     ground_truth: GroundTruth = "semantic_class/semantic_class_{name}.png"
@@ -73,24 +61,13 @@ class Replica(FileDataset[ReplicaOptions]):
         """One a depth image. Raises DataError where there are not as many poses."""
         export = _export(folder)
         assert export is not None
-        path, folders = folder / export.trajectory, Folders()
-        poses = read_table(path, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
+        poses = read_matrices(folder / export.trajectory)
         where, _, before = export.depth.rpartition("/")
-        images = files_named(folder / where, before, ".png")
-        require_equal(path, len(poses), len(images), "depth images")
+        depth = files_named(folder / where, before, ".png")
         camera, scale = self._camera(folder, export)
-        return [
-            FrameSource(
-                name=name,
-                depth=depth,
-                pose=pose,
-                pose_file=path,
-                camera=camera,
-                color=folders.one_of(folder / f"{export.color}{name}", (".jpg", ".png")),
-                depth_scale=scale,
-            )
-            for (name, depth), pose in zip(images.items(), poses, strict=True)
-        ]
+        return frames_of(
+            folder, depth, camera, pose=export.trajectory, color=export.color, poses=poses, depth_scale=scale
+        )
 
     def _camera(self, folder: Path, export: Export) -> tuple[Camera, float]:
         """The camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""

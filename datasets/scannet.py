@@ -16,19 +16,8 @@ from pydantic import BaseModel, Field
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.label_ids import NO_ID
-from semstab.datasets.files.options import (
-    CameraAxes,
-    DepthScale,
-    FileOptions,
-    GroundTruth,
-    PoseConvention,
-    Size,
-    UpAxis,
-    VoidIds,
-    zero_is_void,
-)
-from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.options import DepthScale, FileOptions, GroundTruth, Size, UpAxis, VoidIds, zero_is_void
+from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera
@@ -42,8 +31,6 @@ class ScanNetOptions(FileOptions):
     """What the format says, and may be said otherwise."""
 
     depth_scale: DepthScale = 1000
-    pose_convention: PoseConvention = "camera_to_world"
-    camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = "z"
     ground_truth: GroundTruth = "label-filt/{name}.png"
     void_ids: VoidIds = Field(default_factory=zero_is_void)
@@ -68,23 +55,12 @@ class ScanNet(FileDataset[ScanNetOptions]):
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth image."""
-        folders = Folders()
         camera = self._camera(folder, self.options.intrinsics)
         label_camera = None
         if self.options.label_camera != self.options.intrinsics and _matrix_file(folder, "color").is_file():
             label_camera = self._camera(folder, self.options.label_camera)
-        return [
-            FrameSource(
-                name=name,
-                depth=depth,
-                pose=folder / f"pose/{name}.txt",
-                pose_file=folder / f"pose/{name}.txt",
-                camera=camera,
-                label_camera=label_camera,
-                color=folders.one_of(folder / f"color/{name}", (".jpg", ".png")),
-            )
-            for name, depth in files_named(folder / "depth", "", ".png").items()
-        ]
+        depth = files_named(folder / "depth", "", ".png")
+        return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
     def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
         """The ids of the ground truth as those of the class table's column, where a table is given."""

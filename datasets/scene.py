@@ -141,7 +141,9 @@ class Scene(ABC):
         They are brought to the depth's pixels. Raises DataError where image and depth do not show the same view.
         """
         frame = self.geometry(index)
-        labels, scores = fitted(labels, scores, frame.shape, f"{self.name}, {self.image_name(index)}")
+        where = f"{self.name}, {self.image_name(index)}"
+        labels = None if labels is None else fitted(labels, frame.shape, where)
+        scores = None if scores is None else fitted(scores, frame.shape, where)
         return dataclasses.replace(frame, labels=labels, scores=scores, color=None)
 
 

@@ -10,17 +10,8 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import (
-    CameraAxes,
-    DepthScale,
-    FileOptions,
-    FourIntrinsics,
-    InvalidDepth,
-    PoseConvention,
-    Size,
-)
-from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, InvalidDepth, Size
+from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera, camera_of
 from semstab.frames import Intrinsics
@@ -35,8 +26,6 @@ class SevenScenesOptions(FileOptions):
 
     depth_scale: DepthScale = 1000
     invalid_depth: InvalidDepth = (65535,)
-    pose_convention: PoseConvention = "camera_to_world"
-    camera_axes: CameraAxes = "opencv"
     intrinsics: FourIntrinsics = None
     color_intrinsics: FourIntrinsics = None
     color_size: Size = IMAGE_SIZE
@@ -58,21 +47,11 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth image."""
-        folders, color = Folders(), self.options.color_intrinsics
+        color = self.options.color_intrinsics
         camera = self._camera(folder)
         label_camera = None if color is None else Camera(Intrinsics(*color), self.options.color_size)
-        return [
-            FrameSource(
-                name=name,
-                depth=depth,
-                pose=folder / f"{name}.pose.txt",
-                pose_file=folder / f"{name}.pose.txt",
-                camera=camera,
-                label_camera=label_camera,
-                color=folders.one_of(folder / f"{name}.color", (".png", ".jpg")),
-            )
-            for name, depth in files_named(folder, "", ".depth.png").items()
-        ]
+        depth = files_named(folder, "", ".depth.png")
+        return frames_of(folder, depth, camera, pose="{name}.pose.txt", color="{name}.color", label_camera=label_camera)
 
     def _camera(self, folder: Path) -> Camera:
         """Of the depth: as the options say, else as a file beside the frames or above them does, as 3DMatch has it."""

@@ -11,16 +11,8 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import (
-    CameraAxes,
-    FileOptions,
-    FourIntrinsics,
-    MaxDepth,
-    PoseConvention,
-    UpAxis,
-)
-from semstab.datasets.files.reader import FileDataset, files_named, require_equal
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.options import CameraAxes, FileOptions, FourIntrinsics, MaxDepth, UpAxis
+from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.text_tables import read_table
 from semstab.datasets.views.cameras import camera_of
 from semstab.datasets.views.poses import from_quaternions
@@ -34,7 +26,6 @@ class TartanAirOptions(FileOptions):
 
     camera: Literal["left", "right"] = Field("left", description="camera of the stereo pair")
     max_depth: MaxDepth = 1000
-    pose_convention: PoseConvention = "camera_to_world"
     camera_axes: CameraAxes = "ned"
     up_axis: UpAxis = "-z"
     intrinsics: FourIntrinsics = None
@@ -58,21 +49,11 @@ class TartanAir(FileDataset[TartanAirOptions]):
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth map. Raises DataError where there are not as many poses."""
-        side, folders = self.options.camera, Folders()
+        side = self.options.camera
         path = folder / f"pose_{side}.txt"
         numbers = read_table(path, 7, "tx ty tz qx qy qz qw")
         poses = from_quaternions(numbers[:, :3], numbers[:, 3:], path)
-        maps = files_named(folder / f"depth_{side}", "", f"_{side}_depth.npy")
-        require_equal(path, len(poses), len(maps), "depth maps")
+        depth = files_named(folder / f"depth_{side}", "", f"_{side}_depth.npy")
         camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
-        return [
-            FrameSource(
-                name=name,
-                depth=depth,
-                pose=pose,
-                pose_file=path,
-                camera=camera,
-                color=folders.one_of(folder / f"image_{side}/{name}_{side}", (".png",)),
-            )
-            for (name, depth), pose in zip(maps.items(), poses, strict=True)
-        ]
+        color = f"image_{side}/{{name}}_{side}"
+        return frames_of(folder, depth, camera, pose=path.name, color=color, poses=poses, what="depth maps")

@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre, PoseConvention
+from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.templates import Folders, Template, inside
 from semstab.datasets.formats.disk import natural
@@ -34,7 +34,6 @@ PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
 class TransformsOptions(FileOptions):
     """What the format says, and may be said otherwise; the depth scale is the file's own, else 1000."""
 
-    pose_convention: PoseConvention = "camera_to_world"
     camera_axes: CameraAxes = "opengl"
     pixel_centre: PixelCentre = 0.5
     transforms: str = Field("transforms.json", description="file of the cameras in the scene's folder")

@@ -14,20 +14,12 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import (
-    CameraAxes,
-    DepthScale,
-    FileOptions,
-    FourIntrinsics,
-    PoseConvention,
-    Positive,
-    UpAxis,
-)
+from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, Positive, UpAxis
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.text_tables import read_table, records, to_number
 from semstab.datasets.views.cameras import camera_of
-from semstab.datasets.views.poses import at_times, from_quaternions
+from semstab.datasets.views.poses import at_times, from_quaternions, nearest
 from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")
@@ -46,8 +38,6 @@ class TumOptions(FileOptions):
     """What the format says, and may be said otherwise."""
 
     depth_scale: DepthScale = 5000
-    pose_convention: PoseConvention = "camera_to_world"
-    camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = "z"
     intrinsics: FourIntrinsics = None
     max_difference: Positive = Field(0.02, description="seconds by which things of one frame may differ")
@@ -137,16 +127,9 @@ def mutual_nearest(
     times: npt.NDArray[np.float64], others: npt.NDArray[np.float64], max_difference: float
 ) -> npt.NDArray[np.intp]:
     """For each of the ascending times the index of the other one where each is the other's nearest; -1 for none."""
-    to_other, back = _nearest(times, others), _nearest(others, times)
+    to_other, back = nearest(times, others), nearest(others, times)
     mutual = (back[to_other] == np.arange(len(times))) & (np.abs(others[to_other] - times) <= max_difference)
     return np.where(mutual, to_other, -1)
-
-
-def _nearest(times: npt.NDArray[np.float64], others: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-    """For each time the index of the nearest of the ascending others; of two as near the earlier one."""
-    after = np.searchsorted(others, times).clip(max=len(others) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
 
 
 def _require_ascending(path: Path, times: npt.NDArray[np.float64]) -> None:

@@ -118,12 +118,12 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
         K = Intrinsics(*stated) if stated else read_intrinsics(self._inside(folder, self.options.intrinsics_file))
         folders = Folders()
         return [
-            self._frame(folder, name, path, path, Camera(K), folders)
+            self._frame(folder, name, None, path, Camera(K), folders)
             for name, path in files_named(folder / where, before, after).items()
         ]
 
     def _frame(
-        self, folder: Path, name: str, pose: Poses | Path, pose_file: Path, camera: Camera, folders: Folders
+        self, folder: Path, name: str, pose: Poses | None, pose_file: Path, camera: Camera, folders: Folders
     ) -> FrameSource:
         depth = self._inside(folder, self._depth.filled(name=name))
         color = self._inside(folder, self._images.filled(name=name))

@@ -27,7 +27,7 @@ def write_posed(
     written = SceneFolder(folder, {}, tolerance=0.0)
     written.begin(DepthFormat(scale), {})
     for name, *frames in zip(names, *sources.values(), strict=True):
-        written.write_geometry(name, frames[0], frames[0].color)
+        written.write_geometry(name, frames[0])
         for source, frame in zip(sources, frames, strict=True):
             if source:
                 written.write_labels(name, frame, source)

@@ -12,7 +12,8 @@ from pictures import blobs
 from torch.nn.functional import interpolate
 
 from semstab.backbones import create, segformer
-from semstab.backbones.segformer import argmax_upsampled, label_space, upsampled, working_size
+from semstab.backbones.checkpoint import bilinear
+from semstab.backbones.segformer import argmax_upsampled, label_space, working_size
 from semstab.errors import ConfigError
 
 IMAGES = [blobs(shift=k) for k in range(3)]
@@ -109,7 +110,7 @@ def test_the_size_that_the_model_sees(monkeypatch, image_size, seen):
 def test_upsampling_in_chunks_is_upsampling_at_once(monkeypatch):
     logits = torch.from_numpy(np.random.default_rng(0).normal(size=(7, 5, 6))).float()
     logits[4] = logits[2]  # a tie goes to the lower class, also across chunks
-    whole = upsampled(logits, (20, 30)).argmax(dim=0)
+    whole = bilinear(logits, (20, 30)).argmax(dim=0)
     for classes in (1, 2, 3, 7):
         monkeypatch.setattr(segformer, "CHUNK_BYTES", classes * 4 * 20 * 30)
         torch.testing.assert_close(argmax_upsampled(logits, (20, 30)), whole)

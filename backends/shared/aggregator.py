@@ -16,7 +16,7 @@ from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.merging import compact, group, merge_scores, scatter, sort_labels, sum_scores
 from semstab.backends.shared.pixel_keys import frame_terms
 from semstab.frames import Frame
-from semstab.labels import IGNORE_8BIT
+from semstab.labels import IGNORE_8BIT, fixed
 
 BANDS = 64
 MIN_BAND_ROWS = 8
@@ -112,7 +112,7 @@ class Aggregator:
             highest = np.full(bands, -1, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             find_entries(
-                _fixed(frame.depth), _fixed(labels), ray_x, ray_y, _fixed(frame.T_wc), self.voxel_size, origin,
+                fixed(frame.depth), fixed(labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
                 rays, margin, IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes,
                 row_runs, slots, key, label, count, where, entries, lost, highest, spread,
             )  # fmt: skip
@@ -158,7 +158,7 @@ class Aggregator:
         base = np.concatenate([[0], np.cumsum(at.entries)])
         sums = np.zeros((total, K))
         where = at.where[: frame.depth.size].reshape(frame.shape)
-        sum_scores(_fixed(_widened(frame.scores)), where, at.rows, base, sums)
+        sum_scores(fixed(_widened(frame.scores)), where, at.rows, base, sums)
         weights = np.zeros((n, K))
         merge_scores(order, edges, voxel, bounds, at.room, base, sums, merged_key, merged_pixels, keys, pixels, weights)
         start = np.arange(n + 1, dtype=np.int64) * K
@@ -181,13 +181,6 @@ class Aggregator:
         if name not in self._space or len(self._space[name]) < size:
             self._space[name] = np.empty(max(size, 1), dtype=dtype)
         return self._space[name][:size]
-
-
-def _fixed(array: Any) -> Any:
-    """Contiguous and read-only, so that numba compiles one version."""
-    array = np.ascontiguousarray(array).view()
-    array.flags.writeable = False
-    return array
 
 
 def _widened(scores: Any) -> Any:

@@ -117,13 +117,12 @@ def pack(index: Int64, frame: Frame) -> tuple[Int64, Int64, tuple[int, ...]]:
             f"{frame.where('depth')}: frame {frame.index} spans {' x '.join(map(str, size))} voxels;"
             " leave out far depth (sky?), or use larger voxels"
         )
-    x, y, z = index - low
-    return (x * size[1] + y) * size[2] + z, low[:, 0], size
+    return np.ravel_multi_index(tuple(index - low), size).astype(np.int64, copy=False), low[:, 0], size
 
 
 def unpack(key: Int64, low: Int64, size: tuple[int, ...]) -> Int64:
     """The voxel indices (n, 3) behind keys made by `pack`."""
-    return np.stack([key // (size[1] * size[2]), key // size[2] % size[1], key % size[2]], axis=1) + low
+    return np.stack(np.unravel_index(key, size), axis=1) + low
 
 
 def evidence_of(frame: Frame, num_classes: int) -> Float64:

@@ -30,6 +30,7 @@ from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.errors import DataError
 from semstab.frames import Frame
+from semstab.json_form import to_json
 from semstab.labels import LabelSpace
 from semstab.prefetch import prefetch
 from semstab.task import frame_indices, selected
@@ -105,16 +106,9 @@ class SceneCheck:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object."""
-        content = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        return content | {"problems": list(self.problems), "sound": not self.problems}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Verdict):
-        return value.to_dict()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.asdict(value)
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+        content = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        said = {"verdict": self.verdict.to_dict(), "problems": self.problems, "sound": not self.problems}
+        return {name: to_json(value) for name, value in (content | said).items()}
 
 
 def check(config: Config) -> Iterator[SceneCheck]:

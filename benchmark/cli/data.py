@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -23,9 +23,6 @@ from semstab.cli.options import (
     slice_of,
 )
 from semstab.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    from semstab.config import Config
 
 
 def predict(
@@ -98,9 +95,21 @@ def check(
     quiet: Quiet = False,
 ) -> None:
     """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
+    from rich.console import Console
+
+    from semstab.check import SCHEMA
+    from semstab.check import check as check_scenes
+    from semstab.check.display import print_check
+    from semstab.files import write_json
+
     named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
-    problems = _check(selection(config, named, settings, dataset, data, frames), json_file, quiet)
-    if problems:
+    console, found = Console(quiet=quiet), []
+    for checked in check_scenes(selection(config, named, settings, dataset, data, frames)):
+        print_check(checked, console)
+        found.append(checked)
+    if json_file is not None:
+        write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in found]})
+    if problems := [f"{checked.scene}: {problem}" for checked in found for problem in checked.problems]:
         first, *more = problems
         raise DataError(f"{first}" + (f" (and {len(more)} more, see above)" if more else ""))
 
@@ -120,12 +129,16 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Write any dataset as posed folders. Goes on where it was."""
-    _convert(
-        selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames),
-        out,
-        depth_error,
-        quiet,
-    )
+    from rich.console import Console
+
+    from semstab.convert import convert
+    from semstab.convert.display import frame_bar, print_converted
+
+    chosen = selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames)
+    console = Console(quiet=quiet)
+    with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
+        for converted in convert(chosen, out, depth_error=depth_error, progress=bar):
+            print_converted(converted, console)
 
 
 def _image_size(text: str) -> int | list[int]:
@@ -134,32 +147,3 @@ def _image_size(text: str) -> int | list[int]:
     if len(sides) > 2 or not all(side.isdigit() for side in sides):
         raise ConfigError(f"--image-size {text}: write the shorter side, for example 512, or HEIGHTxWIDTH")
     return int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]
-
-
-def _check(config: Config, json_file: Path | None, quiet: bool) -> list[str]:
-    """Check and print scene by scene; what is wrong, one line each."""
-    from rich.console import Console
-
-    from semstab.check import SCHEMA, check
-    from semstab.check.display import print_check
-    from semstab.files import write_json
-
-    console, found = Console(quiet=quiet), []
-    for checked in check(config):
-        print_check(checked, console)
-        found.append(checked)
-    if json_file is not None:
-        write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in found]})
-    return [f"{checked.scene}: {problem}" for checked in found for problem in checked.problems]
-
-
-def _convert(config: Config, out: Path, depth_error: float, quiet: bool) -> None:
-    from rich.console import Console
-
-    from semstab.convert import convert
-    from semstab.convert.display import FrameBar, print_converted
-
-    console = Console(quiet=quiet)
-    with FrameBar(Console(stderr=True, quiet=quiet)) as bar:
-        for converted in convert(config, out, depth_error=depth_error, progress=bar):
-            print_converted(converted, console)

@@ -52,11 +52,21 @@ def selection(
     """The resolved configuration of a file and options that select data."""
     from semstab.settings import load_config, resolve
 
-    chosen = overrides(named, settings or [])
-    select_dataset(chosen, dataset, data, None)
-    if frames is not None:
-        chosen["frames"] = slice_of(frames)
-    return resolve(load_config(file, chosen))
+    return resolve(load_config(file, chosen(named, settings, dataset, data, frames)))
+
+
+def chosen(
+    named: dict[str, Any],
+    settings: list[str] | None,
+    dataset: str | None,
+    data: Path | None,
+    frames: str | None,
+    seed: int | None = None,
+) -> dict[str, Any]:
+    """What options say, as settings."""
+    content = overrides(named, settings or [])
+    select_dataset(content, dataset, data, seed)
+    return content if frames is None else content | {"frames": slice_of(frames)}
 
 
 def overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:

@@ -24,10 +24,9 @@ from semstab.cli.options import (
     Scheduler,
     TrustGeometry,
     VoxelSize,
+    chosen,
     overrides,
     say,
-    select_dataset,
-    slice_of,
 )
 from semstab.errors import ConfigError
 
@@ -77,27 +76,22 @@ def run(
     quiet: Quiet = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
-    chosen = overrides(
-        {
-            "backends": backend,
-            "scenes": scene,
-            "backbones": backbone,
-            "taxonomy": taxonomy,
-            "voxel_size": voxel_size,
-            "pixel_stride": pixel_stride,
-            "check": check,
-            "events": events,
-            "statistics": statistics,
-            "check_geometry": False if trust_geometry else None,
-        },
-        settings or [],
-    )
-    select_dataset(chosen, dataset, data, seed)
-    if frames is not None:
-        chosen["frames"] = slice_of(frames)
+    named = {
+        "backends": backend,
+        "scenes": scene,
+        "backbones": backbone,
+        "taxonomy": taxonomy,
+        "voxel_size": voxel_size,
+        "pixel_stride": pixel_stride,
+        "check": check,
+        "events": events,
+        "statistics": statistics,
+        "check_geometry": False if trust_geometry else None,
+    }
+    content = chosen(named, settings, dataset, data, frames, seed)
     if check in ("none", "off"):
-        chosen["check"] = None
-    resolved = _load(config, chosen, predict or [])
+        content["check"] = None
+    resolved = _load(config, content, predict or [])
     if device is not None:
         resolved = _on_device(resolved, device)
     _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)

@@ -11,7 +11,7 @@ import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from semstab.config.selection import FrameSelection
-from semstab.config.settings import Settings, explain, merge, read_yaml
+from semstab.config.settings import Settings, explain, merge, read_yaml, validated
 from semstab.config.sweeps import Counts, Deviation, Lengths, Noise, Part, Sweeps
 from semstab.errors import ConfigError
 
@@ -33,6 +33,7 @@ __all__ = [
     "merge",
     "nearest",
     "read_yaml",
+    "validated",
 ]
 
 BASE = "base"

@@ -156,7 +156,7 @@ class _Work:
         name = _name(frame.index)
         self.timed = self.timed or frame.timestamp is not None
         if not self.folder.has_geometry(name):
-            self.folder.write_geometry(name, frame, frame.color)
+            self.folder.write_geometry(name, frame)
         if source is not None and not self.folder.has_labels(name, source):
             if frame.scores is not None and f"{source}{SCORES_SUFFIX}" in self.backbones:
                 raise ConfigError(f"{source} and {source}{SCORES_SUFFIX} would get one folder; choose with --backbone")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -11,24 +11,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from semstab.convert import Converted
 
 
-class FrameBar:
-    """Frames written of one label source; called with what, how many are done, of how many."""
-
-    def __init__(self, console: Console) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
-        self._bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
-        self._work = self._bar.add_task("starting", total=None)
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
-
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Show how far a label source is."""
-        self._bar.update(self._work, description=what, completed=done, total=total)
+@contextmanager
+def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """Frames written of one label source; to be called with what, how many are done, of how many."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
+        work = bar.add_task("starting", total=None)
+        yield lambda what, done, total: bar.update(work, description=what, completed=done, total=total)
 
 
 def print_converted(converted: Converted, console: Console) -> None:

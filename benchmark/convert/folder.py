@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import yaml
@@ -20,7 +17,7 @@ from semstab.datasets.formats.images import MILLIMETRES
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.posed_folder import SETTINGS_FILE
 from semstab.errors import ConfigError, DataError
-from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.files import atomic_path, content_key, read_json, write_json, write_png, write_text
 from semstab.frames import Frame, Intrinsics
 from semstab.labels import LabelSpace
 from semstab.results import slug
@@ -97,7 +94,7 @@ class SceneFolder:
         self.path = path
         self._tolerance = tolerance
         self._settings = dict(settings)
-        self._key = hashlib.blake2b(json.dumps(self._settings, sort_keys=True).encode(), digest_size=16).hexdigest()
+        self._key = content_key(self._settings)
         self.form = self._claim()
         self._intrinsics: Intrinsics | None = None
 
@@ -133,7 +130,7 @@ class SceneFolder:
         labels, scores = (self._label_path("", backbone, soft).parent for soft in (False, True))
         return scores.is_dir() and not labels.is_dir()
 
-    def write_geometry(self, name: str, frame: Frame, color: npt.NDArray[np.uint8] | None) -> None:
+    def write_geometry(self, name: str, frame: Frame) -> None:
         """Write what a frame shows beside labels.
 
         Raises DepthFormatError, or DataError where its intrinsics are not those of the frames before.
@@ -143,24 +140,24 @@ class SceneFolder:
         if stored is None:
             raise DepthFormatError
         self._require_same_camera(frame)
-        if color is not None:
-            _write_png(self.path / "color" / f"{name}.png", np.ascontiguousarray(color[..., ::-1]))
+        if frame.color is not None:
+            write_png(self.path / "color" / f"{name}.png", np.ascontiguousarray(frame.color[..., ::-1]))
         if frame.mask is not None:
-            _write_png(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
+            write_png(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
         write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.T_wc))
         path = self._depth_path(name, self.form)
         if self.form.scale is None:
             with atomic_path(path) as temporary:
                 np.save(temporary, stored)
         else:
-            _write_png(path, stored)
+            write_png(path, stored)
 
     def write_labels(self, name: str, frame: Frame, backbone: str) -> None:
         """Write a frame's label ids, or its scores."""
         path = self._label_path(name, backbone, frame.scores is not None)
         if frame.scores is None:
             assert frame.labels is not None
-            _write_png(path, frame.labels)
+            write_png(path, frame.labels)
             return
         with atomic_path(path) as temporary:
             np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))
@@ -168,7 +165,7 @@ class SceneFolder:
     def write_classes(self, backbone: str, space: LabelSpace) -> None:
         """Write the classes of a backbone beside its maps."""
         folder = self._label_path("", backbone, self.is_soft(backbone)).parent
-        write_text(folder / LABEL_SPACE_FILE, yaml.safe_dump(space.to_dict(), sort_keys=False, allow_unicode=True))
+        space.save(folder / LABEL_SPACE_FILE)
 
     def read_as(self, backbone: str) -> str:
         """The name under which the backbone is found in the folder."""
@@ -219,8 +216,3 @@ def matrix_text(matrix: npt.NDArray[np.float64]) -> str:
 def _bare(backbone: str) -> str:
     """The folder below scores/: posed_folder adds the suffix to its name."""
     return slug(backbone.removesuffix(SCORES_SUFFIX))
-
-
-def _write_png(path: Path, image: npt.NDArray[Any]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
 from rich.console import Console
 
-from semstab.config import DatasetConfig, FrameSelection, explain
+from semstab.config import DatasetConfig, FrameSelection, validated
 from semstab.errors import ConfigError
 from semstab.predict.jobs import Job, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor
@@ -38,8 +37,8 @@ def run(
     options    of the backbone
     dataset    resolved, where the images are those of scenes
     """
-    config = _validated(PredictorConfig, {**predictor, "options": options}).resolved()
-    selection = _validated(FrameSelection, frames)
+    config = validated(PredictorConfig, {**predictor, "options": options}).resolved()
+    selection = validated(FrameSelection, frames)
     jobs = _jobs(images, dataset, scenes, selection, out)
     backbone = load_predictor(config)
     sequence_options = SequenceOptions(
@@ -82,10 +81,3 @@ def _jobs(
     if images is None or dataset is not None:
         raise ConfigError("say what to predict on: --images GLOB, or --data FOLDER, or --dataset NAME")
     return [file_job(images, frames, out)]
-
-
-def _validated(model: Any, content: Mapping[str, Any]) -> Any:
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        raise ConfigError(explain(error, model)) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import time
@@ -10,16 +9,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from semstab.datasets.files.label_source import LABEL_SPACE_FILE
 from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
-from semstab.files import atomic_path, read_json, write_json, write_text
+from semstab.files import atomic_path, content_key, read_json, write_json, write_png
 from semstab.labels import LabelSpace
 
 SCHEMA = 1
@@ -61,7 +58,13 @@ class PredictionFolder:
         self._suffix = ".npz" if kind == "scores" else ".png"
         self._score_type = np.dtype(score_type)
         said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
-        self._content: dict[str, Any] = {"schema": SCHEMA, "kind": kind, "key": _key(said), "settings": said, **about}
+        self._content: dict[str, Any] = {
+            "schema": SCHEMA,
+            "kind": kind,
+            "key": content_key(said),
+            "settings": said,
+            **about,
+        }
         self._frames: dict[str, dict[str, Any]] = self._claim(overwrite)
         self._space = space
         self._saved = -math.inf
@@ -76,11 +79,11 @@ class PredictionFolder:
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
         """Keep a frame's map: ids (H, W), or scores (H, W, K)."""
-        with atomic_path(self.file(name)) as temporary:
-            if self.kind == "scores":
+        if self.kind == "scores":
+            with atomic_path(self.file(name)) as temporary:
                 np.savez(temporary, scores=values.transpose(2, 0, 1).astype(self._score_type))
-            else:
-                temporary.write_bytes(cv2.imencode(".png", values)[1].tobytes())
+        else:
+            write_png(self.file(name), values)
         self._frames[name] = {"image": image, "seconds": round(seconds, 4)}
         if time.monotonic() - self._saved > SAVE_SECONDS:
             self.save()
@@ -90,8 +93,7 @@ class PredictionFolder:
         if not self._frames:
             return
         if self._space is not None:
-            text = yaml.safe_dump(self._space.to_dict(), sort_keys=False, allow_unicode=True)
-            write_text(self.path / LABEL_SPACE_FILE, text)
+            self._space.save(self.path / LABEL_SPACE_FILE)
         write_json(self.path / MANIFEST_FILE, self._content | {"frames": self._frames})
         self._saved = time.monotonic()
 
@@ -121,10 +123,6 @@ class PredictionFolder:
 
 def _files(path: Path) -> list[Path]:
     return [file for file in path.iterdir() if not file.name.startswith(".")] if path.is_dir() else []
-
-
-def _key(settings: Mapping[str, Any]) -> str:
-    return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:

@@ -173,10 +173,8 @@ class PredictedScene(Scene):
             return self._inner.frame(index, backbone, color=color)
         image = self._inner.image(index)
         prediction = self._predict(index, backbone, image)
-        soft = prediction.scores is not None
-        frame = self._inner.predicted(
-            index, **({"scores": prediction.scores} if soft else {"labels": prediction.labels})
-        )
+        labels = prediction.labels if prediction.scores is None else None
+        frame = self._inner.predicted(index, labels=labels, scores=prediction.scores)
         self._digests[index] = _digest(image, frame)
         return dataclasses.replace(frame, color=image if color else None)
 

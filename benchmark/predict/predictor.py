@@ -6,11 +6,11 @@ import re
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from semstab.backbones import Backbone, create, options_model
 from semstab.backbones.class_names import InTaxonomy
-from semstab.config import Settings, explain
+from semstab.config import Settings, validated
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
 from semstab.files import parse_yaml
@@ -53,11 +53,7 @@ class PredictorConfig(Settings):
 
         Raises ConfigError for an option that cannot be used, MissingDependencyError.
         """
-        model = options_model(self.backbone)
-        try:
-            options = model.model_validate(self.options)
-        except ValidationError as error:
-            raise ConfigError(f"backbone '{self.backbone}': {explain(error, model)}") from error
+        options = validated(options_model(self.backbone), self.options, f"backbone '{self.backbone}': ")
         return self.model_copy(update={"options": _absolute(options).model_dump(mode="json")})
 
 
@@ -88,10 +84,7 @@ def parse_predictor(text: str) -> PredictorConfig:
             raise ConfigError(f"--predict {text}: write NAME,KEY=VALUE,...; '{setting}' has no '='")
         group = own if key in ("name", "scores", "taxonomy", "mapping") else options
         group[key] = parse_yaml(value, f"--predict {text}")
-    try:
-        return PredictorConfig(backbone=backbone, options=options, **own)
-    except ValidationError as error:
-        raise ConfigError(f"--predict {text}: {explain(error, PredictorConfig)}") from error
+    return validated(PredictorConfig, {"backbone": backbone, "options": options, **own}, f"--predict {text}: ")
 
 
 def _absolute(options: BaseModel) -> BaseModel:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib.metadata
 import time
 from collections.abc import Sequence
@@ -11,10 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from semstab.backbones import Backbone, Prediction
+from semstab.backbones import Backbone, Prediction, image_digest
 from semstab.datasets.views.same_view import fitted
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType
 from semstab.predict.images import Image, ImageSequence, first_images
@@ -191,20 +187,14 @@ class _Work:
             observer.frame_done(kept)
 
 
-def image_digest(pixels: npt.NDArray[np.uint8]) -> str:
-    """A hash of an image's size and colours."""
-    content = hashlib.blake2b(repr(pixels.shape).encode(), digest_size=16)
-    content.update(np.ascontiguousarray(pixels).data)
-    return content.hexdigest()
-
-
 def _placed(sequence: ImageSequence, picture: _Picture, prediction: Prediction) -> Prediction:
     """The prediction at the pixels that the scene's label files have."""
     frame = sequence.predicted(picture.index, labels=prediction.labels) if sequence.labels_like_depth else None
     if frame is None:
         return prediction
     assert frame.labels is not None
-    return Prediction(frame.labels, fitted(None, prediction.scores, frame.shape, picture.name)[1])
+    scores = None if prediction.scores is None else fitted(prediction.scores, frame.shape, picture.name)
+    return Prediction(frame.labels, scores)
 
 
 def _folders(backbone: Backbone, out: Path, options: SequenceOptions) -> list[PredictionFolder]:

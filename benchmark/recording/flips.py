@@ -15,6 +15,7 @@ from semstab.frames import Frame
 from semstab.labels import LabelSpace
 from semstab.measures import mean_drift
 from semstab.recording.entities import Clock, path
+from semstab.recording.series import LINE_COLORS
 from semstab.recording.tracker import Tracker
 
 SHOWN = 10
@@ -28,10 +29,7 @@ MOVED_BITS = 0.05
 
 MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
-COLORS = (
-    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
-    (255, 255, 255), (170, 255, 195), (220, 190, 255),
-)  # fmt: skip
+COLORS = (*LINE_COLORS, (255, 255, 255), (170, 255, 195), (220, 190, 255))
 
 
 @dataclass(frozen=True)

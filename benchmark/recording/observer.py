@@ -104,7 +104,7 @@ class Recording(Observer):
 
     def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
         """Log the unit's row of the time series."""
-        stream = self._opened()
+        stream, _ = self._opened()
         task = self._tasks[unit.scene, unit.backbone]
         self._clock.set(stream, frame.index, frame.timestamp)
         origin = self._origin(stream, task, frame.T_wc[:3, 3])
@@ -118,22 +118,18 @@ class Recording(Observer):
 
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """Log what the camera and the map show."""
-        stream, group, scene = self._opened(), self._group, task.scene.name
-        assert group is not None
-        assert self._background is not None
-        self._cameras[scene].log(stream, frame, self._background)
-        group.log(stream, frame, self._background, maps=not self.pictures_only)
+        (stream, background), group, scene = self._opened(), self._fused, task.scene.name
+        self._cameras[scene].log(stream, frame, background)
+        group.log(stream, frame, background, maps=not self.pictures_only)
         if not self.pictures_only and chunks_of(group.grown) > self._known.chunks[scene]:
             show = functools.partial(self._show_chunks, stream, scene, group.grown)
-            self._background.submit(frame.index, frame.timestamp, show)
+            background.submit(frame.index, frame.timestamp, show)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """Log the unit's voxels, while they are measured; the time is that of its last frame."""
         if self.pictures_only:
             return
-        stream, group, background = self._opened(), self._group, self._background
-        assert group is not None
-        assert background is not None
+        (stream, background), group = self._opened(), self._fused
         tolerance = self._plan.config.tolerance
         background.submit(*group.last, functools.partial(group.log_map, stream, unit, table, tolerance))
 
@@ -141,17 +137,15 @@ class Recording(Observer):
         """Log the unit's final numbers."""
         if self.pictures_only:
             return
-        stream, group = self._opened(), self._group
-        assert group is not None
-        assert self._background is not None
-        self._background.drain()
+        (stream, background), group = self._opened(), self._fused
+        background.drain()
         self._clock.set(stream, *group.last)
         self._log_numbers(stream, group, summary)
 
     def group_finished(self, task: Task) -> None:
         """Log what flipped, and lay out what there is now."""
-        stream, group, background = self._opened(), self._group, self._background
-        if group is None or background is None:
+        (stream, background), group = self._opened(), self._group
+        if group is None:
             return
         if group.tables:
             (*_, table) = group.tables.values()
@@ -221,16 +215,22 @@ class Recording(Observer):
             stream.flush()
             stream.disconnect()
 
-    def _opened(self) -> rr.RecordingStream:
-        if self._stream is None:
+    @property
+    def _fused(self) -> _Group:
+        """The group that is being fused."""
+        assert self._group is not None
+        return self._group
+
+    def _opened(self) -> tuple[rr.RecordingStream, Background]:
+        if self._stream is None or self._background is None:
             self._stream = stream = self.target.open()
             self._background = Background(stream, self._clock)
             if self.pictures_only:
-                return stream
+                return stream, self._background
             _log_static(stream, self._plan)
             self._send_blueprint(stream)
             self._log_kept(stream)
-        return self._stream
+        return self._stream, self._background
 
     def _lay_out(self, stream: rr.RecordingStream, group: _Group, table: VoxelTable) -> None:
         """All of a group is fused: send the layout again where there is more to it now. The table is one of its own."""

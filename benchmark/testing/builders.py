@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from semstab.frames import Frame, Intrinsics
 from semstab.measures import SBD_MAX
@@ -73,7 +74,7 @@ def random_frames(seed: int, count: int = 3, K: int = 4) -> list[Frame]:
     frames = []
     for index in range(count):
         T_wc = np.eye(4)
-        T_wc[:3, :3] = _turn(*rng.normal(0, 0.2, 3))
+        T_wc[:3, :3] = Rotation.from_euler("xyz", rng.normal(0, 0.2, 3)).as_matrix()
         T_wc[:3, 3] = rng.normal(0, 0.5, 3)
         depth = rng.uniform(0.5, 6, (18, 24)).astype(np.float32)
         depth[rng.random(depth.shape) < 0.1] = rng.choice([0, -1, np.nan, np.inf])
@@ -83,15 +84,6 @@ def random_frames(seed: int, count: int = 3, K: int = 4) -> list[Frame]:
         camera = Intrinsics(fx=20, fy=21, cx=11.3, cy=8.8)
         frames.append(Frame(index, depth, camera, T_wc, None if soft else labels, scores if soft else None))
     return frames
-
-
-def _turn(a: float, b: float, c: float) -> npt.NDArray[np.float64]:
-    """A rotation by angles about x, y, z."""
-    X = np.array([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])
-    Y = np.array([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
-    Z = np.array([[math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1]])
-    turn: npt.NDArray[np.float64] = Z @ Y @ X
-    return turn
 
 
 DEPTHS = st.sampled_from([0.0, 0.25, 0.5, 1.5, 2.5, 3.5])  # 0 is invalid; the others lie inside voxels of 1 m

@@ -7,7 +7,6 @@ wrong, and where and when, is set by `CityOptions.backbones`; `SimulatedBackbone
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 import threading
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
+from semstab.config import nearest
 from semstab.datasets.city.classes import uavid8
 from semstab.datasets.city.flight import FLIGHTS
 from semstab.datasets.city.options import CityOptions, SimulatedBackbone
@@ -51,7 +51,7 @@ class City(Dataset):
     def scene(self, name: str) -> CityScene:
         """Open a scene; its town is built when the first frame is asked for. Raises DataError for an unknown name."""
         if name not in FLIGHTS:
-            raise DataError(f"city: scene '{name}' is not known; {_hint(name, self.scenes)}")
+            raise DataError(f"city: scene '{name}' is not known; {nearest(name, self.scenes)}")
         if self._last is None or self._last.name != name:
             self._last = CityScene(name, self.options)
         return self._last
@@ -181,10 +181,5 @@ class CityScene(Scene):
             return None
         if backbone not in self._options.backbones:
             known = (*self.backbones, GROUND_TRUTH)
-            raise ConfigError(f"city: backbone '{backbone}' is not known; {_hint(backbone, known)}")
+            raise ConfigError(f"city: backbone '{backbone}' is not known; {nearest(backbone, known)}")
         return self._options.backbones[backbone]
-
-
-def _hint(name: str, known: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.datasets.city.classes import BUILDING
-from semstab.datasets.city.mesh import Float64, Int64, Shape, Surface, box, pane, shape
+from semstab.datasets.city.mesh import Float64, Int64, Shape, Surface, box, choose, pane, shape
 from semstab.datasets.city.plots import Building
-from semstab.datasets.city.streets import Layout
-from semstab.datasets.city.terrain import Terrain
+from semstab.datasets.city.terrain import Site
 
 FOUNDATION = 2.0
 """Metres of wall below the ground in the building's middle, so that no gap opens on a slope."""
@@ -44,15 +43,15 @@ class _Placed:
         return _Placed(self.position[rows], self.yaw[rows], self.size[rows], self.walls[rows], self.roofs[rows])
 
 
-def build(buildings: Sequence[Building], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> list[Surface]:
+def build(buildings: Sequence[Building], site: Site, rng: np.random.Generator) -> list[Surface]:
     """Walls, roofs and windows of all buildings."""
     columns = np.array([b[:6] for b in buildings], dtype=np.float64)
     kind = np.array([b.roof for b in buildings])
-    x, y = layout.to_world(columns[:, 0], columns[:, 1])
-    yaw = layout.heading(columns[:, 0], columns[:, 1], columns[:, 2])
+    yaw = site.layout.heading(columns[:, 0], columns[:, 1], columns[:, 2])
     tone = rng.uniform(0.88, 1.08, size=(len(buildings), 1))
-    tiles = np.where((kind == "flat")[:, None], _choose(FLAT, len(kind), rng), _choose(TILES, len(kind), rng))
-    placed = _Placed(terrain.on(x, y), yaw, columns[:, 3:6], _choose(WALLS, len(kind), rng) * tone, tiles * tone)
+    tiles = np.where((kind == "flat")[:, None], choose(FLAT, len(kind), rng), choose(TILES, len(kind), rng))
+    position = site.on(columns[:, 0], columns[:, 1])
+    placed = _Placed(position, yaw, columns[:, 3:6], choose(WALLS, len(kind), rng) * tone, tiles * tone)
     return [
         _walls(placed),
         *_pitched(placed.pick(np.flatnonzero(kind == "gable")), _gable(), rng),
@@ -147,7 +146,3 @@ def _hip() -> Shape:
 
 def _rise(width: Float64) -> Float64:
     return 0.375 * width
-
-
-def _choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
-    return colors[rng.integers(len(colors), size=count)]

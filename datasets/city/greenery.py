@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from semstab.datasets.city.classes import CLUTTER, LOW_VEGETATION, TREE
-from semstab.datasets.city.mesh import Float64, Shape, Surface, blob, box, combine, cone, moved
+from semstab.datasets.city.mesh import Float64, Shape, Surface, blob, box, choose, combine, cone, moved
 from semstab.datasets.city.plots import Barrier, Spot, columns
-from semstab.datasets.city.streets import Layout
-from semstab.datasets.city.terrain import Terrain
+from semstab.datasets.city.terrain import Site
 
 BARK = (0.33, 0.26, 0.20)
 LEAVES = np.array([[0.20, 0.34, 0.12], [0.26, 0.40, 0.14], [0.17, 0.29, 0.13], [0.33, 0.41, 0.16], [0.24, 0.33, 0.20]])
@@ -21,39 +20,39 @@ PIECE = 3.0
 """Metres of a hedge's or fence's pieces; each follows the slope under it."""
 
 
-def trees(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> list[Surface]:
+def trees(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> list[Surface]:
     """Broad-leaved trees of six forms and, one in six, conifers; a spot's size 1 is about 9 m."""
     s, t, _, size = columns(spots)
-    position = terrain.on(*layout.to_world(s, t))
+    position = site.on(s, t)
     forms = [_broadleaf(rng) for _ in range(6)] + [_conifer()]
     form = rng.integers(len(forms), size=len(spots))
     yaw = rng.uniform(0, 2 * np.pi, len(spots))
     slim = rng.uniform(0.8, 1.15, size=(len(spots), 3)) * size[:, None]
     needles = (form == len(forms) - 1)[:, None]
-    tint = np.where(needles, _choose(NEEDLES, len(spots), rng), _choose(LEAVES, len(spots), rng))
+    tint = np.where(needles, choose(NEEDLES, len(spots), rng), choose(LEAVES, len(spots), rng))
     tint = tint * rng.uniform(0.85, 1.15, size=(len(spots), 1))
     rows = [np.flatnonzero(form == k) for k in range(len(forms))]
     return [forms[k].place(TREE, position[r], yaw[r], slim[r], tint[r]) for k, r in enumerate(rows) if len(r)]
 
 
-def bushes(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
+def bushes(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surface:
     """Low round bushes, up to about 1.5 m."""
     s, t, _, size = columns(spots)
-    position = terrain.on(*layout.to_world(s, t), -0.1)
+    position = site.on(s, t, -0.1)
     bush = moved(blob(0, rng, 0.18), (0, 0, 0.45), (0.85, 0.85, 0.8))
     extent = rng.uniform(0.75, 1.3, size=(len(spots), 3)) * size[:, None]
-    tint = _choose(HEDGE, len(spots), rng) * rng.uniform(0.8, 1.25, size=(len(spots), 1))
+    tint = choose(HEDGE, len(spots), rng) * rng.uniform(0.8, 1.25, size=(len(spots), 1))
     return bush.place(LOW_VEGETATION, position, rng.uniform(0, 6.28, len(spots)), extent, tint)
 
 
-def hedges(barriers: Sequence[Barrier], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
+def hedges(barriers: Sequence[Barrier], site: Site, rng: np.random.Generator) -> Surface:
     """Hedges 0.9 m thick and about 1.4 m high."""
-    return _barriers(barriers, (0.9, 1.4), LOW_VEGETATION, HEDGE, layout, terrain, rng)
+    return _barriers(barriers, (0.9, 1.4), LOW_VEGETATION, HEDGE, site, rng)
 
 
-def fences(barriers: Sequence[Barrier], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
+def fences(barriers: Sequence[Barrier], site: Site, rng: np.random.Generator) -> Surface:
     """Fences 8 cm thick and about 1.2 m high."""
-    return _barriers(barriers, (0.08, 1.2), CLUTTER, WOOD, layout, terrain, rng)
+    return _barriers(barriers, (0.08, 1.2), CLUTTER, WOOD, site, rng)
 
 
 def _barriers(
@@ -61,8 +60,7 @@ def _barriers(
     profile: tuple[float, float],
     class_id: int,
     colors: Float64,
-    layout: Layout,
-    terrain: Terrain,
+    site: Site,
     rng: np.random.Generator,
 ) -> Surface:
     ends = columns(barriers).T
@@ -70,16 +68,16 @@ def _barriers(
     owner = np.repeat(np.arange(len(ends)), counts)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     start, stop = (
-        np.stack(layout.to_world(*_between(ends[owner], (number + k) / counts[owner])), axis=1) for k in (0, 1)
+        np.stack(site.layout.to_world(*_between(ends[owner], (number + k) / counts[owner])), axis=1) for k in (0, 1)
     )
     middle, along = (start + stop) / 2, stop - start
     size = np.stack(
         [np.hypot(*along.T) + 0.05, np.full(len(owner), profile[0]), np.full(len(owner), profile[1])], axis=1
     )
     size[:, 2] *= rng.uniform(0.9, 1.1, len(owner)) * rng.uniform(0.8, 1.2, len(ends))[owner]
-    tint = _choose(colors, len(ends), rng)[owner] * rng.uniform(0.92, 1.08, size=(len(owner), 1))
-    position = terrain.on(middle[:, 0], middle[:, 1], -0.15)
-    lean = terrain.slope(middle[:, 0], middle[:, 1])
+    tint = choose(colors, len(ends), rng)[owner] * rng.uniform(0.92, 1.08, size=(len(owner), 1))
+    position = site.terrain.on(middle[:, 0], middle[:, 1], -0.15)
+    lean = site.terrain.slope(middle[:, 0], middle[:, 1])
     return box().place(class_id, position, np.arctan2(along[:, 1], along[:, 0]), size, tint, lean)
 
 
@@ -101,7 +99,3 @@ def _conifer() -> Shape:
     """A trunk under three stacked cones; 11 m high."""
     tiers = [cone(9, (z, z + h), (r, 0.02)) for z, h, r in ((1.4, 4.6, 2.3), (4.2, 4.2, 1.75), (7.0, 4.0, 1.15))]
     return combine(cone(6, (-0.3, 2.0), (0.25, 0.22), color=BARK), *tiers)
-
-
-def _choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
-    return colors[rng.integers(len(colors), size=count)]

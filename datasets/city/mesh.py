@@ -34,13 +34,23 @@ class Surface:
 
 def join(surfaces: Sequence[Surface]) -> Surface:
     """All surfaces as one, in the given order."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    return Surface(
-        np.concatenate([s.vertices for s in surfaces]),
-        np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)]),
-        np.concatenate([s.classes for s in surfaces]),
-        np.concatenate([s.colors for s in surfaces]),
-    )
+    return Surface(*_joined(surfaces), np.concatenate([s.classes for s in surfaces]), _colors(surfaces))
+
+
+def _joined(parts: Sequence[Surface | Shape]) -> tuple[Float64, Int64]:
+    """Vertices and faces of all parts."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+    return np.concatenate([part.vertices for part in parts]), np.concatenate(faces)
+
+
+def _colors(parts: Sequence[Surface | Shape]) -> Float64:
+    return np.concatenate([part.colors for part in parts])
+
+
+def choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
+    """(count, 3) colours, drawn at random from a few."""
+    return colors[rng.integers(len(colors), size=count)]
 
 
 @dataclass(frozen=True)
@@ -85,13 +95,7 @@ def shape(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color | None = N
 
 def combine(*shapes: Shape) -> Shape:
     """Several shapes as one template."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in shapes)])
-    return Shape(
-        np.concatenate([s.vertices for s in shapes]),
-        np.concatenate([s.faces + start for s, start in zip(shapes, starts, strict=False)]),
-        np.concatenate([s.colors for s in shapes]),
-        np.concatenate([s.tinted for s in shapes]),
-    )
+    return Shape(*_joined(shapes), _colors(shapes), np.concatenate([s.tinted for s in shapes]))
 
 
 def box(

@@ -6,8 +6,9 @@ import math
 import re
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
+from semstab.config import Settings
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.city.classes import uavid8
 
@@ -27,12 +28,16 @@ Share = Annotated[float, Field(ge=0, le=1)]
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9.-]*(_[A-Za-z0-9.-]+)*")
 
 
-def _check_class(name: str) -> None:
+def _known_class(name: str) -> str:
     if name not in uavid8().classes:
         raise ValueError(f"class '{name}' is not known; known: {', '.join(uavid8().classes)}")
+    return name
 
 
-class SimulatedBackbone(BaseModel):
+ClassName = Annotated[str, AfterValidator(_known_class)]
+
+
+class SimulatedBackbone(Settings):
     """How one simulated backbone errs. Each draw is a function of the seed, the backbone's and the scene's name, and of
 
     place    the world cell: the same mistake in every view and frame (stable but wrong)
@@ -50,8 +55,6 @@ class SimulatedBackbone(BaseModel):
     frame; the rest goes to the true class where the prediction is wrong, else to the class's row of `confusion`.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     place: Share = Field(0.0, description="share of the world cells that are wrong in every view")
     view: Share = Field(0.0, description="largest probability of an error that depends on where a cell is seen from")
     flicker: Share = Field(0.0, description="probability that a cell is wrong in a frame, independent of all others")
@@ -66,26 +69,17 @@ class SimulatedBackbone(BaseModel):
         60.0, gt=0, le=1000, description="distance from which view errors grow no further, metres"
     )
     softness: float = Field(0.0, ge=0, le=0.49, description="largest score that goes to other classes; 0: class ids")
-    difficulty: dict[str, Annotated[float, Field(ge=0, le=100)]] = Field(
+    difficulty: dict[ClassName, Annotated[float, Field(ge=0, le=100)]] = Field(
         default_factory=dict, description="factors on place, view and flicker by true class; 1 where not given"
     )
-    confusion: dict[str, dict[str, Annotated[float, Field(ge=0)]]] = Field(
+    confusion: dict[ClassName, dict[ClassName, Annotated[float, Field(ge=0)]]] = Field(
         default_factory=dict, description="rows that replace the built-in ones: true class -> wrong class -> weight"
     )
-
-    @field_validator("difficulty", "confusion")
-    @classmethod
-    def _known_classes(cls, rows: dict[str, object]) -> dict[str, object]:
-        for name in rows:
-            _check_class(name)
-        return rows
 
     @field_validator("confusion")
     @classmethod
     def _real_rows(cls, rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
         for name, row in rows.items():
-            for wrong in row:
-                _check_class(wrong)
             if name in row:
                 raise ValueError(f"'{name}' cannot be mistaken for itself")
             if not (math.isfinite(sum(row.values())) and sum(row.values()) > 0):
@@ -108,10 +102,8 @@ BACKBONES = {
 }
 
 
-class CityOptions(BaseModel):
+class CityOptions(Settings):
     """Options of the built-in city."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     seed: int = Field(0, ge=0, lt=2**63, description="of the towns and of all errors")
     width: int = Field(384, ge=16, le=3840, description="image width in pixels")

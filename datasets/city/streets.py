@@ -20,21 +20,15 @@ class Layout:
     """From plan coordinates (s, t) to the world's (x, y), both in metres: sine bends of some 10 m, then a turn."""
 
     yaw: float
-    bend: tuple[float, float]
-    wavenumber: tuple[float, float]
-    phase: tuple[float, float]
+    bend: Float64
+    wavenumber: Float64
+    phase: Float64
 
     @classmethod
     def random(cls, rng: np.random.Generator) -> Layout:
         """A turn by any angle; bends of 6 to 12 m over 240 to 380 m."""
         bend, length, phase = rng.uniform(6, 12, 2), rng.uniform(240, 380, 2), rng.uniform(0, 2 * np.pi, 2)
-        number = 2 * np.pi / length
-        return cls(
-            float(rng.uniform(0.1, np.pi / 2 - 0.1)),
-            (float(bend[0]), float(bend[1])),
-            (float(number[0]), float(number[1])),
-            (float(phase[0]), float(phase[1])),
-        )
+        return cls(float(rng.uniform(0.1, np.pi / 2 - 0.1)), bend, 2 * np.pi / length, phase)
 
     def to_world(self, s: Float64, t: Float64) -> tuple[Float64, Float64]:
         """World x and y of plan points."""

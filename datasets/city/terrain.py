@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.city.classes import LOW_VEGETATION
-from semstab.datasets.city.mesh import Float64, Int64, Surface
+from semstab.datasets.city.mesh import Float64, Int64, Shape, Surface
 from semstab.datasets.city.streets import Layout, Rectangle
 
 SPACING = 4.0
@@ -65,15 +65,32 @@ class Terrain:
         colors = GRASS + (DRY - GRASS) * patchy * rng.uniform(0.5, 1.0, size=(len(faces), 1))
         return Surface.of_class(vertices, faces, LOW_VEGETATION, colors)
 
-    def drape(
-        self, layout: Layout, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike, step: float = SPACING
+
+@dataclass(frozen=True)
+class Site:
+    """Where a town stands: its street plan, and the ground under it."""
+
+    layout: Layout
+    terrain: Terrain
+
+    def on(self, s: Float64, t: Float64, above: npt.ArrayLike = 0.0) -> Float64:
+        """Points (n, 3) that stand `above` metres over the ground at plan points."""
+        return self.terrain.on(*self.layout.to_world(s, t), above)
+
+    def stand(
+        self, template: Shape, class_id: int, places: tuple[Float64, ...], above: float, size: Float64, tint: Float64
     ) -> Surface:
-        """A rectangle of the street plan laid over the ground, `above` metres over it, in cells of at most `step`."""
-        s = np.linspace(area.s0, area.s1, max(2, int(np.ceil((area.s1 - area.s0) / step)) + 1))
-        t = np.linspace(area.t0, area.t1, max(2, int(np.ceil((area.t1 - area.t0) / step)) + 1))
+        """Copies of a shape that follow the ground at `places`: plan coordinates s and t, and the angle in the plan."""
+        s, t, angle = places
+        lean = self.terrain.slope(*self.layout.to_world(s, t))
+        return template.place(class_id, self.on(s, t, above), self.layout.heading(s, t, angle), size, tint, lean)
+
+    def drape(self, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike) -> Surface:
+        """A rectangle of the plan laid over the ground, `above` metres over it, in cells of at most SPACING."""
+        s = np.linspace(area.s0, area.s1, max(2, int(np.ceil((area.s1 - area.s0) / SPACING)) + 1))
+        t = np.linspace(area.t0, area.t1, max(2, int(np.ceil((area.t1 - area.t0) / SPACING)) + 1))
         gs, gt = np.meshgrid(s, t, indexing="ij")
-        x, y = layout.to_world(gs.ravel(), gt.ravel())
-        return Surface.of_class(self.on(x, y, above), grid_faces(len(s), len(t)), class_id, color)
+        return Surface.of_class(self.on(gs.ravel(), gt.ravel(), above), grid_faces(len(s), len(t)), class_id, color)
 
 
 def grid_faces(rows: int, columns: int) -> Int64:

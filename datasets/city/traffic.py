@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.city.classes import HUMAN, MOVING_CAR, STATIC_CAR
-from semstab.datasets.city.mesh import Float64, Shape, Surface, box, combine, join
+from semstab.datasets.city.mesh import Float64, Shape, Surface, box, choose, combine, join
 from semstab.datasets.city.plots import SIDEWALK, SIDEWALK_ABOVE, Spot, columns
-from semstab.datasets.city.streets import MAIN_WIDTH, Layout, Street
-from semstab.datasets.city.terrain import Terrain
+from semstab.datasets.city.streets import MAIN_WIDTH, Street
+from semstab.datasets.city.terrain import Site
 
 Bool = npt.NDArray[np.bool_]
 
@@ -51,17 +51,17 @@ def person() -> Shape:
     )
 
 
-def parked_cars(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
+def parked_cars(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surface:
     """Cars that stand still."""
-    paint = PAINT[rng.integers(len(PAINT), size=len(spots))]
-    return _stand(car(), STATIC_CAR, spots, ROAD_ABOVE, paint, _car_sizes(len(spots), rng), layout, terrain)
+    paint = choose(PAINT, len(spots), rng)
+    return site.stand(car(), STATIC_CAR, tuple(columns(spots)[:3]), ROAD_ABOVE, _car_sizes(len(spots), rng), paint)
 
 
-def standing_people(spots: Sequence[Spot], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
+def standing_people(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surface:
     """People who stand still."""
-    clothes = CLOTHES[rng.integers(len(CLOTHES), size=len(spots))]
+    clothes = choose(CLOTHES, len(spots), rng)
     heights = np.tile(rng.uniform(0.9, 1.08, size=(len(spots), 1)), (1, 3))
-    return _stand(person(), HUMAN, spots, ROAD_ABOVE, clothes, heights, layout, terrain)
+    return site.stand(person(), HUMAN, tuple(columns(spots)[:3]), ROAD_ABOVE, heights, clothes)
 
 
 def roadside_cars(streets: list[Street], rng: np.random.Generator) -> list[Spot]:
@@ -109,20 +109,19 @@ class Movers:
 class Traffic:
     """The moving cars and walking people of a town."""
 
-    layout: Layout
-    terrain: Terrain
+    site: Site
     cars: Movers
     walkers: Movers
 
     @classmethod
-    def random(cls, streets: list[Street], layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Traffic:
+    def random(cls, streets: list[Street], site: Site, rng: np.random.Generator) -> Traffic:
         """A car every 38 m of lane or so at 6 to 13 m/s, a walker every 70 m of sidewalk or so at 0.9 to 1.7 m/s."""
         cars = _movers(streets, 38.0, lambda width: min(1.75, 0.135 * width), (6.0, 13.0), rng)
         walkers = _movers(streets, 70.0, lambda width: width / 2 + SIDEWALK / 2, (0.9, 1.7), rng)
         n, m = len(cars.at), len(walkers.at)
-        cars = replace(cars, tint=PAINT[rng.integers(len(PAINT), size=n)], size=_car_sizes(n, rng))
-        clothes, heights = CLOTHES[rng.integers(len(CLOTHES), size=m)], rng.uniform(0.9, 1.08, size=(m, 1))
-        return cls(layout, terrain, cars, replace(walkers, tint=clothes, size=np.tile(heights, (1, 3))))
+        cars = replace(cars, tint=choose(PAINT, n, rng), size=_car_sizes(n, rng))
+        clothes, heights = choose(CLOTHES, m, rng), rng.uniform(0.9, 1.08, size=(m, 1))
+        return cls(site, cars, replace(walkers, tint=clothes, size=np.tile(heights, (1, 3))))
 
     def at(self, seconds: float, camera: Float64) -> Surface:
         """What moves as it stands at a time, as far as it is within SIGHT of the camera at (x, y, z)."""
@@ -136,13 +135,11 @@ class Traffic:
     def _place(
         self, movers: Movers, template: Shape, class_id: int, above: float, seconds: float, camera: Float64
     ) -> Surface:
-        s, t, angle = movers.plan_places(seconds)
-        x, y = self.layout.to_world(s, t)
+        places = movers.plan_places(seconds)
+        x, y = self.site.layout.to_world(*places[:2])
         near = np.hypot(x - camera[0], y - camera[1]) < SIGHT
-        yaw = self.layout.heading(s, t, angle)[near]
-        x, y = x[near], y[near]
-        lean = self.terrain.slope(x, y)
-        return template.place(class_id, self.terrain.on(x, y, above), yaw, movers.size[near], movers.tint[near], lean)
+        seen = tuple(place[near] for place in places)
+        return self.site.stand(template, class_id, seen, above, movers.size[near], movers.tint[near])
 
 
 def _movers(
@@ -175,16 +172,6 @@ def _movers(
 def _keep_right(street: Street, side: float) -> float:
     """The sign of the offset on which traffic with the direction -side drives on the right."""
     return side if street.axis == "s" else -side
-
-
-def _stand(
-    template: Shape, class_id: int, spots: Sequence[Spot], above: float, tint: Float64, size: Float64,
-    layout: Layout, terrain: Terrain,
-) -> Surface:  # fmt: skip
-    s, t, angle, _ = columns(spots)
-    x, y = layout.to_world(s, t)
-    lean = terrain.slope(x, y)
-    return template.place(class_id, terrain.on(x, y, above), layout.heading(s, t, angle), size, tint, lean)
 
 
 def _car_sizes(count: int, rng: np.random.Generator) -> Float64:

@@ -13,7 +13,7 @@ from semstab.datasets.city.flight import Flight
 from semstab.datasets.city.mesh import Float64, Surface, box, join
 from semstab.datasets.city.plots import Inventory, Spot, columns, furnish
 from semstab.datasets.city.streets import MAIN_WIDTH, Layout, Plot, Rectangle, Street, plan_streets
-from semstab.datasets.city.terrain import Terrain
+from semstab.datasets.city.terrain import Site, Terrain
 
 REACH = 125.0
 """Metres from the flight's path up to which the town is built; beyond it there is grass."""
@@ -35,6 +35,7 @@ def build_world(seed: int, flight: Flight) -> World:
     """The town under a flight; the same for every camera, resolution and number of frames."""
     layout = Layout.random(_rng(seed, flight, 0))
     terrain = Terrain.random(_rng(seed, flight, 1))
+    site = Site(layout, terrain)
     path = np.stack(flight.path(np.linspace(0, 1, 60)), axis=1)
     streets, plots = plan_streets(_plan_area(layout, path), _rng(seed, flight, 2))
     town = _furnished(plots, layout, path, _rng(seed, flight, 3))
@@ -42,10 +43,10 @@ def build_world(seed: int, flight: Flight) -> World:
     town.trees += _street_trees(streets, _rng(seed, flight, 5))
     still = [
         terrain.mesh(path.min(axis=0) - REACH, path.max(axis=0) + REACH, _rng(seed, flight, 6)),
-        *_ground(town, streets, layout, terrain, path),
-        *_standing(town, layout, terrain, path, seed, flight),
+        *_ground(town, streets, site, path),
+        *_standing(town, site, path, seed, flight),
     ]
-    return World(terrain, join(still), traffic.Traffic.random(streets, layout, terrain, _rng(seed, flight, 15)))
+    return World(terrain, join(still), traffic.Traffic.random(streets, site, _rng(seed, flight, 15)))
 
 
 def _rng(seed: int, flight: Flight, purpose: int) -> np.random.Generator:
@@ -84,49 +85,44 @@ def _street_trees(streets: Sequence[Street], rng: np.random.Generator) -> list[S
     return spots
 
 
-def _ground(
-    town: Inventory, streets: Sequence[Street], layout: Layout, terrain: Terrain, path: Float64
-) -> list[Surface]:
+def _ground(town: Inventory, streets: Sequence[Street], site: Site, path: Float64) -> list[Surface]:
     """Streets with their markings, sidewalks, yards and fields, laid over the terrain one above the other."""
-    surfaces = [terrain.drape(layout, p.area, p.above, p.class_id, p.color) for p in town.patches]
+    surfaces = [site.drape(p.area, p.above, p.class_id, p.color) for p in town.patches]
     for number, street in enumerate(streets):
         half = street.width / 2
         shade = np.array(ASPHALT) * (0.92 + 0.04 * (number % 4))
         above = traffic.ROAD_ABOVE + 0.0007 * number  # crossing streets do not lie in one plane
         lane = street.strip(-half - 0.3, half + 0.3)  # its edges lie under the kerbs: no grass shows between
-        surfaces.append(terrain.drape(layout, lane, above, ROAD, shade))
+        surfaces.append(site.drape(lane, above, ROAD, shade))
         for low in street.clear_of_crossings(np.arange(street.low + 3, street.high - 6, 7.0), list(streets), 6.0):
             dash = street.strip(-0.08, 0.08, float(low), float(low) + 3.0)
-            surfaces.append(terrain.drape(layout, dash, MARKING_ABOVE + 0.0007 * number, ROAD, PAINT))
+            surfaces.append(site.drape(dash, MARKING_ABOVE + 0.0007 * number, ROAD, PAINT))
     return [_within(surface, path) for surface in surfaces]
 
 
-def _standing(
-    town: Inventory, layout: Layout, terrain: Terrain, path: Float64, seed: int, flight: Flight
-) -> list[Surface]:
+def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Flight) -> list[Surface]:
     def close(rows: Sequence[Spot]) -> list[Spot]:
-        near = _near([row[:2] for row in rows], layout, path, REACH)
+        near = _near([row[:2] for row in rows], site.layout, path, REACH)
         return [row for row, keep in zip(rows, near, strict=True) if keep]
 
     return [
-        *buildings.build(town.buildings, layout, terrain, _rng(seed, flight, 7)),
-        *greenery.trees(close(town.trees), layout, terrain, _rng(seed, flight, 8)),
-        greenery.bushes(close(town.bushes), layout, terrain, _rng(seed, flight, 9)),
-        greenery.hedges(town.hedges, layout, terrain, _rng(seed, flight, 10)),
-        greenery.fences(town.fences, layout, terrain, _rng(seed, flight, 11)),
-        traffic.parked_cars(close(town.cars), layout, terrain, _rng(seed, flight, 12)),
-        traffic.standing_people(close(town.people), layout, terrain, _rng(seed, flight, 13)),
-        _bins(town, layout, terrain, _rng(seed, flight, 14)),
+        *buildings.build(town.buildings, site, _rng(seed, flight, 7)),
+        *greenery.trees(close(town.trees), site, _rng(seed, flight, 8)),
+        greenery.bushes(close(town.bushes), site, _rng(seed, flight, 9)),
+        greenery.hedges(town.hedges, site, _rng(seed, flight, 10)),
+        greenery.fences(town.fences, site, _rng(seed, flight, 11)),
+        traffic.parked_cars(close(town.cars), site, _rng(seed, flight, 12)),
+        traffic.standing_people(close(town.people), site, _rng(seed, flight, 13)),
+        _bins(town, site, _rng(seed, flight, 14)),
     ]
 
 
-def _bins(town: Inventory, layout: Layout, terrain: Terrain, rng: np.random.Generator) -> Surface:
+def _bins(town: Inventory, site: Site, rng: np.random.Generator) -> Surface:
     """Containers and bins."""
-    s, t, angle, size = columns(town.bins)
-    x, y = layout.to_world(s, t)
-    extent = rng.uniform([0.7, 0.6, 0.9], [1.9, 1.1, 1.5], size=(len(s), 3)) * size[:, None]
-    tint = rng.uniform([0.15, 0.22, 0.2], [0.5, 0.45, 0.5], size=(len(s), 3))
-    return box().place(CLUTTER, terrain.on(x, y, 0.02), layout.heading(s, t, angle), extent, tint, terrain.slope(x, y))
+    *places, size = columns(town.bins)
+    extent = rng.uniform([0.7, 0.6, 0.9], [1.9, 1.1, 1.5], size=(len(size), 3)) * size[:, None]
+    tint = rng.uniform([0.15, 0.22, 0.2], [0.5, 0.45, 0.5], size=(len(size), 3))
+    return site.stand(box(), CLUTTER, tuple(places), 0.02, extent, tint)
 
 
 def _near(places: Sequence[tuple[float, ...]], layout: Layout, path: Float64, distance: float) -> list[bool]:

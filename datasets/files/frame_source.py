@@ -15,9 +15,9 @@ class FrameSource:
 
     name          what path templates call it
     depth         the file
-    pose          (4, 4) in the dataset's convention, or the file that holds it
-    pose_file     what errors of the pose name
+    pose_file     the file that holds its pose, or all poses
     camera        of the depth image
+    pose          (4, 4) in the dataset's convention, where it is not in a file of its own
     label_camera  of the images that label maps belong to, where that is another one
     color         the file that it has, or would have; None where that is not known
     depth_scale   units in a metre, where the dataset's own files say so
@@ -26,9 +26,9 @@ class FrameSource:
 
     name: str
     depth: Path
-    pose: Poses | Path
     pose_file: Path
     camera: Camera
+    pose: Poses | None = None
     label_camera: Camera | None = None
     color: Path | None = None
     depth_scale: float | None = None

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import DataError
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.labels import IGNORE_16BIT, ignore_id
 
 NO_ID = IGNORE_16BIT - 1
 """In a table of class ids: an id that is not in it."""
@@ -26,8 +26,7 @@ def translated(labels: Labels, table: npt.NDArray[np.uint16], path: Path) -> Lab
 
 def without_labels(labels: Labels, void: Collection[int]) -> Labels:
     """The ids, where one of `void` is the ignore id."""
-    ignore = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
-    return np.where(np.isin(labels, [*void]), labels.dtype.type(ignore), labels)
+    return np.where(np.isin(labels, [*void]), labels.dtype.type(ignore_id(labels)), labels)
 
 
 def without_scores(scores: Scores, ids: Sequence[int], void: Collection[int]) -> Scores:

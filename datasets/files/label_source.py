@@ -17,9 +17,9 @@ from semstab.labels import LabelSpace
 
 logger = logging.getLogger("semstab")
 
-Kind = Literal["labels", "scores"]
+Kind = Literal["labels", "scores", "masks"]
 KINDS: tuple[Kind, ...] = ("labels", "scores")
-SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES}
+SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES, "masks": MASK_SUFFIXES}
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
 REGIONS = "regions/{backbone}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
@@ -124,10 +124,7 @@ def find_masks(options: FileOptions, place: ScenePlace, names: Sequence[str]) ->
     if options.masks is None:
         return {}
     template = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=place.below_root)
-    folders = Folders()
-    paths = {name: inside(place.folder, place.folder, template.replace("{name}", name), "masks") for name in names}
-    found = {name: folders.one_of(path, MASK_SUFFIXES) for name, path in paths.items()}
-    return {name: path for name, path in found.items() if path is not None}
+    return _source("masks", place.folder, template, names, Folders()).files
 
 
 def _said(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:

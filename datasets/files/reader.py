@@ -16,8 +16,12 @@ from semstab.datasets.files.label_source import ScenePlace
 from semstab.datasets.files.messages import nearest
 from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.scene import FileScene
+from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.scene import Dataset
+from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError, DataError
 
 DEEPEST = 3
@@ -118,10 +122,42 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
     return {name: folder / f"{before}{name}{after}" for name in sorted(names, key=natural) if name}
 
 
-def require_equal(path: Path, poses: int, files: int, what: str) -> None:
-    """Raises DataError where a trajectory has another number of poses than there are files."""
-    if poses != files:
-        raise DataError(f"{path}: has {poses} poses, but there are {files} {what}; they must be as many")
+def frames_of(
+    folder: Path,
+    depth: Mapping[str, Path],
+    camera: Camera,
+    *,
+    pose: str,
+    color: str,
+    poses: Poses | None = None,
+    label_camera: Camera | None = None,
+    depth_scale: float | None = None,
+    what: str = "depth images",
+) -> list[FrameSource]:
+    """One a depth image, with its colour where there is any; `pose` and `color` are templates with {name}.
+
+    poses  (n, 4, 4) in the same order, where `pose` is the file of them all
+
+    Raises DataError where that file has another number of poses than there are depth images, or what goes with each.
+    """
+    if poses is not None and len(poses) != len(depth):
+        raise DataError(
+            f"{folder / pose}: has {len(poses)} poses, but there are {len(depth)} {what}; they must be as many"
+        )
+    folders = Folders()
+    return [
+        FrameSource(
+            name=name,
+            depth=path,
+            pose_file=folder / pose.replace("{name}", name),
+            camera=camera,
+            pose=None if poses is None else poses[k],
+            label_camera=label_camera,
+            color=folders.one_of(folder / color.replace("{name}", name), COLOR_SUFFIXES),
+            depth_scale=depth_scale,
+        )
+        for k, (name, path) in enumerate(depth.items())
+    ]
 
 
 def _below(folder: Path, is_scene: Callable[[Path], bool], levels: int) -> Iterator[Path]:

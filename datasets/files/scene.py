@@ -35,7 +35,7 @@ from semstab.datasets.scene import GROUND_TRUTH, Scene
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
 from semstab.datasets.views.ray_depth import planar
-from semstab.datasets.views.resampling import Labels, Scores, fit_labels, fit_scores
+from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
 from semstab.datasets.views.same_view import fitted
 from semstab.errors import ConfigError, DataError
 from semstab.frames import Frame, Intrinsics
@@ -104,7 +104,7 @@ class FileScene(Scene):
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
-        files = [frame.depth, *([frame.pose] if isinstance(frame.pose, Path) else [])]
+        files = [frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._source(name).missing(frame.name)]
         if color and self._color_file(frame) is None:
@@ -163,7 +163,8 @@ class FileScene(Scene):
         """
         depth = self.depth(index)
         where = str(self._frame(index).color or self.image_name(index))
-        labels, scores = self._fitted(index, labels, scores, depth.shape, where)
+        labels = None if labels is None else self._fitted(index, labels, depth.shape, where)
+        scores = None if scores is None else self._fitted(index, scores, depth.shape, where)
         return self._framed(index, depth, labels, scores, color=False)
 
     def depth(self, index: int) -> npt.NDArray[np.float32]:
@@ -264,41 +265,34 @@ class FileScene(Scene):
             labels = translated(labels, self._class_ids[backbone], path)
         if void := self.options.void_ids.get(backbone):
             labels = without_labels(labels, void)
-        fitting: Labels = self._stored(index, labels, None, shape, str(path), "labels are")[0]
-        return fitting
+        return self._stored(index, labels, shape, path, "labels are")
 
     def _scores(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Scores:
         scores = read_scores(path, self.options.scores_layout or "KHW", (shape[0], shape[1]), self._read)
         if void := self.options.void_ids.get(backbone):
             space = self._space(backbone)
             scores = without_scores(scores, range(scores.shape[2]) if space is None else space.ids, void)
-        fitting: Scores = self._stored(index, None, scores, shape, str(path), "scores are")[1]
-        return fitting
+        return self._stored(index, scores, shape, path, "scores are")
 
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
         """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
         mask = read_mask(path, self._read).astype(np.uint8)
-        masked: npt.NDArray[np.bool_] = self._stored(index, mask, None, shape, str(path), "the mask is")[0] == 1
+        masked: npt.NDArray[np.bool_] = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
-    def _stored(
-        self, index: int, labels: Any, scores: Any, shape: tuple[int, ...], where: str, what: str
-    ) -> tuple[Any, Any]:
+    def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
         """What a file holds, at the depth's pixels; where it must have them, `Frame` says that it has not."""
-        return (labels, scores) if self.labels_like_depth else self._fitted(index, labels, scores, shape, where, what)
+        return values if self.labels_like_depth else self._fitted(index, values, shape, str(path), what)
 
     def _fitted(
-        self, index: int, labels: Any, scores: Any, shape: tuple[int, ...], where: str, what: str = "the image is"
-    ) -> tuple[Any, Any]:
-        """Labels (H', W') and scores (H', W', K), each where given, as the depth's camera sees them."""
+        self, index: int, values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is"
+    ) -> Pixels:
+        """Labels (H', W') or scores (H', W', K) as the depth's camera sees them."""
         camera = self._frame(index).label_camera
         if camera is None:
-            return fitted(labels, scores, shape, where, what)
-        ours, size, centre = self.intrinsics(index, shape), (shape[0], shape[1]), self.options.pixel_centre or 0.0
-        return (
-            None if labels is None else fit_labels(labels, camera.at(labels.shape, centre), ours, size),
-            None if scores is None else fit_scores(scores, camera.at(scores.shape, centre), ours, size),
-        )
+            return fitted(values, shape, where, what)
+        K = camera.at(values.shape, self.options.pixel_centre or 0.0)
+        return fit(values, K, self.intrinsics(index, shape), (shape[0], shape[1]))
 
     def _geometry_bytes(self, source: FrameSource) -> bytes:
         """The pose and the cameras of a frame, as bytes that are equal where they are."""
@@ -312,7 +306,7 @@ class FileScene(Scene):
         return data
 
     def _stored_pose(self, source: FrameSource) -> Poses:
-        return read_pose(source.pose) if isinstance(source.pose, Path) else source.pose
+        return read_pose(source.pose_file) if source.pose is None else source.pose
 
     def _space(self, backbone: str) -> LabelSpace | None:
         """The classes of a label source, None where nothing says them; what says them is read once."""

@@ -86,13 +86,17 @@ def at_times(
     times, poses = times[kept], poses[kept]
     if not len(times):
         return np.full((len(wanted), 4, 4), np.nan)
-    after = np.searchsorted(times, wanted).clip(1, max(1, len(times) - 1)).clip(max=len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(wanted - times[before] <= times[after] - wanted, before, after)
-    found = poses[nearest] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
-    found = found.copy()
-    found[np.abs(times[nearest] - wanted) > max_gap] = np.nan
+    at = nearest(wanted, times)
+    found = poses[at] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
+    found[np.abs(times[at] - wanted) > max_gap] = np.nan
     return found
+
+
+def nearest(times: npt.NDArray[np.float64], others: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
+    """For each time the index of the nearest of the ascending others; of two as near the earlier one."""
+    after = np.searchsorted(others, times).clip(max=len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
 
 
 def _between(times: npt.NDArray[np.float64], poses: Poses, wanted: npt.NDArray[np.float64]) -> Poses:

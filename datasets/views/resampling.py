@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.frames import Intrinsics
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.labels import ignore_id
 
 Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 Scores = npt.NDArray[np.floating[Any]]
+Pixels = TypeVar("Pixels", bound=npt.NDArray[Any])
+"""Labels (H, W) or scores (H, W, K): the same comes back."""
 
 TIE = 1e-6
 """Pixels by which a position between two pixels is moved on, so that ties do not depend on rounding."""
 
 FAR = 2.0**40
 """Pixels from which a position is anyway outside of any image, and still a whole number when it is rounded."""
+
+
+def fit(values: Pixels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Pixels:
+    """`fit_labels` of a label map, `fit_scores` of scores."""
+    fitting: Any = fit_labels if values.ndim == 2 else fit_scores
+    fitted: Pixels = fitting(values, K, K_depth, shape)
+    return fitted
 
 
 def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Labels:
@@ -30,7 +39,7 @@ def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[
     H, W = labels.shape
     fitted: Labels = labels[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
     outside = ~(_within(rows, H)[:, None] & _within(columns, W))
-    fitted[outside] = IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+    fitted[outside] = ignore_id(labels)
     return fitted
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.resampling import Labels, Scores, fit_labels, fit_scores
+from semstab.datasets.views.resampling import Pixels, fit
 from semstab.errors import DataError
 from semstab.frames import Intrinsics
 
@@ -13,24 +11,15 @@ SHAPE_TOLERANCE = 0.02
 """Images whose ratios of width and height differ by more do not show the same view."""
 
 
-def fitted(
-    labels: Labels | None, scores: Scores | None, shape: tuple[int, ...], where: str, what: str = "the image is"
-) -> tuple[Labels | None, Scores | None]:
-    """Labels (H', W') and scores (H', W', K), each where given, at the pixels of an image (H, W) of the same view.
+def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is") -> Pixels:
+    """Labels (H', W') or scores (H', W', K) at the pixels of an image (H, W) of the same view.
 
     Nearest for ids, linear for scores. Raises DataError with `where`, its file, for another shape of image.
     """
-    return (
-        None if labels is None else _fit(fit_labels, labels, shape, f"{where}: {what}"),
-        None if scores is None else _fit(fit_scores, scores, shape, f"{where}: {what}"),
-    )
-
-
-def _fit(fit: Any, values: Any, shape: tuple[int, ...], says: str) -> Any:
     if values.shape[:2] == shape:
         return values
     (H, W), (h, w) = values.shape[:2], shape
     if abs(W * h / (H * w) - 1) > SHAPE_TOLERANCE:
-        raise DataError(f"{says} {W}x{H} but depth is {w}x{h}, another view; register one to the other")
+        raise DataError(f"{where}: {what} {W}x{H} but depth is {w}x{h}, another view; register one to the other")
     target = Intrinsics(1, 1, (w - 1) / 2, (h - 1) / 2)
     return fit(values, Camera(target, (w, h)).at(values.shape), target, (h, w))
