@@ -12,8 +12,8 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.config import validated
-from semstab.labels import IGNORE_8BIT, LabelSpace
-from semstab.registry import Entry, Registry
+from semstab.model.labels import IGNORE_8BIT, LabelSpace
+from semstab.runtime.registry import Entry, Registry
 
 REGISTRY = Registry(
     "backbone",

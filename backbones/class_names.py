@@ -14,8 +14,8 @@ import numpy as np
 
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.errors import ConfigError
-from semstab.files import parse_yaml
-from semstab.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
+from semstab.model.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
+from semstab.runtime.files import parse_yaml
 
 Leniency = Literal["strict", "lenient"]
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.config import Settings
 from semstab.errors import ConfigError
-from semstab.labels import IGNORE_8BIT, LabelSpace
+from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
 Features = npt.NDArray[np.float32]
 

@@ -9,7 +9,7 @@ from typing import Self
 from pydantic import Field, field_validator, model_validator
 
 from semstab.config import Settings, read_yaml, validated
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 SHIPPED = importlib.resources.files("semstab.configs") / "backbones" / "segearth_uavid.yaml"
 

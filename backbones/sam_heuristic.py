@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, model_validator
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.backbones.sam_proposals import Mask, SamOptions, SamProposer
 from semstab.config import Settings, read_yaml, validated
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 HUES = 180
 """OpenCV's hue runs from 0 to 180."""

@@ -20,7 +20,7 @@ from pydantic import Field
 from semstab.backbones import UNASSIGNED, Image, image_digest
 from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.errors import DataError
-from semstab.files import atomic_path, content_key
+from semstab.runtime.files import atomic_path, content_key
 
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from semstab.backbones import Backbone, Image, Labels, Prediction, create
 from semstab.backbones.sam_proposals import Proposals, SamOptions, SamProposer
 from semstab.errors import ConfigError
-from semstab.labels import ignore_id
+from semstab.model.labels import ignore_id
 
 
 class SamVoteOptions(SamOptions):

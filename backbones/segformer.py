@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, PositiveInt
 
 from semstab.backbones import Backbone, Image, Prediction, narrowed
 from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 Logits = Callable[[torch.Tensor], torch.Tensor]
 

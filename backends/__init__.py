@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.frames import Frame
-from semstab.registry import Entry, Registry
-from semstab.results import FrameReport
-from semstab.voxels import Events, VoxelTable
+from semstab.model.frames import Frame
+from semstab.model.results import FrameReport
+from semstab.model.voxels import Events, VoxelTable
+from semstab.runtime.registry import Entry, Registry
 
 OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
 

@@ -23,11 +23,11 @@ from semstab.backends.shared.association import check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import index_of_keys
 from semstab.backends.shared.total import Change, MapTotal
-from semstab.compiled import is_kept, settings
 from semstab.errors import ConfigError
-from semstab.frames import Frame, Intrinsics
-from semstab.results import FrameReport
-from semstab.voxels import Events, VoxelTable, index_columns
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.results import FrameReport
+from semstab.model.voxels import Events, VoxelTable, index_columns
+from semstab.runtime.compiled import is_kept, settings
 
 Int64 = npt.NDArray[np.int64]
 

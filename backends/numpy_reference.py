@@ -8,9 +8,9 @@ import numpy as np
 
 from semstab.backends.shared.association import Int64, Observations, check_frame, check_settings, observe
 from semstab.backends.shared.total import Change, MapTotal
-from semstab.frames import Frame
-from semstab.results import FrameReport
-from semstab.voxels import Events, VoxelTable, index_columns
+from semstab.model.frames import Frame
+from semstab.model.results import FrameReport
+from semstab.model.voxels import Events, VoxelTable, index_columns
 
 
 class NumpyReference:

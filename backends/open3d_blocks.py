@@ -21,9 +21,9 @@ from semstab.backends.shared.association import Int64, check_frame, check_settin
 from semstab.backends.shared.columns import update_rows
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
-from semstab.frames import Frame
-from semstab.results import FrameReport
-from semstab.voxels import VoxelTable, index_columns
+from semstab.model.frames import Frame
+from semstab.model.results import FrameReport
+from semstab.model.voxels import VoxelTable, index_columns
 
 INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""

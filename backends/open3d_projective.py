@@ -22,8 +22,8 @@ from semstab.backends.shared.aggregator import Aggregator, Observed
 from semstab.backends.shared.association import Float64, Int64, check_frame
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.errors import ConfigError
-from semstab.frames import Frame
-from semstab.labels import IGNORE_8BIT
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT
 
 MARGIN = 1.25
 """Voxels beyond the band in which blocks are visited, from the centres of the voxels that hold a pixel's point: half a

@@ -15,9 +15,9 @@ from semstab.backends import FusionBackend
 from semstab.backends.torch_parts.maps import TorchMaps
 from semstab.backends.torch_parts.storage import SLOT_BYTES
 from semstab.backends.torch_parts.views import DepthView, Image, TensorPrediction, evidence_of_frame
-from semstab.frames import Frame, Intrinsics
-from semstab.results import FrameReport
-from semstab.voxels import VoxelTable
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.results import FrameReport
+from semstab.model.voxels import VoxelTable
 
 
 class TorchMap(FusionBackend):

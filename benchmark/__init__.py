@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
-    from semstab.frames import Frame, Intrinsics
-    from semstab.labels import LabelSpace
+    from semstab.model.frames import Frame, Intrinsics
+    from semstab.model.labels import LabelSpace
+    from semstab.model.voxels import Events, VoxelTable
     from semstab.settings import load_config, load_study
-    from semstab.voxels import Events, VoxelTable
 
 __version__ = "0.1.0"
 
@@ -46,13 +46,13 @@ _HOMES = {
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
-    "Events": "voxels",
-    "Frame": "frames",
-    "Intrinsics": "frames",
-    "LabelSpace": "labels",
+    "Events": "model.voxels",
+    "Frame": "model.frames",
+    "Intrinsics": "model.frames",
+    "LabelSpace": "model.labels",
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
-    "VoxelTable": "voxels",
+    "VoxelTable": "model.voxels",
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",

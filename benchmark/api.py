@@ -9,8 +9,8 @@ from semstab.config import Config
 from semstab.engine import Executor, Observer
 from semstab.engine.execution import run as execute
 from semstab.engine.execution import run_study as execute_study
-from semstab.records import Result
-from semstab.report import Reporting
+from semstab.model.records import Result
+from semstab.outputs.report import Reporting
 
 
 def run(

@@ -12,11 +12,11 @@ from semstab.config import Config, Exclusion, Part, Perturbation
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.selection import Selected, select_frames
 from semstab.errors import ConfigError, DataError
-from semstab.exclusion import leave_out
-from semstab.frames import Frame
-from semstab.labels import LabelMapping, LabelSpace
-from semstab.perturbation import perturb
-from semstab.results import Unit
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelMapping, LabelSpace
+from semstab.model.results import Unit
+from semstab.pixels.exclusion import leave_out
+from semstab.pixels.perturbation import perturb
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from semstab.config import DatasetConfig, validated
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
-from semstab.registry import Entry, Registry
+from semstab.runtime.registry import Entry, Registry
 
 __all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Scene", "open_dataset", "options_model", "resolved"]
 

@@ -22,7 +22,7 @@ from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera
 from semstab.errors import DataError
-from semstab.labels import IGNORE_16BIT
+from semstab.model.labels import IGNORE_16BIT
 
 Which = Literal["depth", "color"]
 

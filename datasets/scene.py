@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.datasets.views.same_view import fitted
 from semstab.errors import DataError
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
 
 GROUND_TRUTH = "gt"
 """The name under which a scene's ground truth labels are selected like a backbone's."""

@@ -14,7 +14,7 @@ from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsi
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera, camera_of
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 IMAGE_SIZE = (640, 480)
 INTRINSICS_FILE = "camera-intrinsics.txt"

@@ -24,7 +24,7 @@ from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILL
 from semstab.datasets.formats.json_files import matrix, number, read_object
 from semstab.datasets.views.cameras import Camera
 from semstab.errors import DataError
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")

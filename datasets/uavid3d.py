@@ -30,7 +30,7 @@ from semstab.datasets.transforms_json import read_transforms
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 TAXONOMY = "uavid8"
 """Of the label maps, unless the options say otherwise: the colours of UAVid's ground truth."""

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from semstab.backends import create
 from semstab.datasets import open_dataset
-from semstab.frames import Frame
-from semstab.voxels import VoxelTable
+from semstab.model.frames import Frame
+from semstab.model.voxels import VoxelTable
 
 W, H, COUNT, SHRUNK = 48, 32, 4, 10
 CLASSES = ["clutter", "building", "road", "static car", "tree", "low vegetation", "human", "moving car"]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from semstab.datasets.formats.codecs import PNG_SIGNATURE
 from semstab.errors import DataError
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 SHAPE = (6, 8)
 METRES = np.random.default_rng(7).uniform(0.1, 60, SHAPE).astype(np.float32)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from semstab.errors import ConfigError, DataError
-from semstab.results import FrameReport
-from semstab.voxels import VoxelTable
+from semstab.model.results import FrameReport
+from semstab.model.voxels import VoxelTable
 
 
 @dataclass

@@ -9,7 +9,7 @@ from PIL import Image
 from posed_writer import write_posed
 
 from semstab.datasets import open_dataset
-from semstab.frames import Frame, Intrinsics
+from semstab.model.frames import Frame, Intrinsics
 
 H, W, K = 6, 8, 3
 SETTINGS = {"classes": ["a", "b", "c"], "up_axis": "z"}

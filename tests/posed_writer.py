@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from semstab.convert.folder import CONVERSION_FILE, DepthFormat, SceneFolder
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 
 
 def write_posed(

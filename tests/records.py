@@ -6,9 +6,9 @@ import numpy as np
 
 from semstab.config import BASE
 from semstab.metrics import summarise
-from semstab.records import Record, Result, Variation
-from semstab.results import Unit, UnitSummary
-from semstab.voxels import VoxelTable
+from semstab.model.records import Record, Result, Variation
+from semstab.model.results import Unit, UnitSummary
+from semstab.model.voxels import VoxelTable
 
 CLASSES = ("a", "b", "c")
 

@@ -7,7 +7,7 @@ import tiny_models
 from semstab.backbones import Prediction
 from semstab.backbones.class_names import InTaxonomy, class_mapping, vocabularies
 from semstab.errors import ConfigError
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 UAVID = LabelSpace.load("uavid-one-car")
 CITYSCAPES = LabelSpace("model", tiny_models.CITYSCAPES)

@@ -18,8 +18,8 @@ from semstab.check.reprojection import Sample, median_of_seen
 from semstab.check.views import MAX_PIXELS, STEPS, View, clusters, evenly, pairs_within
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
-from semstab.frames import Frame
-from semstab.warp import correspond
+from semstab.model.frames import Frame
+from semstab.pixels.warp import correspond
 
 ALL = range(12)
 

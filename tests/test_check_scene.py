@@ -25,8 +25,8 @@ from semstab.check.views import View
 from semstab.cli import app
 from semstab.config import Config
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame
-from semstab.labels import LabelSpace
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace
 from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))

@@ -16,7 +16,7 @@ from semstab.datasets.city.mesh import Surface
 from semstab.datasets.city.rendering import Caster
 from semstab.datasets.city.simulation import Simulation, View
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 
 SMALL = {"width": 96, "height": 54, "frames": 3}
 ONE_WRONG_CLASS = {

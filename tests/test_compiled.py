@@ -15,9 +15,9 @@ import tiny_scene
 import semstab
 
 IMPORT = """
-import semstab.recording, semstab.statistics.kernels  # whatever is compiled is imported without an error
+import semstab.outputs.recording, semstab.statistics.kernels  # whatever is compiled is imported without an error
 from semstab.backends.numba_hash import NumbaHash
-from semstab.compiled import serial
+from semstab.runtime.compiled import serial
 
 @serial
 def twice(x):

@@ -25,8 +25,8 @@ from semstab.convert import convert, convert_scene
 from semstab.convert.folder import DepthFormat, depth_format, matrix_text, quantised
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Intrinsics
-from semstab.labels import LabelSpace
+from semstab.model.frames import Intrinsics
+from semstab.model.labels import LabelSpace
 from semstab.settings import load_config, resolve
 from semstab.testing.builders import assert_same_map
 

@@ -20,23 +20,23 @@ from records import record, study, voxels
 import semstab
 from semstab.config import Config
 from semstab.engine import Observer, load_result, run_study
-from semstab.engine.memory import estimate
 from semstab.engine.units import make_plan
+from semstab.engine.work.memory import estimate
 from semstab.errors import ConfigError
-from semstab.json_form import to_json
 from semstab.metrics import sbd
-from semstab.plots import figures
-from semstab.plots.maps import right_or_wrong
-from semstab.plots.statistics import DriftByOP, draw_intervals, draw_reliability
-from semstab.report import TOPICS, write_report
+from semstab.model.voxels import Events, VoxelTable
+from semstab.outputs.plots import figures
+from semstab.outputs.plots.maps import right_or_wrong
+from semstab.outputs.plots.statistics import DriftByOP, draw_intervals, draw_reliability
+from semstab.outputs.report import TOPICS, write_report
+from semstab.outputs.tables import tables
+from semstab.outputs.tables import to_json as table_content
+from semstab.outputs.terminal import print_summary
+from semstab.runtime.json_form import to_json
 from semstab.settings import load_config
 from semstab.statistics import Estimate, Reliability, analyse, describe
 from semstab.statistics.__main__ import main
 from semstab.statistics.correctness import ACCURACY
-from semstab.tables import tables
-from semstab.tables import to_json as table_content
-from semstab.terminal import print_summary
-from semstab.voxels import Events, VoxelTable
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 BACKBONES = ("a", "b", "gt")

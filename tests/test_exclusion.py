@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 import semstab
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
-from semstab.exclusion import leave_out
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
+from semstab.pixels.exclusion import leave_out
 from semstab.settings import load_config
 from semstab.task import read
 

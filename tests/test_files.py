@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from semstab.errors import DataError
-from semstab.files import atomic_path, keep_only, read_json, write_json, write_text
+from semstab.runtime.files import atomic_path, keep_only, read_json, write_json, write_text
 
 
 def test_a_file_is_written_whole(tmp_path):

@@ -7,8 +7,9 @@ import pytest
 from records import record, study, voxels
 from wall_study import BACKBONES, wall_study
 
-from semstab.averages import ENOUGH, Level, describe, pooled
-from semstab.findings import (
+from semstab.metrics import op, vss
+from semstab.outputs.averages import ENOUGH, Level, describe, pooled
+from semstab.outputs.findings import (
     HARDLY,
     VISIBLE_VSS,
     Answer,
@@ -18,7 +19,6 @@ from semstab.findings import (
     less_association,
     more_disagreement,
 )
-from semstab.metrics import op, vss
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
 N = ENOUGH

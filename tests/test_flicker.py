@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from semstab import datasets
 from semstab.errors import ConfigError
-from semstab.frames import Frame, Intrinsics
 from semstab.metrics import CompensatedFlicker, compensated_flicker, flicker_percent
+from semstab.model.frames import Frame, Intrinsics
+from semstab.pixels.warp import correspond, warp
 from semstab.testing import checks, random_frames
-from semstab.warp import correspond, warp
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -28,7 +28,7 @@ from image_files import (
 from semstab.datasets.formats import codecs
 from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
 from semstab.errors import ConfigError
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 # --- depth
 

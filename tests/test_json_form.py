@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from semstab.errors import DataError
-from semstab.files import read_json, write_json
-from semstab.json_form import INLINE, fields_of, from_json, to_json
+from semstab.runtime.files import read_json, write_json
+from semstab.runtime.json_form import INLINE, fields_of, from_json, to_json
 
 
 @dataclass(frozen=True)

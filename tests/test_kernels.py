@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from semstab.backends.shared import pixel_keys
 from semstab.backends.shared.keys import HALF
-from semstab.labels import IGNORE_8BIT
+from semstab.model.labels import IGNORE_8BIT
 
 W = 300
 coordinate = st.one_of(

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semstab.errors import ConfigError, DataError
-from semstab.labels import LabelSpace, shipped_taxonomies
+from semstab.model.labels import LabelSpace, shipped_taxonomies
 from semstab.testing import checks
 
 UAVID8, UAVID7, UAVID3 = (LabelSpace.load(name) for name in ("uavid8", "uavid7", "uavid3"))

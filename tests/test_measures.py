@@ -14,21 +14,21 @@ import tiny_study
 from rich.console import Console
 
 import semstab
-from semstab.averages import describe, levels
 from semstab.config import Config
 from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
-from semstab.measures import VSS, Measure, measures, register, registered
-from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import histograms
-from semstab.plots.judgement import statistics_figures
-from semstab.plots.maps import draw_stability
-from semstab.plots.sweeps import draw_sweep
-from semstab.recording import Recording, looks
-from semstab.recording.voxel_maps import defaults
-from semstab.tables import tables, to_csv
-from semstab.terminal import print_summary
-from semstab.voxels import VoxelTable
+from semstab.model.measures import VSS, Measure, measures, register, registered
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.averages import describe, levels
+from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
+from semstab.outputs.plots.histograms import histograms
+from semstab.outputs.plots.judgement import statistics_figures
+from semstab.outputs.plots.maps import draw_stability
+from semstab.outputs.plots.sweeps import draw_sweep
+from semstab.outputs.recording import Recording, looks
+from semstab.outputs.recording.voxel_maps import defaults
+from semstab.outputs.tables import tables, to_csv
+from semstab.outputs.terminal import print_summary
 
 
 def second_largest(table):

@@ -10,10 +10,10 @@ import semstab
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
 from semstab.engine import memory
-from semstab.engine.memory import available_bytes, estimate, require_memory
 from semstab.engine.units import make_plan
+from semstab.engine.work.memory import available_bytes, estimate, require_memory
 from semstab.errors import ConfigError
-from semstab.frames import Frame, Intrinsics
+from semstab.model.frames import Frame, Intrinsics
 from semstab.settings import load_config
 from semstab.task import Task, read
 

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from semstab import backends
 from semstab.errors import DataError
-from semstab.frames import Frame, Intrinsics
-from semstab.measures import ENTROPY, SBD, VSS, margin, measures
 from semstab.metrics import (
     compare,
     dominant,
@@ -25,9 +23,11 @@ from semstab.metrics import (
     summarise,
     vss,
 )
-from semstab.results import Means, MeasureMeans, Unit
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.measures import ENTROPY, SBD, VSS, margin, measures
+from semstab.model.results import Means, MeasureMeans, Unit
+from semstab.model.voxels import VoxelTable
 from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
-from semstab.voxels import VoxelTable
 
 
 def voxel_table(op, evidence, drift_sum=None, classes=()):

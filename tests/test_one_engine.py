@@ -21,7 +21,7 @@ import semstab
 from semstab.config import BACKENDS
 from semstab.engine import LocalProcesses, load_result
 from semstab.metrics import compare
-from semstab.recording import Recording, Target
+from semstab.outputs.recording import Recording, Target
 from semstab.settings import load_config, load_study
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
@@ -148,7 +148,7 @@ def test_a_recording_of_several_processes_has_what_one_process_records(root, tmp
 
 def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> None:
     """What a unit has is part of its key."""
-    from semstab.measures import Measure, registered
+    from semstab.model.measures import Measure, registered
 
     config, out = load_config(overrides=settings(root, backends=["numpy"])), tmp_path / "run"
     semstab.engine.run(config, out=out)

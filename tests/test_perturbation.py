@@ -14,8 +14,8 @@ import semstab
 from semstab.config import Config, Perturbation
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
-from semstab.frames import Frame, Intrinsics
-from semstab.perturbation import perturb
+from semstab.model.frames import Frame, Intrinsics
+from semstab.pixels.perturbation import perturb
 from semstab.settings import load_config
 from semstab.task import read
 

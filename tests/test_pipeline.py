@@ -19,10 +19,10 @@ from semstab.datasets.formats import disk
 from semstab.engine import Observer, load_result
 from semstab.engine.folder import Folder
 from semstab.errors import ConfigError, DataError
-from semstab.json_form import to_json
-from semstab.measures import ENTROPY, SBD, VSS
-from semstab.records import Result
-from semstab.results import STAGES, Unit
+from semstab.model.measures import ENTROPY, SBD, VSS
+from semstab.model.records import Result
+from semstab.model.results import STAGES, Unit
+from semstab.runtime.json_form import to_json
 from semstab.settings import load_config
 
 

@@ -17,19 +17,19 @@ from records import record, study, voxels
 from wall_study import BACKBONES, drawn_walls, wall_study
 
 from semstab import backends
-from semstab.averages import ENOUGH, describe, levels
 from semstab.errors import DataError
-from semstab.measures import SBD_MAX, VSS, measures
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
-from semstab.plots import figures, topdown
-from semstab.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
-from semstab.plots.maps import Overview, draw_overview, draw_stability, scale_length
-from semstab.plots.style import COLUMN, DPI, PAGE
-from semstab.plots.sweeps import draw_sweep
-from semstab.plots.topdown import EMPTY, level_axes, top_down
+from semstab.model.measures import SBD_MAX, VSS, measures
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.averages import ENOUGH, describe, levels
+from semstab.outputs.plots import figures, topdown
+from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
+from semstab.outputs.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
+from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability, scale_length
+from semstab.outputs.plots.style import COLUMN, DPI, PAGE
+from semstab.outputs.plots.sweeps import draw_sweep
+from semstab.outputs.plots.topdown import EMPTY, level_axes, top_down
 from semstab.testing import SEQUENCES, as_frames, checks
-from semstab.voxels import VoxelTable
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
 PALETTE = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200]], dtype=np.uint8)
@@ -364,5 +364,6 @@ def test_a_frame_file_without_palette_or_with_objects_is_refused(tmp_path):
 
 
 def test_matplotlib_is_imported_only_when_something_is_drawn():
-    code = "import sys, semstab.plots, semstab.report; assert not {'matplotlib', 'jinja2', 'PIL'} & set(sys.modules)"
+    heavy = "{'matplotlib', 'jinja2', 'PIL'}"
+    code = f"import sys, semstab.outputs.plots, semstab.outputs.report; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -25,15 +25,15 @@ from semstab.datasets.formats.images import read_labels
 from semstab.datasets.selection import select_frames
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
-from semstab.labels import LabelSpace
-from semstab.measures import ENTROPY
 from semstab.metrics import matched_region_flicker
+from semstab.model.labels import LabelSpace
+from semstab.model.measures import ENTROPY
+from semstab.pixels.warp import warp
 from semstab.predict.jobs import file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
 from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
 from semstab.predict.sources import ImageFiles
 from semstab.settings import predicted_config
-from semstab.warp import warp
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}

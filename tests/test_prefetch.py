@@ -11,7 +11,7 @@ import weakref
 import pytest
 
 from semstab.errors import DataError
-from semstab.prefetch import prefetch
+from semstab.runtime.prefetch import prefetch
 
 
 def readers() -> list[str]:

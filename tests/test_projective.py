@@ -13,8 +13,8 @@ from oracle import Oracle
 
 from semstab import backends
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame, Intrinsics
 from semstab.metrics import entropy, sbd, vss
+from semstab.model.frames import Frame, Intrinsics
 from semstab.testing import EXACT, SUMS, assert_same_map, checks, random_frames, voxels
 
 NAME = "open3d-projective"

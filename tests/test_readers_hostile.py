@@ -27,8 +27,8 @@ from semstab.datasets.selection import select_frames
 from semstab.datasets.transforms_json import read_transforms
 from semstab.engine import run
 from semstab.errors import DataError, SemstabError
+from semstab.model.voxels import VoxelTable
 from semstab.settings import load_config
-from semstab.voxels import VoxelTable
 
 
 def write(form, folder: Path) -> list[str]:

@@ -17,7 +17,7 @@ from semstab.datasets.files.options import FileOptions
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.views.resampling import fit_labels, fit_scores
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 FORM = FORMATS["hololens"]
 SCANNET = FORMATS["scannet"]

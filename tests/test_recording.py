@@ -24,18 +24,18 @@ from semstab.engine import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, PlannedUnit
 from semstab.errors import ConfigError
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
-from semstab.measures import SBD_MAX, measures
-from semstab.recording import SERIES, Recording, background, looks, observer, tracker, voxel_maps
-from semstab.recording.entities import Clock
-from semstab.recording.layout import Scenery, direction, fit
-from semstab.recording.series import OF_THE_BACKBONE
-from semstab.records import Record, Result, Variation
-from semstab.results import Unit, UnitSummary
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
+from semstab.model.measures import SBD_MAX, measures
+from semstab.model.records import Record, Result, Variation
+from semstab.model.results import Unit, UnitSummary
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.recording import SERIES, Recording, background, looks, observer, tracker, voxel_maps
+from semstab.outputs.recording.entities import Clock
+from semstab.outputs.recording.layout import Scenery, direction, fit
+from semstab.outputs.recording.series import OF_THE_BACKBONE
 from semstab.settings import load_config
 from semstab.task import Task
-from semstab.voxels import VoxelTable
 
 NANOSECONDS = 1_000_000_000
 

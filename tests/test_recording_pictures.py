@@ -23,15 +23,15 @@ import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
 from semstab.engine.units import make_plan
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
-from semstab.measures import SBD_MAX
 from semstab.metrics import compensated_flicker
-from semstab.recording import Recording, camera, drift_colors, flips, voxel_maps
-from semstab.recording.entities import Clock
-from semstab.recording.flips import FlipLog
-from semstab.recording.tracker import Tracker
-from semstab.recording.voxel_maps import looks
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
+from semstab.model.measures import SBD_MAX
+from semstab.outputs.recording import Recording, camera, drift_colors, flips, voxel_maps
+from semstab.outputs.recording.entities import Clock
+from semstab.outputs.recording.flips import FlipLog
+from semstab.outputs.recording.tracker import Tracker
+from semstab.outputs.recording.voxel_maps import looks
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 
@@ -456,7 +456,7 @@ def test_a_killed_run_leaves_a_recording_that_optimize_makes_whole(tmp_path) -> 
 import os, signal, time, semstab
 from semstab.engine import Observer
 from semstab.settings import load_config
-from semstab.recording import Recording
+from semstab.outputs.recording import Recording
 class Killing(Observer):
     def unit_finished(self, unit, table, summary):
         time.sleep(1)

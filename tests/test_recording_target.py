@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 import semstab
 from semstab import cli
 from semstab.errors import ConfigError
-from semstab.recording import Recording, Target, target
+from semstab.outputs.recording import Recording, Target, target
 
 
 def test_what_rerun_may_say() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from semstab import backends, registry
 from semstab.errors import ConfigError, MissingDependencyError, SemstabError
-from semstab.registry import Entry, Registry
+from semstab.runtime.registry import Entry, Registry
 
 SHAPES = Registry(
     "shape",
@@ -88,7 +88,9 @@ def test_the_package_imports_nothing_heavy():
     assert found.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("module", ["semstab.backends", "semstab.frames", "semstab.metrics", "semstab.voxels"])
+@pytest.mark.parametrize(
+    "module", ["semstab.backends", "semstab.model.frames", "semstab.metrics", "semstab.model.voxels"]
+)
 def test_the_data_model_needs_numpy_alone(module):
     heavy = ("open3d", "rerun", "matplotlib", "pyarrow", "cv2", "trimesh", "hypothesis", "pytest")
     code = f"import sys, {module}; print([name for name in {heavy} if name in sys.modules])"

@@ -13,15 +13,15 @@ from PIL import Image
 from records import record, study, voxels
 from wall_study import BACKBONES, CLASSES, STEPS, drawn_walls
 
-from semstab.averages import ENOUGH, pooled
 from semstab.config import BASE, SHARED
-from semstab.findings import findings
-from semstab.plots import figures
-from semstab.records import Failure, ImageSpace, Variation
-from semstab.report import write_report
-from semstab.report.reading import reading
-from semstab.results import Agreement, Unit
-from semstab.tables import tables
+from semstab.model.records import Failure, ImageSpace, Variation
+from semstab.model.results import Agreement, Unit
+from semstab.outputs.averages import ENOUGH, pooled
+from semstab.outputs.findings import findings
+from semstab.outputs.plots import figures
+from semstab.outputs.report import write_report
+from semstab.outputs.report.reading import reading
+from semstab.outputs.tables import tables
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
 EVIL = '<script>alert("x")</script> & "quoted"'

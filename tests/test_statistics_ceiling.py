@@ -10,7 +10,7 @@ import pytest
 
 from semstab import backends
 from semstab.errors import DataError
-from semstab.frames import Frame, Intrinsics
+from semstab.model.frames import Frame, Intrinsics
 from semstab.statistics import ceiling, losses, psa, rendered
 from semstab.testing import sight_line
 

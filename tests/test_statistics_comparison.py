@@ -12,9 +12,9 @@ from simulated_events import grid, log_of
 from statsmodels.stats.multitest import multipletests
 
 from semstab.errors import ConfigError, DataError
-from semstab.measures import VSS
 from semstab.metrics import vss
 from semstab.metrics.matching import shared_rows
+from semstab.model.measures import VSS
 from semstab.statistics import coverage, paired, psa, sign_flip_test, standardised
 from semstab.statistics.agreement import PSA
 from semstab.statistics.comparison import EDGES, holm, standard_weights

@@ -10,7 +10,7 @@ from simulated_events import grid, log_of, log_of_evidence
 from sklearn.metrics import accuracy_score, jaccard_score
 
 from semstab.errors import DataError
-from semstab.information import normalise
+from semstab.model.information import normalise
 from semstab.statistics import (
     BlockBootstrap,
     correctness,

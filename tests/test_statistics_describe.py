@@ -11,18 +11,18 @@ import tiny_scene
 from simulated_events import grid, log_of
 
 import semstab
-from semstab.comparison_model import BackboneComparison
 from semstab.config import Config
 from semstab.errors import ConfigError, DataError
-from semstab.files import read_json, write_json
-from semstab.json_form import from_json, to_json
 from semstab.metrics import sbd
+from semstab.model.comparison import BackboneComparison
+from semstab.model.statistics import UNDEFINED, MapStatistics
+from semstab.model.voxels import VoxelTable
+from semstab.runtime.files import read_json, write_json
+from semstab.runtime.json_form import from_json, to_json
 from semstab.statistics import Estimate, analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
 from semstab.statistics.__main__ import main
 from semstab.statistics.agreement import PSA
 from semstab.statistics.text import comparison_lines, lines
-from semstab.statistics_model import UNDEFINED, MapStatistics
-from semstab.voxels import VoxelTable
 
 SIDE, F = 24, 8
 

@@ -12,10 +12,10 @@ from scipy.stats import false_discovery_control
 from simulated_events import log_of, log_of_evidence, soft
 
 from semstab.errors import ConfigError
-from semstab.information import js_divergence, normalise
 from semstab.metrics import sbd, vss
+from semstab.model.information import js_divergence, normalise
+from semstab.model.voxels import Events
 from semstab.statistics import benjamini_hochberg, expected_sbd, flips, scene_drift, voxel_drift
-from semstab.voxels import Events
 
 
 def sbd_of(evidence):

@@ -7,8 +7,8 @@ import pytest
 from simulated_events import log_of, log_of_evidence, soft
 
 from semstab.errors import ConfigError
-from semstab.information import js_divergence, normalise
 from semstab.metrics import entropy, sbd, vss
+from semstab.model.information import js_divergence, normalise
 from semstab.statistics import RULES, fuse
 from semstab.statistics.fusion_rules import labels
 

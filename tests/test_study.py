@@ -19,14 +19,14 @@ from semstab.config import BACKENDS, Config
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
-from semstab.engine.jobs import Job, Request, split
-from semstab.engine.passes import run_job
 from semstab.engine.units import make_plan
+from semstab.engine.work.jobs import Job, Request, split
+from semstab.engine.work.passes import run_job
 from semstab.errors import ConfigError, DataError
-from semstab.json_form import to_json
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
-from semstab.records import Variation
-from semstab.results import Unit
+from semstab.model.records import Variation
+from semstab.model.results import Unit
+from semstab.runtime.json_form import to_json
 from semstab.settings import resolve
 from semstab.statistics import compare_backbones
 from semstab.task import read
@@ -122,7 +122,7 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
 
     monkeypatch.setattr(FileScene, "frame", counted)
     grown = itertools.count(step=1_000_000)
-    monkeypatch.setattr("semstab.engine.passes._resident_bytes", lambda: next(grown))
+    monkeypatch.setattr("semstab.engine.work.passes._resident_bytes", lambda: next(grown))
     run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")
     assert len(decoded) > 25
     assert summary(tmp_path / "tight") == summary(tmp_path / "whole")

@@ -15,9 +15,9 @@ import tiny_study
 from tiny_study import Counting, Interrupting, summary
 
 from semstab.engine import DaskCluster, LocalProcesses, run_study
-from semstab.engine.jobs import Job
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
+from semstab.engine.work.jobs import Job
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.settings import resolve
 
@@ -128,7 +128,7 @@ def test_an_interruption_ends_the_processes_and_keeps_what_is_finished(root, tmp
 def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> None:
     code = (
         "import multiprocessing, time\n"
-        "from semstab.engine.executors import _start_worker\n"
+        "from semstab.engine.work.executors import _start_worker\n"
         "if __name__ == '__main__':\n"
         "    context = multiprocessing.get_context('spawn')\n"
         "    listening, alive = context.Pipe(duplex=False)\n"
@@ -140,7 +140,7 @@ def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> N
     )
     (tmp_path / "parent.py").write_text(code)
     (tmp_path / "worker.py").write_text(
-        "import time\nfrom semstab.engine.executors import _start_worker\n"
+        "import time\nfrom semstab.engine.work.executors import _start_worker\n"
         "def work(listening):\n    _start_worker(listening, 1)\n    time.sleep(60)\n"
     )
     parent = subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
@@ -208,7 +208,7 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(root, t
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("semstab.engine.work.executors.CONNECT_SECONDS", 0.5)
     with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
         DaskCluster("tcp://127.0.0.1:9")
 

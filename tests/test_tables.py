@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 from records import record, study, voxels
 from wall_study import BACKBONES, STEPS, wall_study
 
-from semstab.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.config import BACKENDS, SHARED
-from semstab.files import write_text
-from semstab.measures import SBD, VSS
 from semstab.metrics import entropy, op, sbd, vss
-from semstab.records import ImageSpace, RegionFlicker, Result
+from semstab.model.measures import SBD, VSS
+from semstab.model.records import ImageSpace, RegionFlicker, Result
+from semstab.outputs.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.outputs.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
+from semstab.runtime.files import write_text
 from semstab.statistics import Estimate
-from semstab.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
 from semstab.testing import checks
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -29,7 +29,7 @@ from semstab.backends.torch_parts.maps import TorchMaps  # noqa: E402
 from semstab.backends.torch_parts.storage import EMPTY, MapGrid, VoxelHash, slots_for  # noqa: E402
 from semstab.backends.torch_parts.views import DepthView, TensorPrediction  # noqa: E402
 from semstab.errors import ConfigError, DataError, MissingDependencyError  # noqa: E402
-from semstab.frames import Frame, Intrinsics  # noqa: E402
+from semstab.model.frames import Frame, Intrinsics  # noqa: E402
 from semstab.testing import (  # noqa: E402
     EXACT,
     SUMS,

@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 from semstab import backends
 from semstab.errors import DataError
 from semstab.metrics import entropy, vss
+from semstab.model.voxels import Events, VoxelTable
 from semstab.testing import (
     EXACT,
     HITS,
@@ -27,7 +28,6 @@ from semstab.testing import (
     sight_line,
     voxels,
 )
-from semstab.voxels import Events, VoxelTable
 
 
 def reference(frames, voxel_size=1.0, K=3):

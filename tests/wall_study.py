@@ -11,9 +11,9 @@ from posed_writer import write_posed
 
 from semstab.config import Config
 from semstab.engine import run_study
-from semstab.frames import Frame, Intrinsics
-from semstab.plots import write_figures
-from semstab.records import Result
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.records import Result
+from semstab.outputs.plots import write_figures
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
 STEPS = {"often": 0.25, "rarely": 1.0}

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.backends.shared.aggregator import Observed
 from semstab.backends.shared.keys import index_of_keys
-from semstab.voxels import Events, index_columns
+from semstab.model.voxels import Events, index_columns
 
 Int64 = npt.NDArray[np.int64]
 

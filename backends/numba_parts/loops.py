@@ -9,8 +9,8 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import PARTITIONS, mix
-from semstab.compiled import parallel, serial
-from semstab.results import RECURRENT
+from semstab.model.results import RECURRENT
+from semstab.runtime.compiled import parallel, serial
 
 SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
 

@@ -15,8 +15,8 @@ from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.merging import compact, group, merge_scores, scatter, sort_labels, sum_scores
 from semstab.backends.shared.pixel_keys import frame_terms
-from semstab.frames import Frame
-from semstab.labels import IGNORE_8BIT, fixed
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, fixed
 
 BANDS = 64
 MIN_BAND_ROWS = 8

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 
 INDEX_LIMIT = 2**31
 """Voxel indices are int32."""

@@ -12,8 +12,8 @@ from semstab.backends.shared.aggregator import Observed
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.total import Change
-from semstab.compiled import parallel
-from semstab.results import RECURRENT
+from semstab.model.results import RECURRENT
+from semstab.runtime.compiled import parallel
 
 Int64 = npt.NDArray[np.int64]
 

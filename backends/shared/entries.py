@@ -10,7 +10,7 @@ import numpy as np
 
 from semstab.backends.shared.hashing import mix, partition_of
 from semstab.backends.shared.pixel_keys import keys_of_row
-from semstab.compiled import parallel, serial
+from semstab.runtime.compiled import parallel, serial
 
 
 @serial

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.compiled import serial
+from semstab.runtime.compiled import serial
 
 PARTITIONS = 64
 

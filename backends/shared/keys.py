@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from semstab.backends.shared.association import back_project, voxel_index
 from semstab.errors import DataError
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 
 HALF = 1 << 20
 """A map reaches that many voxels to either side of its origin."""

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import PARTITIONS, mix, partition_of
-from semstab.compiled import parallel
+from semstab.runtime.compiled import parallel
 
 
 @parallel

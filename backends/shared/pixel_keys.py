@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.backends.shared.keys import HALF
-from semstab.compiled import compiled, serial
+from semstab.runtime.compiled import compiled, serial
 
 BLOCK = 256
 """Pixels whose keys are computed again where one of them is in doubt."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.information import entropy_bits, js_divergence, normalise
-from semstab.results import RECURRENT, FrameReport
+from semstab.model.information import entropy_bits, js_divergence, normalise
+from semstab.model.results import RECURRENT, FrameReport
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

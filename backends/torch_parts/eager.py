@@ -19,7 +19,7 @@ from semstab.backends.shared.keys import HALF
 from semstab.backends.shared.total import Change
 from semstab.backends.torch_parts.storage import EMPTY, Columns, MapGrid, VoxelHash
 from semstab.backends.torch_parts.views import DepthView, Labels, Scores
-from semstab.results import RECURRENT
+from semstab.model.results import RECURRENT
 
 NONE, LOST = -1, -2
 """Instead of a voxel: the pixel has no depth, or its point is out of the map's reach."""

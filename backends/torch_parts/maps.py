@@ -26,9 +26,9 @@ from semstab.backends.torch_parts.views import (
     evidence_of,
 )
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Intrinsics
-from semstab.results import FrameReport
-from semstab.voxels import VoxelTable, index_columns
+from semstab.model.frames import Intrinsics
+from semstab.model.results import FrameReport
+from semstab.model.voxels import VoxelTable, index_columns
 
 FIRST_ROWS = 1 << 12
 """Voxels that a new map has room for."""

@@ -13,7 +13,7 @@ import triton.language as tl
 
 from semstab.backends.shared import keys
 from semstab.backends.torch_parts import eager, storage
-from semstab.results import RECURRENT
+from semstab.model.results import RECURRENT
 
 NONE = tl.constexpr(eager.NONE)
 LOST = tl.constexpr(eager.LOST)

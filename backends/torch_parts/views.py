@@ -13,8 +13,8 @@ import torch
 from torch.utils.dlpack import from_dlpack
 
 from semstab.errors import DataError
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 
 INTEGERS = (torch.uint8, torch.uint16, torch.int8, torch.int16, torch.int32, torch.int64)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from semstab.datasets import Scene
 from semstab.datasets.views.poses import CAMERA_AXES
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 
 Size = tuple[int, int]
 Ratio = tuple[float, float]

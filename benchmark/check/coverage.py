@@ -14,8 +14,8 @@ import numpy.typing as npt
 from semstab.backends import create
 from semstab.check.reprojection import Sample
 from semstab.check.views import Float64, Pair, View
-from semstab.frames import Frame
-from semstab.labels import IGNORE_8BIT
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT
 
 CONSISTENT = 0.05
 """A point that is seen again is taken for the same surface where the two depths differ by at most this share."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.frames import Frame
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 MOST_IDS = 5
 

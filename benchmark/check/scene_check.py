@@ -29,10 +29,10 @@ from semstab.check.views import View, clusters, evenly, label_source, pairs_with
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.errors import DataError
-from semstab.frames import Frame
-from semstab.json_form import to_json
-from semstab.labels import LabelSpace
-from semstab.prefetch import prefetch
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace
+from semstab.runtime.json_form import to_json
+from semstab.runtime.prefetch import prefetch
 from semstab.task import frame_indices, selected
 
 SCHEMA = 1

@@ -14,7 +14,7 @@ from semstab.check.conventions import Convention
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.views.poses import CAMERA_AXES
 from semstab.datasets.views.ray_depth import ray_lengths
-from semstab.frames import Frame, Intrinsics
+from semstab.model.frames import Frame, Intrinsics
 
 MAX_PIXELS = 2**20
 """Of a larger image only every n-th pixel of each axis is kept."""

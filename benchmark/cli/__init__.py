@@ -13,7 +13,7 @@ from semstab.cli.listing import list_
 from semstab.cli.options import say
 from semstab.cli.running import run, study, view
 from semstab.errors import SemstabError
-from semstab.process import settle
+from semstab.runtime.process import settle
 
 INTERRUPTED = 130
 

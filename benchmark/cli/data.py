@@ -100,7 +100,7 @@ def check(
     from semstab.check import SCHEMA
     from semstab.check import check as check_scenes
     from semstab.check.display import print_check
-    from semstab.files import write_json
+    from semstab.runtime.files import write_json
 
     named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
     console, found = Console(quiet=quiet), []

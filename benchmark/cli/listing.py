@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from semstab.registry import Registry
+    from semstab.runtime.registry import Registry
 
 
 def list_() -> None:
@@ -14,7 +14,7 @@ def list_() -> None:
     from rich.table import Table
 
     from semstab import backbones, backends, datasets
-    from semstab.labels import LabelSpace, shipped_taxonomies
+    from semstab.model.labels import LabelSpace, shipped_taxonomies
     from semstab.settings import load_study, shipped_studies
 
     table = Table(show_edge=False)

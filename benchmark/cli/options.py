@@ -71,7 +71,7 @@ def chosen(
 
 def overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:
     """The settings given as options, those of --set last."""
-    from semstab.files import parse_yaml
+    from semstab.runtime.files import parse_yaml
 
     content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}
     for setting in settings:

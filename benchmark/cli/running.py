@@ -33,8 +33,8 @@ from semstab.errors import ConfigError
 if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine import Executor, Observer
-    from semstab.recording import Recording
-    from semstab.records import Result
+    from semstab.model.records import Result
+    from semstab.outputs.recording import Recording
 
 
 DISAGREE = 3
@@ -127,7 +127,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     """Open a run's recording in the rerun viewer."""
     import subprocess
 
-    from semstab.recording.target import viewer_command
+    from semstab.outputs.recording.target import viewer_command
 
     recording = run / "recording.rrd" if run.is_dir() else run
     if not recording.exists():
@@ -140,8 +140,8 @@ def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, r
     from rich.console import Console
 
     from semstab.api import run_study
-    from semstab.progress import ProgressBar, failure_lines
-    from semstab.terminal import print_summary
+    from semstab.outputs.progress import ProgressBar, failure_lines
+    from semstab.outputs.terminal import print_summary
 
     if report not in ("on", "off"):
         raise ConfigError(f"--report {report}: write on or off")
@@ -173,7 +173,7 @@ def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, r
 def _recording(rerun: str | None, out: Path) -> list[Recording]:
     if rerun == "off":
         return []
-    from semstab.recording import Recording, Target
+    from semstab.outputs.recording import Recording, Target
 
     return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
 

@@ -64,7 +64,7 @@ class BackendConfig(Part):
 
 
 class Perturbation(Settings):
-    """Noise added to depth and poses, to see what geometry alone does to the numbers; see `semstab.perturbation`.
+    """Noise on depth and poses, to see what geometry alone does to the numbers; see `semstab.pixels.perturbation`.
 
     Standard deviations, of each axis where there are three. 0 adds nothing.
     """
@@ -83,7 +83,7 @@ class Perturbation(Settings):
 
 
 class Exclusion(Settings):
-    """What is left out of fusion because it moves; see `semstab.exclusion`."""
+    """What is left out of fusion because it moves; see `semstab.pixels.exclusion`."""
 
     classes: tuple[str, ...] = Field((), description="classes, by their name in a backbone's or in the run's taxonomy")
     masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from semstab.errors import ConfigError
-from semstab.files import MAX_YAML_BYTES, parse_yaml, read_limited
+from semstab.runtime.files import MAX_YAML_BYTES, parse_yaml, read_limited
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -16,9 +16,9 @@ from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.datasets.files.label_source import LABEL_SPACE_FILE
 from semstab.datasets.views.poses import UP_AXES
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame
-from semstab.prefetch import prefetch
-from semstab.results import slug
+from semstab.model.frames import Frame
+from semstab.model.results import slug
+from semstab.runtime.prefetch import prefetch
 from semstab.task import frame_indices, selected
 
 __all__ = ["Converted", "convert", "convert_scene"]

@@ -17,10 +17,10 @@ from semstab.datasets.formats.images import MILLIMETRES
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.posed_folder import SETTINGS_FILE
 from semstab.errors import ConfigError, DataError
-from semstab.files import atomic_path, content_key, read_json, write_json, write_png, write_text
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
-from semstab.results import slug
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
+from semstab.model.results import slug
+from semstab.runtime.files import atomic_path, content_key, read_json, write_json, write_png, write_text
 
 SCHEMA = 1
 """Version of conversion.json."""

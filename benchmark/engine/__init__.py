@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from semstab.engine.execution import run, run_study
-    from semstab.engine.executors import DaskCluster, Executor, InProcess, LocalProcesses
     from semstab.engine.folder import load_result
     from semstab.engine.observer import Observer
+    from semstab.engine.work.executors import DaskCluster, Executor, InProcess, LocalProcesses
 
 __all__ = [
     "DaskCluster",

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics import Analysis, BackboneComparison, analyse, compare_backbones
 from semstab.task import Task
-from semstab.voxels import Events, VoxelTable
 
 
 def truth_task(task: Task) -> Task | None:

@@ -17,21 +17,21 @@ from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.config import BACKENDS, BASE, Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.evaluation import comparison
-from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder
-from semstab.engine.jobs import Job, Request, split
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
-from semstab.engine.passes import lend
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.engine.work.executors import Executor, InProcess
+from semstab.engine.work.jobs import Job, Request, split
+from semstab.engine.work.passes import lend
 from semstab.errors import DataError
 from semstab.metrics import compare
-from semstab.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
-from semstab.results import Agreement
+from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
+from semstab.model.results import Agreement
+from semstab.model.voxels import VoxelTable
+from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 from semstab.statistics import BackboneComparison
-from semstab.stopwatch import Stopwatch
-from semstab.voxels import VoxelTable
 
 GB = 1e9
 

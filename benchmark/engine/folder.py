@@ -17,13 +17,24 @@ import yaml
 
 from semstab.config import Config, read_yaml
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.jobs import Outcome, shared_marker
 from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.work.jobs import Outcome, shared_marker
 from semstab.errors import ConfigError, DataError
-from semstab.files import atomic_path, read_json, write_json, write_text
-from semstab.json_form import from_json, to_json
-from semstab.records import EVENTS, FRAMES, OVERVIEW, TRUTH, UNITS, VOXELS, ImageSpace, Record, Result, UnitContent
-from semstab.results import SCHEMA, Unit, slug
+from semstab.model.records import (
+    EVENTS,
+    FRAMES,
+    OVERVIEW,
+    TRUTH,
+    UNITS,
+    VOXELS,
+    ImageSpace,
+    Record,
+    Result,
+    UnitContent,
+)
+from semstab.model.results import SCHEMA, Unit, slug
+from semstab.runtime.files import atomic_path, read_json, write_json, write_text
+from semstab.runtime.json_form import from_json, to_json
 
 logger = logging.getLogger("semstab")
 

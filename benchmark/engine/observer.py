@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine.series import FrameRow
     from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
-    from semstab.frames import Frame
-    from semstab.records import Result
-    from semstab.results import Unit, UnitSummary
+    from semstab.model.frames import Frame
+    from semstab.model.records import Result
+    from semstab.model.results import Unit, UnitSummary
+    from semstab.model.voxels import VoxelTable
     from semstab.task import Task
-    from semstab.voxels import VoxelTable
 
 
 class Observer:

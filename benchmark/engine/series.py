@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from semstab.results import STAGES, FrameReport
+from semstab.model.results import STAGES, FrameReport
 
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",

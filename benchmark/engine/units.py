@@ -24,11 +24,11 @@ from semstab.config import (
     Sweeps,
 )
 from semstab.datasets import Scene, open_dataset
-from semstab.engine.jobs import Request
+from semstab.engine.work.jobs import Request
 from semstab.errors import ConfigError
-from semstab.measures import measures
-from semstab.records import REGIONS, Variation
-from semstab.results import Unit
+from semstab.model.measures import measures
+from semstab.model.records import REGIONS, Variation
+from semstab.model.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
 
 FORMAT = 2

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.measures import measures
 from semstab.metrics.matching import shared_rows
-from semstab.results import Agreement, Deviation, Unit
-from semstab.voxels import VoxelTable
+from semstab.model.measures import measures
+from semstab.model.results import Agreement, Deviation, Unit
+from semstab.model.voxels import VoxelTable
 
 TOLERANCE = 1e-9
 """Largest difference allowed between float64 backends in any quantity of any voxel."""

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.information import entropy_bits, normalise
-from semstab.measures import sbd
-from semstab.results import RECURRENT
-from semstab.voxels import VoxelTable
+from semstab.model.information import entropy_bits, normalise
+from semstab.model.measures import sbd
+from semstab.model.results import RECURRENT
+from semstab.model.voxels import VoxelTable
 
 LOW_PERSISTENCE, DRIFTING, UNCERTAIN, STABLE = range(4)
 

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.frames import Frame
-from semstab.labels import flat
-from semstab.warp import DEPTH_TOLERANCE, correspond
+from semstab.model.frames import Frame
+from semstab.model.labels import flat
+from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
 
 def flicker_percent(previous: Frame, current: Frame) -> float:
@@ -25,7 +25,7 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
         raise DataError(
             f"{current.where('depth')}: frames {previous.index} and {current.index} differ in size ({sizes})"
         )
-    from semstab.pixel_kernel import count_changed
+    from semstab.model.pixel_kernel import count_changed
 
     images = (previous.valid, previous.predicted, current.valid, current.predicted)
     both, changed = count_changed(*(flat(image) for image in images))
@@ -49,8 +49,8 @@ def compensated_flicker(
 ) -> CompensatedFlicker:
     """Flicker after the previous frame's labels are warped into the current one, so that camera motion is not counted.
 
-    A pixel is co-visible where it is valid, the previous camera saw the same surface point (`semstab.warp.correspond`
-    with its occlusion test), and the pixel that saw it was valid too. Soft scores count by their largest class; the
+    A pixel is co-visible where it is valid, the previous camera saw the same surface point
+    (`semstab.pixels.warp.correspond` with its occlusion test), and the pixel that saw it was valid too. Soft scores count by their largest class; the
     frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
 
     Raises ConfigError where depth_tolerance is not above 0 and below 1.

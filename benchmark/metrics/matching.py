@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.voxels import Events, VoxelTable
+from semstab.model.voxels import Events, VoxelTable
 
 Int64 = npt.NDArray[np.int64]
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError, DataError
-from semstab.information import entropy_bits
+from semstab.model.information import entropy_bits
 
 Regions = npt.NDArray[np.integer[Any]]
 
@@ -53,7 +53,7 @@ def matched_region_flicker(
     Regions are matched one to one so that the sum of their IoUs over the valid pixels is largest (Hungarian method);
     pairs with an IoU of at most iou_threshold come apart again. flicker = 1 - (pixels in both regions of a pair +
     pixels unassigned in both) / valid pixels. To leave out camera motion, warp the previous map first
-    (`semstab.warp.warp`) and count where that is defined.
+    (`semstab.pixels.warp.warp`) and count where that is defined.
 
     Raises DataError where the maps differ in size, ConfigError for a threshold that is not from 0 to below 1.
     """

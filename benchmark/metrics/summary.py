@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from semstab.measures import MeasureMeans, dominant, mean, measures
-from semstab.results import RECURRENT, Means, TableSummary
-from semstab.voxels import VoxelTable
+from semstab.model.measures import MeasureMeans, dominant, mean, measures
+from semstab.model.results import RECURRENT, Means, TableSummary
+from semstab.model.voxels import VoxelTable
 
 STRATA = (1, 2, 5)
 """Upper edges of the paper's strata: OP=1, OP=2, 3<=OP<=5, OP>5."""

@@ -16,8 +16,8 @@ from semstab.datasets.files.label_source import LABEL_SPACE_FILE
 from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
-from semstab.files import atomic_path, content_key, read_json, write_json, write_png
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
+from semstab.runtime.files import atomic_path, content_key, read_json, write_json, write_png
 
 SCHEMA = 1
 """Version of predictions.json."""

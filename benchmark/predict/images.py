@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.views.resampling import Labels, Scores
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 
 Image = npt.NDArray[np.uint8]
 

@@ -18,11 +18,11 @@ from semstab.config import DatasetConfig, Settings
 from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset, resolved
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
-from semstab.frames import Frame
-from semstab.labels import LabelSpace
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace
 from semstab.predict.images import first_images
 from semstab.predict.predictor import PredictorConfig, load_predictor
-from semstab.registry import Entry
+from semstab.runtime.registry import Entry
 
 NAME = "predicted"
 

@@ -13,8 +13,8 @@ from semstab.backbones.class_names import InTaxonomy
 from semstab.config import Settings, validated
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
-from semstab.files import parse_yaml
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
+from semstab.runtime.files import parse_yaml
 
 
 class PredictorConfig(Settings):

@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from semstab.datasets.formats.images import read_labels
-from semstab.files import write_text
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
+from semstab.pixels.warp import warp
 from semstab.predict.images import ImageSequence
-from semstab.warp import warp
+from semstab.runtime.files import write_text
 
 COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))
 

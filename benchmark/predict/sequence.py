@@ -15,7 +15,7 @@ from semstab.datasets.views.same_view import fitted
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType
 from semstab.predict.images import Image, ImageSequence, first_images
 from semstab.predict.region_series import RegionSeries, region_series
-from semstab.prefetch import prefetch
+from semstab.runtime.prefetch import prefetch
 
 REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers", "onnxruntime")
 

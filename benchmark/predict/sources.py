@@ -10,7 +10,7 @@ from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, read_color
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame
+from semstab.model.frames import Frame
 from semstab.predict.images import Image
 
 

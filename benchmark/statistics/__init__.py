@@ -4,7 +4,17 @@ Pure functions of a VoxelTable and its Events. `describe` says everything about 
 several; docs/metrics.md derives each measure.
 """
 
-from semstab.comparison_model import BackboneComparison
+from semstab.model.comparison import BackboneComparison
+from semstab.model.statistics import (
+    ClassAgreement,
+    Correctness,
+    Estimate,
+    Losses,
+    MapStatistics,
+    Quadrants,
+    Reliability,
+    StabilityVerdict,
+)
 from semstab.statistics.agreement import class_agreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
@@ -32,16 +42,6 @@ from semstab.statistics.drift import (
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.verdict import verdict
-from semstab.statistics_model import (
-    ClassAgreement,
-    Correctness,
-    Estimate,
-    Losses,
-    MapStatistics,
-    Quadrants,
-    Reliability,
-    StabilityVerdict,
-)
 
 __all__ = [
     "RULES",

@@ -11,14 +11,14 @@ from typing import Any
 from semstab.config import read_yaml
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import SemstabError
-from semstab.files import read_json, write_json
-from semstab.json_form import to_json
 from semstab.metrics.summary import STRATA
-from semstab.results import Unit
+from semstab.model.results import Unit
+from semstab.model.voxels import Events, VoxelTable
+from semstab.runtime.files import read_json, write_json
+from semstab.runtime.json_form import to_json
 from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.description import analyse
 from semstab.statistics.text import comparison_lines, lines
-from semstab.voxels import Events, VoxelTable
 
 
 def main() -> int:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from semstab.measures import Quantity
-from semstab.statistics_model import ClassAgreement
-from semstab.voxels import Events, VoxelTable
+from semstab.model.measures import Quantity
+from semstab.model.statistics import ClassAgreement
+from semstab.model.voxels import Events, VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from semstab.comparison_model import BackboneComparison, RuleComparison, Standardised
 from semstab.errors import ConfigError
-from semstab.measures import Measure, Quantity, measures
 from semstab.metrics.matching import require_same_map
+from semstab.model.comparison import BackboneComparison, RuleComparison, Standardised
+from semstab.model.measures import Measure, Quantity, measures
+from semstab.model.statistics import RuleMeans
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics import fusion_rules
 from semstab.statistics.comparison import (
     EDGES,
@@ -23,8 +25,6 @@ from semstab.statistics.comparison import (
     voxelwise,
 )
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
-from semstab.statistics_model import RuleMeans
-from semstab.voxels import Events, VoxelTable
 
 SCHEMA = 1
 

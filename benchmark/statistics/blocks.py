@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import voxel_keys
-from semstab.statistics_model import Estimate
+from semstab.model.statistics import Estimate
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

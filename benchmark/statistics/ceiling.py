@@ -15,14 +15,14 @@ import numpy.typing as npt
 from semstab.backends import FusionBackend
 from semstab.backends.shared.association import back_project, voxel_index
 from semstab.errors import DataError
-from semstab.frames import Frame
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.metrics import dominant
 from semstab.metrics.matching import shared_rows, voxel_keys
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.model.statistics import Estimate, Losses
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import psa, ratio_of
 from semstab.statistics.blocks import BlockBootstrap, spatial_blocks
-from semstab.statistics_model import Estimate, Losses
-from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 

@@ -9,11 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from semstab.comparison_model import MapCoverage, Paired, PairedDifference, Rank, Ranking
 from semstab.errors import ConfigError
-from semstab.measures import Quantity, dominant, measures
 from semstab.metrics.matching import require_same_grid, shared_rows
-from semstab.results import RECURRENT
+from semstab.model.comparison import MapCoverage, Paired, PairedDifference, Rank, Ranking
+from semstab.model.measures import Quantity, dominant, measures
+from semstab.model.results import RECURRENT
+from semstab.model.statistics import Estimate
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA, PSA, alpha_columns, alpha_of, psa, ratio_of
 from semstab.statistics.blocks import (
     LEAST_BLOCKS,
@@ -23,8 +25,6 @@ from semstab.statistics.blocks import (
     spatial_blocks,
 )
 from semstab.statistics.correctness import ACCURACY, join_truth
-from semstab.statistics_model import Estimate
-from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Tables = Mapping[str, VoxelTable]

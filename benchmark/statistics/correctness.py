@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.information import normalise
-from semstab.measures import MeasureMeans, Quantity, dominant, measures
 from semstab.metrics import strata
 from semstab.metrics.matching import shared_rows
-from semstab.results import RECURRENT
+from semstab.model.information import normalise
+from semstab.model.measures import MeasureMeans, Quantity, dominant, measures
+from semstab.model.results import RECURRENT
+from semstab.model.statistics import UNDEFINED, Correctness, Estimate, Quadrants, Reliability, RuleMeans
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import psa, ratio_of
 from semstab.statistics.blocks import BlockBootstrap
 from semstab.statistics.fusion_rules import Fused
-from semstab.statistics_model import UNDEFINED, Correctness, Estimate, Quadrants, Reliability, RuleMeans
-from semstab.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -10,11 +10,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.information import normalise
-from semstab.measures import MeasureMeans, dominant, mean, measures, sbd, vss
 from semstab.metrics import strata
 from semstab.metrics.matching import require_same_map, rows_of
 from semstab.metrics.summary import STRATA
+from semstab.model.information import normalise
+from semstab.model.measures import MeasureMeans, dominant, mean, measures, sbd, vss
+from semstab.model.statistics import (
+    UNDEFINED,
+    BlockCut,
+    CorrectnessStatistics,
+    DriftStatistics,
+    DriftTests,
+    EntropyParts,
+    Estimate,
+    FlipRates,
+    FrameAgreement,
+    MapStatistics,
+    Repeated,
+    RuleOutcome,
+    StratumStatistics,
+)
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
     alpha_columns,
@@ -48,22 +64,6 @@ from semstab.statistics.drift import (
 )
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
-from semstab.statistics_model import (
-    UNDEFINED,
-    BlockCut,
-    CorrectnessStatistics,
-    DriftStatistics,
-    DriftTests,
-    EntropyParts,
-    Estimate,
-    FlipRates,
-    FrameAgreement,
-    MapStatistics,
-    Repeated,
-    RuleOutcome,
-    StratumStatistics,
-)
-from semstab.voxels import Events, VoxelTable
 
 SCHEMA = 1
 FALSE_DISCOVERIES = 0.05

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.measures import Quantity, mean, sbd
+from semstab.model.measures import Quantity, mean, sbd
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT
-from semstab.voxels import Events, VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

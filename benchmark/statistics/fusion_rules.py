@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.information import normalise
+from semstab.model.information import normalise
+from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
-from semstab.voxels import Events
 
 Float64 = npt.NDArray[np.float64]
 

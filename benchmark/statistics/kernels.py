@@ -14,7 +14,7 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term
 from semstab.backends.shared.hashing import mix
-from semstab.compiled import serial
+from semstab.runtime.compiled import serial
 
 CHUNKS = 64
 ENUMERATED = 5

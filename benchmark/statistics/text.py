@@ -6,12 +6,12 @@ import math
 import textwrap
 from collections.abc import Iterable, Sequence
 
-from semstab.comparison_model import BackboneComparison
-from semstab.measures import measures
+from semstab.model.comparison import BackboneComparison
+from semstab.model.measures import measures
+from semstab.model.statistics import Estimate, MapStatistics, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
-from semstab.statistics_model import Estimate, MapStatistics, RuleOutcome
 
 Row = tuple[str, Estimate | float, str]
 Cell = str | float

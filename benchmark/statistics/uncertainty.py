@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.information import entropy_bits, normalise
-from semstab.voxels import VoxelTable
+from semstab.model.information import entropy_bits, normalise
+from semstab.model.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 

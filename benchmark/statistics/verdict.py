@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from semstab.statistics_model import UNDEFINED, Estimate, StabilityVerdict
+from semstab.model.statistics import UNDEFINED, Estimate, StabilityVerdict
 
 RELIABLE = 0.8
 """Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from semstab.backends import FusionBackend
-from semstab.frames import Frame
-from semstab.voxels import VoxelTable
+from semstab.model.frames import Frame
+from semstab.model.voxels import VoxelTable
 
 
 class BackendTests:

@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semstab.frames import Frame, Intrinsics
-from semstab.measures import SBD_MAX
 from semstab.metrics import entropy, sbd, vss
-from semstab.voxels import VoxelTable
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.measures import SBD_MAX
+from semstab.model.voxels import VoxelTable
 
 Voxel = tuple[int, int, int]
 Label = int | Sequence[float]

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame
 from semstab.metrics import entropy, vss
-from semstab.results import RECURRENT, FrameReport
+from semstab.model.frames import Frame
+from semstab.model.results import RECURRENT, FrameReport
+from semstab.model.voxels import VoxelTable
 from semstab.testing.base import BackendTests
 from semstab.testing.builders import (
     JS_HALF,
@@ -26,7 +27,6 @@ from semstab.testing.builders import (
     sight_line,
     voxels,
 )
-from semstab.voxels import VoxelTable
 
 
 class ContractTests(BackendTests):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from semstab.errors import DataError
-from semstab.frames import Frame, Intrinsics
 from semstab.metrics import dominant
+from semstab.model.frames import Frame, Intrinsics
 from semstab.testing.base import BackendTests
 from semstab.testing.builders import LOOKING, sight_line, voxels
 

@@ -25,8 +25,8 @@ from semstab.datasets.city.simulation import Simulation, View
 from semstab.datasets.city.world import World, build_world
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
 
 __all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedBackbone"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 CLUTTER, BUILDING, ROAD, STATIC_CAR, TREE, LOW_VEGETATION, HUMAN, MOVING_CAR = range(8)
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from semstab.datasets.city.classes import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE
 from semstab.datasets.city.hashing import hash_integers, uniform
 from semstab.datasets.city.mesh import Float64, Int64, Surface
-from semstab.frames import Intrinsics
-from semstab.labels import IGNORE_8BIT
+from semstab.model.frames import Intrinsics
+from semstab.model.labels import IGNORE_8BIT
 
 CHUNK = 1 << 18
 """Rays cast at a time: what bounds the memory of a large image."""

@@ -13,8 +13,8 @@ from semstab.datasets.city.hashing import UInt64, hash_integers, rehash, salt, u
 from semstab.datasets.city.mesh import Float64, Int64
 from semstab.datasets.city.options import CONFUSION, SimulatedBackbone
 from semstab.datasets.city.rendering import CHUNK, Rendered
-from semstab.frames import Intrinsics
-from semstab.labels import IGNORE_8BIT
+from semstab.model.frames import Intrinsics
+from semstab.model.labels import IGNORE_8BIT
 
 Labels = npt.NDArray[np.uint8]
 Scores = npt.NDArray[np.float32]

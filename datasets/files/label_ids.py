@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import DataError
-from semstab.labels import IGNORE_16BIT, ignore_id
+from semstab.model.labels import IGNORE_16BIT, ignore_id
 
 NO_ID = IGNORE_16BIT - 1
 """In a table of class ids: an id that is not in it."""

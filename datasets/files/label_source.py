@@ -13,7 +13,7 @@ from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.templates import Folders, Template, inside, matching_folders
 from semstab.datasets.formats.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
-from semstab.labels import LabelSpace
+from semstab.model.labels import LabelSpace
 
 logger = logging.getLogger("semstab")
 

@@ -38,8 +38,8 @@ from semstab.datasets.views.ray_depth import planar
 from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
 from semstab.datasets.views.same_view import fitted
 from semstab.errors import ConfigError, DataError
-from semstab.frames import Frame, Intrinsics
-from semstab.labels import LabelSpace
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
 
 PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table"}
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""

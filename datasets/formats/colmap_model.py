@@ -21,8 +21,8 @@ from semstab.datasets.formats.text_tables import to_number
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import Poses, from_quaternions
 from semstab.errors import DataError
-from semstab.files import open_file
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
+from semstab.runtime.files import open_file
 
 MODELS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",

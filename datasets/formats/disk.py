@@ -9,7 +9,7 @@ from collections.abc import Container
 from pathlib import Path
 
 from semstab.errors import DataError
-from semstab.files import open_file, read_limited
+from semstab.runtime.files import open_file, read_limited
 
 AGAIN = "copy or export it again"
 MAX_BYTES = 2**32

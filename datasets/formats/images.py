@@ -15,7 +15,7 @@ from semstab.datasets.formats.codecs import Png, decode_exr, decode_jpeg, decode
 from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.views.resampling import Labels
 from semstab.errors import ConfigError, DataError
-from semstab.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")

@@ -15,7 +15,7 @@ import deflate
 import numpy as np
 import numpy.typing as npt
 
-from semstab.compiled import serial
+from semstab.runtime.compiled import serial
 
 LARGEST_RATIO = 1032
 """A byte of a deflate stream becomes at most that many: what claims more is not worth the memory."""

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from semstab.datasets.formats.disk import read_bytes
 from semstab.errors import DataError, one_line
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 MAX_TEXT_BYTES = 2**16
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from semstab.errors import DataError
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 LARGEST = 1e9
 

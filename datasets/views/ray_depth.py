@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 
 def ray_lengths(camera: Intrinsics, u: npt.ArrayLike, v: npt.ArrayLike) -> npt.NDArray[np.float64]:

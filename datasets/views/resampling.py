@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from semstab.frames import Intrinsics
-from semstab.labels import ignore_id
+from semstab.model.frames import Intrinsics
+from semstab.model.labels import ignore_id
 
 Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 Scores = npt.NDArray[np.floating[Any]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.resampling import Pixels, fit
 from semstab.errors import DataError
-from semstab.frames import Intrinsics
+from semstab.model.frames import Intrinsics
 
 SHAPE_TOLERANCE = 0.02
 """Images whose ratios of width and height differ by more do not show the same view."""

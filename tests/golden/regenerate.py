@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from semstab import backends
-from semstab.files import write_json, write_text
-from semstab.frames import Frame, Intrinsics
-from semstab.json_form import to_json
-from semstab.measures import measures
 from semstab.metrics import summarise
-from semstab.tables import tables, to_csv, to_latex, to_markdown
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.measures import measures
+from semstab.outputs.tables import tables, to_csv, to_latex, to_markdown
+from semstab.runtime.files import write_json, write_text
+from semstab.runtime.json_form import to_json
 
 FILE = Path(__file__).parent / "small_map.json"
 K = 4

@@ -21,7 +21,7 @@ import open3d.core as o3c
 
 import semstab
 from semstab import backends
-from semstab.files import write_json
+from semstab.runtime.files import write_json
 
 VOXEL_SIZE, FRAMES = 0.2, 4
 BASELINE = "Open3D integrate"

@@ -18,7 +18,7 @@ import numpy as np
 
 import semstab
 from semstab import backends
-from semstab.files import write_json
+from semstab.runtime.files import write_json
 
 VOXEL_SIZE, K, APART, VISITS = 0.2, 7, 200.0, 15
 

@@ -19,10 +19,10 @@ import flight
 import numpy as np
 
 from semstab import statistics
-from semstab.files import write_json
+from semstab.model.voxels import Events, VoxelTable
+from semstab.runtime.files import write_json
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
 from semstab.statistics.drift import FRAME_ORDERS, LEAST_DRAWS
-from semstab.voxels import Events, VoxelTable
 
 FRAMES, MEAN_OP = 80, 6
 BASELINE = "plain NumPy"

@@ -1,0 +1,192 @@
+"""Where jobs are done: in this process, in local processes, or on a Dask cluster; one interface."""
+
+from __future__ import annotations
+
+import concurrent.futures as cf
+import contextlib
+import dataclasses
+import importlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Generator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection, wait
+from typing import Any, Protocol
+
+from semstab.engine.observer import Observers
+from semstab.engine.work.jobs import Job, Outcome, failed
+from semstab.engine.work.memory import available_bytes
+from semstab.engine.work.passes import run_job
+from semstab.errors import ConfigError, MissingDependencyError
+from semstab.runtime.prefetch import default_threads
+from semstab.runtime.process import settle
+
+CONNECT_SECONDS = 10
+
+Finished = tuple[Job, tuple[Outcome, ...]]
+
+
+class Executor(Protocol):
+    """Runs jobs.
+
+    name       for the manifest
+    width      how many jobs it runs at once
+    elsewhere  whether other processes do the work, so that observers here do not see it
+    """
+
+    name: str
+    width: int
+    elsewhere: bool
+
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest.
+
+        `observers` are told of the work that is done in this very process.
+        """
+        ...
+
+
+class InProcess:
+    """One job after the other, in this process."""
+
+    name = "in this process"
+    width = 1
+    elsewhere = False
+
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """In order."""
+        for job in jobs:
+            yield job, run_job(job, observers)
+
+
+class LocalProcesses:
+    """That many processes on this machine, which share its cores and its free memory."""
+
+    elsewhere = True
+
+    def __init__(self, jobs: int) -> None:
+        if jobs < 1:
+            raise ConfigError(f"{jobs} jobs: use 1 or more")
+        self.width = jobs
+        self.name = f"{jobs} local processes"
+
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """As they finish.
+
+        Where a process dies, nobody knows of which job: what is left is tried again, then once more one by one. The job
+        whose process dies then fails, and the others finish.
+        """
+        left = dict(enumerate(self._with_a_share(job) for job in jobs))
+        for width in (self.width, self.width):
+            with contextlib.suppress(BrokenProcessPool):
+                yield from self._run(left, width)
+        while left:
+            try:
+                yield from self._run(left, 1)
+            except BrokenProcessPool:
+                job = left.pop(min(left))
+                text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
+                yield job, tuple(failed(job.requests, text))
+
+    def _run(self, left: dict[int, Job], width: int) -> Generator[Finished, None, None]:
+        """Run the jobs that are left, in order; take away those that are finished."""
+        if not left:
+            return
+        context = multiprocessing.get_context("spawn")
+        listening, alive = context.Pipe(duplex=False)
+        share = max(1, cores() // self.width)
+        pool = cf.ProcessPoolExecutor(
+            min(width, len(left)), context, initializer=_start_worker, initargs=(listening, share)
+        )
+        try:
+            _check_start(pool)
+            futures = {pool.submit(run_job, job): k for k, job in left.items()}
+            for future in cf.as_completed(futures) if width > 1 else list(futures):
+                outcomes = future.result()
+                yield left.pop(futures[future]), outcomes
+            pool.shutdown()
+        finally:
+            alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _with_a_share(self, job: Job) -> Job:
+        memory = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
+        threads = job.threads or default_threads()
+        return dataclasses.replace(job, threads=max(1, threads // self.width), memory_bytes=memory / self.width)
+
+
+def _check_start(pool: cf.ProcessPoolExecutor) -> None:
+    """Raise ConfigError where not even an empty job runs: a script that starts processes must be importable."""
+    try:
+        pool.submit(os.getpid).result()
+    except BrokenProcessPool as error:
+        raise ConfigError(
+            "worker processes do not start; in a script of your own, call it under if __name__ == '__main__'"
+        ) from error
+
+
+def _start_worker(listening: Connection, threads: int) -> None:
+    """Set a worker process up: with its share of the cores, and so that it ends with its parent."""
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))  # read when Open3D is loaded
+    settle()
+    import numba
+
+    numba.set_num_threads(min(threads, numba.get_num_threads()))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
+
+    def end_with_parent() -> None:
+        wait([listening])  # readable once the other end is closed: by the parent, or by its death
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+class DaskCluster:
+    """The workers of a Dask scheduler, for example tcp://127.0.0.1:8786; they must have semstab and see the data.
+
+    Raises MissingDependencyError without dask, ConfigError where no scheduler answers.
+    """
+
+    elsewhere = True
+
+    def __init__(self, scheduler: str) -> None:
+        try:
+            self._client = _distributed().Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
+            ) from error
+        self.width = max(1, sum(self._client.nthreads().values()))
+        self.name = f"Dask, {self.width} threads"
+
+    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """As they finish. The scheduler gives the job of a worker that died to another one."""
+        with self._client:
+            futures = {self._client.submit(run_job, job, pure=False): job for job in jobs}
+            try:
+                for future in _distributed().as_completed(list(futures), loop=self._client.loop):
+                    yield futures[future], _outcomes(future, futures[future])
+            finally:
+                self._client.cancel(list(futures))
+
+
+def _distributed() -> Any:
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise MissingDependencyError("a Dask cluster needs more packages: pip install 'semstab[cluster]'") from error
+
+
+def _outcomes(future: Any, job: Job) -> tuple[Outcome, ...]:
+    try:
+        outcomes: tuple[Outcome, ...] = future.result()
+    except Exception as error:  # noqa: BLE001 - whatever happened to it on the cluster
+        return tuple(failed(job.requests, error))
+    return outcomes
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,162 @@
+"""The end of a unit: its map is measured, judged by the statistics, and written."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends import FusionBackend
+from semstab.config import Config
+from semstab.datasets import Scene
+from semstab.datasets.formats.disk import file_digest
+from semstab.engine.evaluation import analyse_map
+from semstab.engine.observer import Observers
+from semstab.engine.series import to_csv
+from semstab.engine.work.jobs import Job, Outcome, shared_marker
+from semstab.engine.work.stream import Stream, UnitMap
+from semstab.engine.work.up_axis import estimate_up
+from semstab.errors import DataError
+from semstab.metrics import macro_mean, summarise
+from semstab.model.measures import dominant, measures
+from semstab.model.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
+from semstab.model.results import STAGES, UnitSummary, slug
+from semstab.model.voxels import VoxelTable
+from semstab.runtime.files import atomic_path, write_text
+from semstab.runtime.stopwatch import Stopwatch
+from semstab.statistics import Analysis
+from semstab.task import Task, read
+
+Savers = dict[str, Callable[[Path], None]]
+"""What writes each file of a unit, by its path in the folder."""
+
+
+def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: Stopwatch) -> Outcome:
+    """Measure a finished map and write its files. Raises DataError where no pixel was valid."""
+    task, config, unit = one.task, one.request.config, one.task.units[0]
+    kept = one.request.kept
+    with watch("measure"):
+        table = _table(one.backend, task)
+        _require_voxels(task, config, table)
+    if kept:
+        with watch("observe"):
+            observers.tell(lambda observer: observer.unit_fused(unit, table))
+    with watch("statistics"):
+        truth = None if one.truth is None else _table(one.truth, task)
+        events = one.backend.events() if config.statistics else None
+        found = analyse_map(task, config, table, events, truth) if one.request.judged else None
+    with watch("measure"):
+        summary = _summary(one, table, found)
+    with watch("write"):
+        saved, returned = _written(job, _savers(stream, one, table, truth, found))
+    content = UnitContent(task.digest, summary, files=saved)
+    if one.request.image_space and stream.image_space is not None:
+        image_space = stream.image_space.result(summary.flicker_percent)
+        content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
+    if kept:
+        with watch("observe"):
+            observers.tell(lambda observer: observer.unit_finished(unit, table, summary))
+    return Outcome(one.request.identity, content, files=returned)
+
+
+def _table(backend: FusionBackend, task: Task) -> VoxelTable:
+    return dataclasses.replace(backend.table(), classes=task.mapping.target.classes)
+
+
+def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
+    """Raise DataError, which says what is missing in the first frame, where the map is empty."""
+    if len(table):
+        return
+    frame = read(task, task.indices[0], config.pixel_stride)
+    depth = np.mean(np.isfinite(frame.depth) & (frame.depth > 0))
+    labelled = np.mean(frame.predicted != frame.ignore_id)
+    raise DataError(
+        f"{task.scene.name}, {task.backbone}: no pixel of {len(task.indices)} frames is valid (first frame: depth in"
+        f" {depth:.0%} of the pixels, a label in {labelled:.0%}); check depth_scale, the ignore id and the taxonomy"
+    )
+
+
+def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
+    """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
+    task, config, rows = one.task, one.request.config, one.rows
+    stages = [row.stage_ms() for row in rows]
+    return UnitSummary(
+        unit=task.units[0],
+        taxonomy=task.mapping.target.name,
+        frames=len(task.indices),
+        table=summarise(table, config.strata),
+        flicker_percent=macro_mean([row.flicker_percent for row in rows]),
+        fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
+        stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
+        left_out=sum(row.left_out for row in rows),
+        frames_left_out=task.left_out,
+        statistics=None if found is None else found.summary,
+    )
+
+
+def _savers(
+    stream: Stream, one: UnitMap, table: VoxelTable, truth: VoxelTable | None, found: Analysis | None
+) -> Savers:
+    """What is to be written of a unit beside its summary."""
+    config, unit = one.request.config, one.task.units[0]
+    savers: Savers = {}
+    if one.request.image_space:
+        savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
+    if not one.request.kept:
+        return savers
+    savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
+        save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
+    )
+    savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
+    events = one.backend.events() if config.events else None
+    if events is not None:
+        savers[f"{EVENTS}/{unit.slug}.parquet"] = dataclasses.replace(events, classes=table.classes).save
+    if truth is not None and one.request.image_space:
+        savers[f"{TRUTH}/{unit.slug}.parquet"] = truth.save
+    return savers
+
+
+def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Write files into the folder where it is shared; their digests, and their bytes where it is not."""
+    digests, returned = {}, {}
+    shared = shared_marker(job.folder, job.start).exists()
+    with tempfile.TemporaryDirectory() as elsewhere:
+        for name, save in savers.items():
+            path = (job.folder if shared else Path(elsewhere)) / name
+            save(path)
+            digests[name] = file_digest(path).hex()
+            if not shared:
+                returned[name] = path.read_bytes()
+    return digests, returned
+
+
+def save_voxels(table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
+    """Write a voxel table together with its measures, and further columns (n,) by name."""
+    own = {measure.key: measure.of(table) for measure in measures()}
+    table.save(path, {**own, "label": dominant(table), **(columns or {})})
+
+
+def _save_text(text: str, path: Path) -> None:
+    write_text(path, text)
+
+
+def _save_arrays(arrays: Mapping[str, Any], path: Path) -> None:
+    named: dict[str, Any] = dict(arrays)
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **named)
+
+
+def _up(scene: Scene, table: VoxelTable, poses: Sequence[Any]) -> tuple[float, float, float] | None:
+    """The scene's up axis, said or estimated; None where neither works."""
+    try:
+        up = estimate_up(table, poses) if scene.up is None else scene.up
+    except (DataError, ImportError, OSError):
+        return None
+    x, y, z = (float(value) for value in up)
+    return x, y, z

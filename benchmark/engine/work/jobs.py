@@ -1,0 +1,115 @@
+"""The work of a plan: units that read the same sequence are one job, small enough to send to another machine."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from semstab.config import Config
+from semstab.engine.observer import Factory
+from semstab.errors import SemstabError, one_line
+from semstab.model.records import UnitContent
+
+
+@dataclass(frozen=True)
+class Request:
+    """A unit to compute, and what is wanted of it; see `semstab.engine.units.PlannedUnit`.
+
+    config    with its frames one by one: those of its sequence that all label sources of the plan have
+    left_out  how many selected frames lack a file or a pose
+    regions   whether it is the flicker of regions without classes, and nothing is fused
+    """
+
+    identity: str
+    config: Config
+    image_space: bool = False
+    kept: bool = False
+    judged: bool = True
+    left_out: int = 0
+    regions: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """Units of one scene and backbone.
+
+    start         names this start: a worker opens the dataset once for it
+    folder        of the run or study
+    threads       that decode frames ahead
+    memory_bytes  that maps may take before some are put off to another pass over the frames; None: half of what is free
+    observers     made where the job is done, and told of what is fused there
+    """
+
+    scene: str
+    backbone: str
+    requests: tuple[Request, ...]
+    start: str
+    folder: Path
+    threads: int | None = None
+    memory_bytes: float | None = None
+    observers: tuple[Factory, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a unit: what its file holds, or the one line that says why there is none.
+
+    files    further files of it by their path in the folder, where the worker does not see that folder
+    cause    the exception, where the unit failed in this very process
+    trace    where it was raised, if it is not semstab's own
+    seconds  that its pass took, by stage; of the first outcome of a pass only
+    """
+
+    identity: str
+    content: UnitContent | None = None
+    error: str | None = None
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    cause: BaseException | None = field(default=None, compare=False)
+    trace: str = ""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without the exception, which may not travel."""
+        return {**self.__dict__, "cause": None}
+
+
+def failed(requests: Iterable[Request], error: str | Exception) -> list[Outcome]:
+    """The outcomes of units that could not be computed."""
+    if isinstance(error, str):
+        return [Outcome(request.identity, error=error) for request in requests]
+    trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
+    return [Outcome(request.identity, error=message(error), cause=error, trace=trace) for request in requests]
+
+
+def message(error: Exception) -> str:
+    """One line; an error that is not semstab's own says its type."""
+    return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
+
+
+def shared_marker(folder: Path, start: str) -> Path:
+    """The file by which a worker knows that it sees the folder itself, not one of the same name elsewhere."""
+    return folder / f".shared-{start}"
+
+
+def split(jobs: Sequence[Job], width: int) -> list[Job]:
+    """As many jobs as can run at once, if there are that many units: the largest ones are halved.
+
+    What is kept of one sequence stays together, for it is watched together.
+    """
+    jobs = list(jobs)
+    while len(jobs) < width:
+        divisible = [k for k, job in enumerate(jobs) if all(_halves(job.requests))]
+        if not divisible:
+            break
+        k = max(divisible, key=lambda k: len(jobs[k].requests))
+        jobs[k : k + 1] = [replace(jobs[k], requests=half) for half in _halves(jobs[k].requests)]
+    return jobs
+
+
+def _halves(requests: tuple[Request, ...]) -> tuple[tuple[Request, ...], tuple[Request, ...]]:
+    ordered = sorted(requests, key=lambda request: not request.kept)
+    together = sum(request.kept for request in ordered)
+    half = max(together, len(ordered) // 2)
+    return tuple(ordered[:half]), tuple(ordered[half:])

@@ -1,0 +1,256 @@
+"""One pass over a sequence: each frame is decoded once, and goes into the maps of all units that want it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+
+from semstab.backends import FusionBackend, create, takes_option
+from semstab.config import Config
+from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
+from semstab.engine.evaluation import truth_task
+from semstab.engine.observer import Observers
+from semstab.engine.series import FrameRow
+from semstab.engine.work.finish import finish
+from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
+from semstab.engine.work.memory import available_bytes, require_memory
+from semstab.engine.work.regions import measure_regions
+from semstab.engine.work.stream import Decoded, Prepared, Stream, UnitMap, streams_of
+from semstab.errors import DataError
+from semstab.model.frames import Frame
+from semstab.runtime.prefetch import Fetched, prefetch
+from semstab.runtime.stopwatch import Stopwatch
+from semstab.task import Task, tasks_of
+
+logger = logging.getLogger("semstab")
+
+WARM_UP_STRIDE = 8
+"""A backend is warmed up with so few pixels of the first frame."""
+
+
+def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]:
+    """Compute the units of a job. One that fails does not keep the others from finishing.
+
+    `observers` see it where it is done in their process; elsewhere the job brings its own.
+    """
+    made = [make() for make in job.observers]
+    told = observers or Observers(made)
+    outcomes: list[Outcome] = []
+    requests = job.requests
+    try:
+        scene = _scene(job)
+        regions = [request for request in requests if request.regions]
+        outcomes += [measure_regions(job, scene, request) for request in regions]
+        requests = tuple(request for request in requests if not request.regions)
+        while requests:
+            fused = Pass(job, scene, requests, told)
+            outcomes += fused.run()
+            requests = tuple(fused.put_off)
+    except Exception as error:  # noqa: BLE001 - whatever happens to a job is reported, and the other jobs go on
+        outcomes += failed(requests, error)
+    finally:
+        for observer in made:
+            observer.close()
+    for problem in told.errors if made else ():
+        logger.warning("%s, %s: not recorded (%s)", job.scene, job.backbone, message(problem))
+    return tuple(outcomes)
+
+
+_lent: dict[str, Mapping[str, Scene]] = {}
+
+
+@contextlib.contextmanager
+def lend(start: str, scenes: Mapping[str, Scene]) -> Iterator[None]:
+    """Let jobs of that start that are done in this process read open scenes while the block lasts."""
+    _lent[start] = scenes
+    try:
+        yield
+    finally:
+        del _lent[start]
+
+
+def _scene(job: Job) -> Scene:
+    if job.start in _lent:
+        return _lent[job.start][job.scene]
+    dataset = job.requests[0].config.dataset
+    return _dataset(job.start, dataset.name, json.dumps(dataset.options)).scene(job.scene)
+
+
+@functools.lru_cache(maxsize=1)
+def _dataset(_start: str, name: str, options: str) -> Dataset:
+    """The dataset, opened once for a start: its scenes share what they read or render."""
+    return open_dataset(name, json.loads(options))
+
+
+class Pass:
+    """A pass with as many maps as the memory bound allows; the requests of the others are put off to another one."""
+
+    def __init__(self, job: Job, scene: Scene, requests: Sequence[Request], observers: Observers) -> None:
+        self.job = job
+        self.put_off: list[Request] = []
+        self.observers = observers
+        self._scene = scene
+        self._outcomes: list[Outcome] = []
+        self._watch = Stopwatch()
+        self._streams = streams_of([one for request in requests for one in self._created(request)])
+        self._memory_before = _resident_bytes()
+        self._bound = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
+
+    def run(self) -> list[Outcome]:
+        """Fuse and measure; the outcome of every unit that was not put off."""
+        order = sorted(frozenset[int]().union(*(stream.indices for stream in self._streams)))
+        decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
+        watched = [one for stream in self._streams for one in stream.maps if one.request.kept]
+        if watched:
+            task = dataclasses.replace(watched[0].task, backends=tuple(one.task.backends[0] for one in watched))
+            self.observers.tell(lambda observer: observer.group_started(task, watched[0].request.config))
+        for one in watched:
+            self.observers.tell(lambda observer, one=one: observer.unit_started(one.task.units[0], one.backend))  # type: ignore[misc]
+        with contextlib.closing(decode) as frames:
+            for index, fetched in zip(order, frames, strict=True):
+                self._watch.seconds["read"] += fetched.waited
+                for stream in self._streams:
+                    if stream.maps and index in stream.indices:
+                        self._feed(stream, fetched)
+                self._make_room()
+        for stream in self._streams:
+            self._finish(stream)
+        if self._outcomes:
+            self._outcomes[0] = dataclasses.replace(self._outcomes[0], seconds=dict(self._watch.seconds))
+        return self._outcomes
+
+    def _created(self, request: Request) -> list[UnitMap]:
+        """An empty map for a unit; none where it fails."""
+        with self._failing([request]):
+            (task,) = tasks_of(self._scene, request.config)
+            task = dataclasses.replace(task, left_out=request.left_out)
+            truth = _truth_map(request.config, task) if request.config.statistics else None
+            return [UnitMap(request, task, _new_map(request.config, task), truth)]
+        return []
+
+    def _decode(self, index: int) -> Decoded:
+        """Decode a frame in a worker thread; an error fails the units that need the frame, not those that do not."""
+        try:
+            color = self.observers.want_color or any(stream.shown == index for stream in self._streams)
+            frame = self._scene.frame(index, self.job.backbone, color=color)
+            wanted = any(stream.truth_task is not None and index in stream.indices for stream in self._streams)
+            return Decoded(index, frame, _ground_truth(self._scene, index) if wanted else None)
+        except Exception as error:  # noqa: BLE001 - raised again by `_feed`
+            return Decoded(index, error=error)
+
+    def _feed(self, stream: Stream, fetched: Fetched[Decoded]) -> None:
+        """A frame into every map of a stream."""
+        watched = [one for one in stream.maps if one.request.kept]
+        with self._failing([one.request for one in stream.maps]):
+            now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
+            if watched and not watched[0].rows:
+                require_memory(stream.task, watched[0].request.config, now.frame)
+            for one in stream.maps:
+                with self._failing([one.request]):
+                    row = self._integrate(one, now, fetched)
+                    one.rows.append(self._told(one, now.frame, row))
+            if watched:
+                self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
+        lost = {outcome.identity for outcome in self._outcomes}
+        stream.maps = [one for one in stream.maps if one.request.identity not in lost]
+
+    def _integrate(self, one: UnitMap, now: Prepared, fetched: Fetched[Decoded]) -> FrameRow:
+        frame = now.frame
+        if not one.rows:
+            if not one.request.kept:
+                require_memory(one.task, one.request.config, frame)
+            _warm_up(one, frame)
+        with self._watch(f"fuse {one.task.backends[0]}"):
+            report = one.backend.integrate(frame)
+        if one.truth is not None and now.truth is not None:
+            one.truth.integrate(now.truth)
+        return FrameRow(
+            report, frame.timestamp, now.flicker, fetched.seconds, fetched.waited, now.seconds,
+            left_out=frame.left_out_pixels,
+        )  # fmt: skip
+
+    def _told(self, one: UnitMap, frame: Frame, row: FrameRow) -> FrameRow:
+        """The row, once the observers have seen it."""
+        unit = one.task.units[0]
+        what = f"{unit.scene} · {unit.backbone} · {unit.backend}"
+        self.observers.tell(lambda observer: observer.advanced(1, what))
+        if not one.request.kept:
+            return row
+        with self._watch("observe") as lap:
+            self.observers.tell(lambda observer: observer.frame_fused(unit, frame, row))
+        return dataclasses.replace(row, logging_seconds=lap.seconds)
+
+    def _finish(self, stream: Stream) -> None:
+        """Measure the finished maps of a stream, and let go of each."""
+        watched = any(one.request.kept for one in stream.maps)
+        while stream.maps:
+            one = stream.maps.pop(0)
+            with self._failing([one.request]):
+                self._outcomes.append(finish(self.job, stream, one, self.observers, self._watch))
+        if watched:
+            self.observers.tell(lambda observer: observer.group_finished(stream.task))
+
+    def _make_room(self) -> None:
+        """Put maps off to the next pass where they take more than the memory bound: half, but none that is watched."""
+        maps = [one for stream in self._streams for one in stream.maps]
+        if len(maps) < 2 or _resident_bytes() - self._memory_before <= self._bound:
+            return
+        most = sorted(maps, key=lambda one: not one.request.kept)[max(1, len(maps) // 2) :]
+        off = {one.request.identity for one in most if not one.request.kept}
+        self.put_off += [one.request for one in maps if one.request.identity in off]
+        for stream in self._streams:
+            stream.maps = [one for one in stream.maps if one.request.identity not in off]
+
+    @contextlib.contextmanager
+    def _failing(self, requests: Sequence[Request]) -> Iterator[None]:
+        """What is raised in the block becomes the outcome of these units, but of those that failed before."""
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others go on
+            lost = {outcome.identity for outcome in self._outcomes}
+            self._outcomes += failed([request for request in requests if request.identity not in lost], error)
+
+
+def _new_map(config: Config, task: Task) -> FusionBackend:
+    """An empty map; it keeps the history where that is to be written, or statistics are computed from it."""
+    (backend,) = config.backends
+    wanted = (config.events or config.statistics) and takes_option(backend.name, "history")
+    options = ({"history": True} if wanted else {}) | backend.options
+    return create(backend.name, voxel_size=config.voxel_size, num_classes=len(task.mapping.target), **options)
+
+
+def _truth_map(config: Config, task: Task) -> FusionBackend | None:
+    """An empty map for the ground truth, where there is any; its history is not wanted."""
+    without_log = config.model_copy(update={"statistics": False, "events": False})
+    return _new_map(without_log, task) if truth_task(task) else None
+
+
+_warm: set[tuple[str, str, int, bool]] = set()
+
+
+def _warm_up(one: UnitMap, frame: Frame) -> None:
+    """Let a backend load what it compiles, once a process: else the first frame would cost more than the others."""
+    config, task = one.request.config, one.task
+    (backend,) = config.backends
+    kind = (backend.name, json.dumps(backend.options), len(task.mapping.target), frame.scores is None)
+    if kind not in _warm:
+        _new_map(config, task).integrate(frame.every(WARM_UP_STRIDE))
+        _warm.add(kind)
+
+
+def _ground_truth(scene: Scene, index: int) -> Frame | None:
+    """A frame with its ground truth; None where the frame has none."""
+    try:
+        return scene.frame(index, GROUND_TRUTH, color=False)
+    except DataError:
+        return None
+
+
+def _resident_bytes() -> int:
+    import psutil
+
+    return int(psutil.Process().memory_info().rss)

@@ -1,0 +1,128 @@
+"""Units that fuse the very same frames, and what they share of each: preparation, flicker, ground truth, a picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from semstab.backends import FusionBackend
+from semstab.engine.evaluation import truth_task
+from semstab.engine.series import FrameRow
+from semstab.engine.work.image_space import ImageSpaceMeter
+from semstab.engine.work.jobs import Request
+from semstab.metrics import flicker_percent
+from semstab.model.frames import Frame
+from semstab.runtime.stopwatch import Stopwatch
+from semstab.task import Task, prepare
+
+SHOWN_WIDTH = 1280
+"""Pixels of the frame that is kept for figures."""
+
+
+@dataclass(eq=False)
+class UnitMap:
+    """A unit that is being fused; `truth` takes the ground truth of the same frames, for statistics."""
+
+    request: Request
+    task: Task
+    backend: FusionBackend
+    truth: FusionBackend | None = None
+    rows: list[FrameRow] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """A frame as its scene has it, with its ground truth where that is wanted; or the error that came instead."""
+
+    index: int
+    frame: Frame | None = None
+    truth: Frame | None = None
+    error: Exception | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it keeps in memory."""
+        return sum(frame.nbytes for frame in (self.frame, self.truth) if frame is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A frame ready to fuse, with its ground truth; its flicker in percent, and the seconds which that took."""
+
+    frame: Frame
+    truth: Frame | None
+    flicker: float
+    seconds: float
+
+
+class Stream:
+    """Units that fuse the very same frames: those of one taxonomy, noise, pixel stride and selection of frames."""
+
+    def __init__(self, maps: Sequence[UnitMap]) -> None:
+        self.maps = list(maps)
+        self.task = dataclasses.replace(
+            maps[0].task, backends=tuple(one.task.backends[0] for one in maps if one.request.kept)
+        )
+        self.pixel_stride = maps[0].request.config.pixel_stride
+        self.indices = frozenset(self.task.indices)
+        self.previous: Frame | None = None
+        self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
+        takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
+        self.truth_task = truth_task(self.task) if takes_truth else None
+        self.poses: list[Any] = []
+        self.shown = self.task.indices[len(self.task.indices) // 2] if self.image_space is not None else None
+        self.overview: dict[str, Any] = {}
+
+    def next_frame(self, decoded: Decoded, watch: Stopwatch, *, color: bool) -> Prepared:
+        """The frame as the stream's units fuse it; with its colour only where somebody but the figures wants it."""
+        if decoded.error is not None:
+            raise decoded.error
+        assert decoded.frame is not None
+        frame = prepare(self.task, decoded.frame, self.pixel_stride)
+        with watch("flicker") as lap:
+            flicker = _flicker_between(self.previous, frame)
+        truth = self._truth(decoded)
+        if self.image_space is not None:
+            with watch("image space"):
+                self.image_space.add(frame, truth)
+        if decoded.index == self.shown:
+            self.overview = _overview(self.task, decoded.frame)
+            frame = frame if color else dataclasses.replace(frame, color=None)
+        self.poses.append(frame.T_wc)
+        self.previous = frame
+        return Prepared(frame, truth, flicker, lap.seconds)
+
+    def _truth(self, decoded: Decoded) -> Frame | None:
+        if self.truth_task is None or decoded.truth is None:
+            return None
+        return prepare(self.truth_task, decoded.truth, self.pixel_stride)
+
+
+def streams_of(maps: Iterable[UnitMap]) -> list[Stream]:
+    """The maps by the frames that they share."""
+    groups: dict[Any, list[UnitMap]] = {}
+    for one in maps:
+        config = one.request.config
+        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, tuple(one.task.indices))
+        groups.setdefault(same, []).append(one)
+    return [Stream(group) for group in groups.values()]
+
+
+def _flicker_between(previous: Frame | None, frame: Frame) -> float:
+    """Flicker against the frame before; undefined for the first one, and where the image size changes."""
+    if previous is None or previous.shape != frame.shape:
+        return math.nan
+    return flicker_percent(previous, frame)
+
+
+def _overview(task: Task, decoded: Frame) -> dict[str, Any]:
+    """What a figure shows of a frame, no wider than SHOWN_WIDTH."""
+    frame = prepare(task, decoded, -(-decoded.shape[1] // SHOWN_WIDTH))
+    palette = np.array(task.mapping.target.colors, dtype=np.uint8)
+    arrays: dict[str, Any] = {"frame": frame.index, "labels": frame.predicted, "palette": palette}
+    return arrays if frame.color is None else arrays | {"color": frame.color}

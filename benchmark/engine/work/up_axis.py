@@ -1,0 +1,91 @@
+"""Which way is up, where a dataset does not say: the normal of the ground plane, found in the fused map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import DataError
+from semstab.model.voxels import VoxelTable
+
+Float64 = npt.NDArray[np.float64]
+
+PLANES = 4
+"""Planes looked at, the largest first; the ground is one of them."""
+
+THICKNESS = 0.01
+"""A plane's points lie within this share of the scene's size on either side: ground is rough, and rises and falls."""
+
+POINTS = 10_000
+"""Points used, drawn at random from more."""
+
+ITERATIONS = 2_000
+"""Draws of three points a plane. They all lie in a plane of 15% of the points once in 300 draws."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane in the map.
+
+    normal  (3,) unit vector towards the cameras
+    share   of the points that lie in it, 0 to 1
+    """
+
+    normal: Float64
+    share: float
+
+
+def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLike] | npt.ArrayLike) -> Float64:
+    """The world's up axis (3,), a unit vector: the normal, towards the cameras, of the plane that is likely the ground.
+
+    points  a fused map, whose voxels count by area; or world points (n, 3), metres
+    poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes
+
+    The cameras alone do not tell: up in their images is up in the world for a level camera, and straight ahead for one
+    that looks down. So the largest planes of the map are found (RANSAC, seeded: the same input gives the same answer),
+    and of those which the cameras see from above, the one with the largest share * cos(angle to the up of a camera that
+    looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor of its size.
+
+    It is wrong where the ground is not among the largest planes (a façade filmed from the street, a table top that is
+    tilted), where cameras are rolled by tens of degrees, and by the ground's own slope. Say `up_axis` instead then.
+    Raises DataError where there are fewer than 3 points, or no plane with the cameras above it.
+    """
+    at = points.centers if isinstance(points, VoxelTable) else np.asarray(points, dtype=np.float64)
+    T_wc = np.asarray(poses, dtype=np.float64)
+    prior = _unit(-(2 * T_wc[:, :3, 1] + T_wc[:, :3, 2]).mean(axis=0))
+    planes = list(_planes(at, T_wc[:, :3, 3])) if len(at) >= 3 else []
+    scores = [plane.share * float(plane.normal @ prior) for plane in planes]
+    if max(scores, default=0.0) <= 0:
+        raise DataError(f"no ground plane found under the cameras in {len(at)} points; say which axis is up (up_axis)")
+    return planes[int(np.argmax(scores))].normal
+
+
+def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
+    """The largest planes, each found among the points that the ones before it left."""
+    import open3d as o3d
+
+    origin = np.median(points, axis=0)
+    rest, cameras = points - origin, cameras - origin
+    if len(rest) > POINTS:
+        rest = np.random.default_rng(0).choice(rest, POINTS, replace=False, shuffle=False)
+    total = len(rest)
+    low, high = np.percentile(rest, [5, 95], axis=0)
+    distance = THICKNESS * float(np.linalg.norm(high - low))
+    o3d.utility.random.seed(0)
+    for _ in range(PLANES):
+        if len(rest) < 3 or distance == 0:
+            return
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rest))
+        # Probability 1: an early stop would depend on the threads' timing.
+        model, inliers = cloud.segment_plane(distance, ransac_n=3, num_iterations=ITERATIONS, probability=1.0)
+        above = np.median(cameras @ model[:3] + model[3]) > 0
+        yield Plane(_unit(model[:3] if above else -model[:3]), len(inliers) / total)
+        rest = np.delete(rest, inliers, axis=0)
+
+
+def _unit(vector: Float64) -> Float64:
+    unit: Float64 = vector / np.linalg.norm(vector)
+    return unit

@@ -1,0 +1,129 @@
+"""What `semstab.statistics` says of several backbones' maps of one scene; in JSON as the fields say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from semstab.model.measures import Quantity
+from semstab.model.statistics import UNDEFINED, Estimate, RuleMeans
+
+ByBackbone = Mapping[str, Estimate]
+
+
+@dataclass(frozen=True)
+class MapCoverage:
+    """What a backbone's map covers. `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
+
+    backbone: str
+    voxels: int
+    observations: int
+    mean_op: float
+    repeated: int
+    recurrent: int
+    common_share: float
+    alone: int
+
+
+@dataclass(frozen=True)
+class Standardised:
+    """Means at a common distribution of OP, by the key of what is compared and backbone.
+
+    edges    upper edges of the strata of OP
+    weights  of the strata
+    """
+
+    edges: tuple[int, ...]
+    weights: tuple[float, ...]
+    values: Mapping[str, ByBackbone]
+
+    def of(self, quantity: Quantity, backbone: str) -> Estimate:
+        """A backbone's mean; undefined for what is no mean over voxels."""
+        return self.values.get(quantity.key, {}).get(backbone, UNDEFINED)
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """A measure of backbone a minus that of b on the voxels that all saw twice or more.
+
+    p_value  of the paired sign-flip test over blocks, for measures with one value a voxel; p_holm corrects it for the
+             number of pairs (Holm 1979)
+    """
+
+    measure: str
+    a: str
+    b: str
+    difference: Estimate
+    p_value: float
+    p_holm: float
+
+
+@dataclass(frozen=True)
+class Rank:
+    """A backbone's place, 1 being the best, with the range that holds 95 % of the resamples.
+
+    best is the share of the resamples in which it is first.
+    """
+
+    backbone: str
+    value: float
+    rank: int
+    low: int
+    high: int
+    best: float
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The backbones by one measure on common voxels, the best first."""
+
+    measure: str
+    ranks: tuple[Rank, ...]
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Backbones on the voxels that every one of them observed at least twice.
+
+    values  what is `compared`, by its key and backbone
+    """
+
+    voxels: int
+    blocks: int
+    block_size: float
+    values: Mapping[str, ByBackbone]
+    differences: tuple[PairedDifference, ...]
+    rankings: tuple[Ranking, ...]
+
+    def of(self, quantity: Quantity) -> ByBackbone:
+        """The values of what is compared, by backbone."""
+        return self.values[quantity.key]
+
+
+@dataclass(frozen=True)
+class RuleComparison:
+    """The backbones under each rule of fusion, on their common voxels with OP >= 2.
+
+    values         by rule and backbone
+    orders         by the key of what is compared and rule, the best backbone first
+    order_changes  by key, whether the order depends on the rule
+    """
+
+    voxels: int
+    values: Mapping[str, Mapping[str, RuleMeans]]
+    orders: Mapping[str, Mapping[str, tuple[str, ...]]]
+    order_changes: Mapping[str, bool]
+
+
+@dataclass(frozen=True)
+class BackboneComparison:
+    """Several backbones' maps of one scene beside each other."""
+
+    scene: str
+    schema: int
+    seed: int
+    backbones: tuple[str, ...]
+    coverage: tuple[MapCoverage, ...]
+    standardised: Standardised
+    paired: Paired
+    fusion_rules: RuleComparison | None

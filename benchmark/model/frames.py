@@ -1,0 +1,254 @@
+"""One posed image with depth and labels: what every dataset yields and every backend integrates."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import DataError
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
+
+RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole intrinsics in pixels; integer (u, v) are pixel centres."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy"):
+            value = float(getattr(self, name))
+            object.__setattr__(self, name, value)
+            if not np.isfinite(value) or (name.startswith("f") and value <= 0):
+                raise DataError(f"intrinsics: {name} = {value:g}; focal lengths must be positive and all values finite")
+
+    @classmethod
+    def from_matrix(cls, K: npt.ArrayLike) -> Intrinsics:
+        """From a 3x3 (or 4x4) camera matrix. Raises DataError where it has skew or another shape."""
+        K = np.asarray(K, dtype=np.float64)
+        if K.shape not in ((3, 3), (4, 4)):
+            raise DataError(f"intrinsics: expected a 3x3 matrix, got shape {K.shape}")
+        if abs(K[0, 1]) > 1e-9 * abs(K[0, 0]):
+            raise DataError(f"intrinsics: skew {K[0, 1]:g} is not supported; undistort the images")
+        return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+
+    @property
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """The 3x3 camera matrix."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def every(self, stride: int) -> Intrinsics:
+        """Intrinsics of the image that keeps pixels 0, stride, 2 stride, ... of each axis."""
+        return Intrinsics(self.fx / stride, self.fy / stride, self.cx / stride, self.cy / stride)
+
+    def resized(self, size: tuple[int, int], to: tuple[int, int]) -> Intrinsics:
+        """Intrinsics after resizing the image from (width, height) `size` to `to`; pixel areas, not centres, align."""
+        sx, sy = to[0] / size[0], to[1] / size[1]
+        return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One observation of the scene, validated where it is made; its arrays are read-only views.
+
+    index       number in the sequence
+    depth       (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid
+    intrinsics  of the depth image
+    T_wc        (4, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV)
+    labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; or
+    scores      (H, W, K) float, non-negative; normalised per pixel where they are used
+    color       (H, W, 3) uint8 RGB, optional
+    mask        (H, W) bool, True where a thing moves that is not to be fused, optional; see `semstab.pixels.exclusion`
+    left_out    (H, W) bool, the pixels that were left out of fusion for what they show, optional
+    timestamp   seconds, optional
+    files       which file each field came from ('depth', 'pose', 'labels', ...); error messages name it
+
+    Raises DataError where shapes disagree, the pose is not rigid or not finite, or a type is wrong.
+    """
+
+    index: int
+    depth: npt.NDArray[np.float32]
+    intrinsics: Intrinsics
+    T_wc: npt.NDArray[np.float64]
+    labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | None = None
+    scores: npt.NDArray[np.floating[Any]] | None = None
+    color: npt.NDArray[np.uint8] | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+    left_out: npt.NDArray[np.bool_] | None = None
+    timestamp: float | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._set("depth", self._checked_depth())
+        self._set("T_wc", self._checked_pose())
+        if (self.labels is None) == (self.scores is None):
+            raise DataError(f"{self.where('labels')}: give labels or scores, one of the two")
+        if self.labels is not None:
+            self._set("labels", self._checked_labels(np.asarray(self.labels)))
+        if self.scores is not None:
+            self._set("scores", self._checked_scores(np.asarray(self.scores)))
+        if self.color is not None:
+            self._set("color", self._checked_color(np.asarray(self.color)))
+        for name in ("mask", "left_out"):
+            if (marked := getattr(self, name)) is not None:
+                self._set(name, self._checked_mask(name, np.asarray(marked)))
+
+    @cached_property
+    def valid(self) -> npt.NDArray[np.bool_]:
+        """(H, W): depth is valid, and the label is not ignored or the scores are finite and sum to more than 0."""
+        if self.labels is not None:
+            from semstab.model.pixel_kernel import mark_valid
+
+            valid = np.empty(self.shape, dtype=np.bool_)
+            mark_valid(flat(self.depth), flat(self.labels), self.ignore_id, valid.reshape(-1))
+        else:
+            valid = (self.depth > 0) & (self.depth < np.inf) & _usable_scores(self.scores)
+        valid.setflags(write=False)
+        return valid
+
+    @cached_property
+    def predicted(self) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+        """(H, W) class ids: the labels, or the class of the largest score (ignored where scores are unusable)."""
+        if self.labels is not None:
+            return self.labels
+        assert self.scores is not None
+        dtype = np.uint8 if self.scores.shape[2] <= IGNORE_8BIT else np.uint16
+        ids: npt.NDArray[Any] = self.scores.argmax(axis=2).astype(dtype)
+        ids[~_usable_scores(self.scores)] = self.ignore_id
+        ids.setflags(write=False)
+        return ids
+
+    @property
+    def ignore_id(self) -> int:
+        """The id of a pixel without a label: 255, or 65535 in 16-bit maps."""
+        if self.labels is not None:
+            return ignore_id(self.labels)
+        assert self.scores is not None
+        return IGNORE_8BIT if self.scores.shape[2] <= IGNORE_8BIT else IGNORE_16BIT
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W) in pixels."""
+        return self.depth.shape[0], self.depth.shape[1]
+
+    @property
+    def left_out_pixels(self) -> int:
+        """How many pixels were left out of fusion for what they show."""
+        return 0 if self.left_out is None else int(np.count_nonzero(self.left_out))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its images, the mask of valid pixels included."""
+        return self.depth.size + sum(image.nbytes for image in self._images.values())
+
+    @property
+    def _images(self) -> dict[str, npt.NDArray[Any]]:
+        """Those that the frame has, by field."""
+        images = {name: getattr(self, name) for name in ("depth", "labels", "scores", "color", "mask", "left_out")}
+        return {name: image for name, image in images.items() if image is not None}
+
+    def every(self, stride: int) -> Frame:
+        """The frame that keeps every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
+        if stride == 1:
+            return self
+        pick = (slice(None, None, stride), slice(None, None, stride))
+        kept: dict[str, Any] = {name: image[pick] for name, image in self._images.items()}
+        return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **kept)
+
+    def where(self, what: str) -> str:
+        """What an error message calls a field: its file where it has one, else the frame and the field."""
+        return self.files.get(what, f"frame {self.index}, {what}")
+
+    def _set(self, name: str, value: npt.NDArray[Any]) -> None:
+        value = value.view()
+        value.setflags(write=False)
+        object.__setattr__(self, name, value)
+
+    def _checked_depth(self) -> npt.NDArray[np.float32]:
+        depth = np.asarray(self.depth)
+        if depth.ndim != 2 or depth.size == 0:
+            raise DataError(f"{self.where('depth')}: depth must be (H, W), got shape {depth.shape}")
+        if not np.issubdtype(depth.dtype, np.floating):
+            raise DataError(
+                f"{self.where('depth')}: depth is {depth.dtype}; convert it to metres (float32) with its depth scale"
+            )
+        return depth.astype(np.float32, copy=False)
+
+    def _checked_pose(self) -> npt.NDArray[np.float64]:
+        where = self.where("pose")
+        T = np.array(self.T_wc, dtype=np.float64)
+        if T.shape != (4, 4):
+            raise DataError(f"{where}: the pose must be a 4x4 matrix, got shape {T.shape}")
+        if not np.isfinite(T).all():
+            raise DataError(f"{where}: the pose is not finite (lost tracking?); leave this frame out")
+        if np.abs(T[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:
+            raise DataError(
+                f"{where}: the last row of the pose is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?"
+            )
+        R = T[:3, :3]
+        if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
+            raise DataError(f"{where}: the rotation is not orthonormal, {_in_line(R)}; does it hold a scale?")
+        if np.linalg.det(R) < 0:
+            raise DataError(f"{where}: the rotation mirrors (determinant -1), {_in_line(R)}; check camera_axes")
+        return T
+
+    def _checked_mask(self, name: str, mask: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+        if mask.dtype != np.bool_:
+            raise DataError(f"{self.where(name)}: the {name} is {mask.dtype}; use bool, True where pixels are left out")
+        self._same_size(name, mask.shape)
+        return mask
+
+    def _checked_labels(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        if labels.dtype not in (np.uint8, np.uint16):
+            raise DataError(
+                f"{self.where('labels')}: labels are {labels.dtype}; use uint8 or uint16 (ignore 255 or 65535)"
+            )
+        self._same_size("labels", labels.shape)
+        return labels
+
+    def _checked_scores(self, scores: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        where = self.where("scores")
+        if scores.ndim != 3 or not np.issubdtype(scores.dtype, np.floating):
+            raise DataError(f"{where}: scores must be float (H, W, K), got {scores.dtype} of shape {scores.shape}")
+        self._same_size("scores", scores.shape[:2])
+        if scores.shape[2] < 2:
+            raise DataError(f"{where}: scores hold {scores.shape[2]} class; at least 2 are needed")
+        if scores.min(initial=0.0, where=np.isfinite(scores)) < 0:
+            raise DataError(f"{where}: scores are negative (logits?); apply a softmax first")
+        return scores
+
+    def _checked_color(self, color: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
+            raise DataError(
+                f"{self.where('color')}: colour must be uint8 (H, W, 3), got {color.dtype} of shape {color.shape}"
+            )
+        return color
+
+    def _same_size(self, name: str, shape: tuple[int, ...]) -> None:
+        H, W = self.shape
+        if shape != (H, W):
+            size = "x".join(str(n) for n in shape[::-1])
+            raise DataError(f"{self.where(name)}: {name} are {size} but depth is {W}x{H}; bring them to one size")
+
+
+def _in_line(matrix: npt.NDArray[np.float64]) -> str:
+    """A matrix in one line, as an error message shows it."""
+    return "[" + "; ".join(" ".join(f"{value:.4g}" for value in row) for row in matrix) + "]"
+
+
+def _usable_scores(scores: npt.NDArray[Any] | None) -> npt.NDArray[np.bool_]:
+    assert scores is not None
+    total = scores.sum(axis=2, dtype=np.float64)
+    usable: npt.NDArray[np.bool_] = np.isfinite(total) & (total > 0)
+    return usable

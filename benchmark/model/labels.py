@@ -1,0 +1,312 @@
+"""Label spaces (taxonomies) and the mapping between two of them, by class name."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.resources
+import reprlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from semstab.errors import ConfigError, DataError
+from semstab.runtime.files import MAX_YAML_BYTES, parse_yaml, read_limited, write_text
+
+IGNORE_8BIT = 255
+IGNORE_16BIT = 65535
+LEFT_OUT = -1
+"""The row of a name that a label space ignores."""
+UNKNOWN = -1
+"""In a mapping's table: an id that the source label space does not have."""
+
+# Paul Tol's 'bright' and 'muted' schemes: distinguishable with any colour vision.
+PALETTE = (
+    (68, 119, 170), (238, 102, 119), (34, 136, 51), (204, 187, 68), (102, 204, 238), (170, 51, 119), (187, 187, 187),
+    (51, 34, 136), (136, 204, 238), (68, 170, 153), (17, 119, 51), (153, 153, 51), (221, 204, 119), (204, 102, 119),
+    (136, 34, 85), (170, 68, 153),
+)  # fmt: skip
+
+Color = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class LabelSpace:
+    """The classes of a label map: ids, names and colours, without the ignore id.
+
+    name     of the taxonomy
+    classes  K >= 2 distinct names; evidence vectors follow their order
+    ids      the id of each class in label maps; 0..K-1 unless given
+    colors   RGB of each class
+    members  for each class, names of other taxonomies that fall into it
+    ignored  names of other taxonomies that are left out
+
+    Raises ConfigError where these contradict each other.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    ids: tuple[int, ...] = ()
+    colors: tuple[Color, ...] = ()
+    members: tuple[tuple[str, ...], ...] = ()
+    ignored: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        K = len(self.classes)
+        if K < 2:
+            raise ConfigError(f"taxonomy {self.name}: {K} class; stability needs at least 2 (entropy divides by log K)")
+        object.__setattr__(self, "ids", self.ids or tuple(range(K)))
+        object.__setattr__(self, "colors", self.colors or tuple(PALETTE[k % len(PALETTE)] for k in range(K)))
+        object.__setattr__(self, "members", self.members or ((),) * K)
+        for what in ("ids", "colors", "members"):
+            if len(getattr(self, what)) != K:
+                raise ConfigError(f"taxonomy {self.name}: {len(getattr(self, what))} {what} for {K} classes")
+        if len(set(self.ids)) != K or min(self.ids) < 0 or max(self.ids) >= IGNORE_16BIT:
+            raise ConfigError(
+                f"taxonomy {self.name}: ids must be distinct, 0 to {IGNORE_16BIT - 1}, got {list(self.ids)}"
+            )
+        if IGNORE_8BIT in self.ids and max(self.ids) == IGNORE_8BIT:
+            raise ConfigError(f"taxonomy {self.name}: id 255 means 'ignore'; give the class another id")
+        names = [name_key(name) for name in (*self.classes, *(m for ms in self.members for m in ms), *self.ignored)]
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ConfigError(f"taxonomy {self.name}: '{repeated[0]}' is named twice")
+
+    def __len__(self) -> int:
+        return len(self.classes)
+
+    @classmethod
+    def load(cls, name_or_path: str | Path) -> LabelSpace:
+        """A taxonomy that ships with semstab, by name (`uavid7`), or from a YAML file.
+
+        Raises ConfigError where there is no such taxonomy or the file is not one.
+        """
+        text, where = _taxonomy_text(str(name_or_path))
+        return cls.from_dict(parse_yaml(text, where), where)
+
+    @classmethod
+    def from_dict(cls, content: Any, where: str = "taxonomy") -> LabelSpace:
+        """From the content of a taxonomy file: name, classes (names, or name, id, color, members), ignored."""
+        if not isinstance(content, dict) or not isinstance(content.get("classes"), list):
+            raise ConfigError(f"{where}: a taxonomy needs a list 'classes'")
+        known = ("name", "classes", "ignored")
+        if unknown := [key for key in content if key not in known]:
+            raise ConfigError(f"{where}: unknown key {reprlib.repr(unknown[0])}; known: {', '.join(known)}")
+        entries = [entry if isinstance(entry, dict) else {"name": entry} for entry in content["classes"]]
+        for entry in entries:
+            if not isinstance(entry.get("name"), str) or set(entry) - {"name", "id", "color", "members"}:
+                got = reprlib.repr(entry)
+                raise ConfigError(f"{where}: a class needs a name, and may have id, color, members; got {got}")
+        return cls(
+            name=str(content.get("name", Path(where).stem)),
+            classes=tuple(entry["name"] for entry in entries),
+            ids=_ids(entries, where),
+            colors=tuple(
+                _color(entry.get("color", PALETTE[k % len(PALETTE)]), where) for k, entry in enumerate(entries)
+            ),
+            members=tuple(_names(entry.get("members", []), where) for entry in entries),
+            ignored=_names(content.get("ignored", []), where),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of a taxonomy file; `from_dict` reads it back."""
+        rows = zip(self.classes, self.ids, self.colors, self.members, strict=True)
+        classes = [{"name": n, "id": i, "color": list(c), "members": list(m)} for n, i, c, m in rows]
+        return {"name": self.name, "classes": classes, "ignored": list(self.ignored)}
+
+    @property
+    def row_of(self) -> dict[str, int]:
+        """By `name_key` of its classes and their members the row of the class; LEFT_OUT of what it ignores."""
+        rows = {name_key(name): LEFT_OUT for name in self.ignored}
+        for row, (name, members) in enumerate(zip(self.classes, self.members, strict=True)):
+            rows |= {name_key(key): row for key in (name, *members)}
+        return rows
+
+    def save(self, path: str | Path) -> None:
+        """Write a taxonomy file."""
+        write_text(path, yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True))
+
+    def mapping_to(self, target: LabelSpace) -> LabelMapping:
+        """Map each class of this space to the class of `target` with its name, or among whose members it is.
+
+        Raises ConfigError, naming them, where classes are mapped nowhere and are not listed as ignored.
+        """
+        known = target.row_of
+        if lost := [name for name in self.classes if name_key(name) not in known]:
+            raise ConfigError(
+                f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {self.name};"
+                " add the name to a class's members, or to ignored"
+            )
+        rows = (known[name_key(name)] for name in self.classes)
+        return LabelMapping(self, target, tuple(None if row == LEFT_OUT else row for row in rows))
+
+
+@dataclass(frozen=True)
+class LabelMapping:
+    """From the ids of one label space to rows 0..K-1 of another; `rows` has None where a class is ignored."""
+
+    source: LabelSpace
+    target: LabelSpace
+    rows: tuple[int | None, ...]
+
+    def __post_init__(self) -> None:
+        if all(row is None for row in self.rows):
+            raise ConfigError(
+                f"taxonomy {self.target.name}: every class of {self.source.name} is ignored; nothing is left"
+            )
+
+    def named(self, names: Iterable[str]) -> tuple[int, ...]:
+        """Positions of the source classes that have one of these names, or become a class that has."""
+        wanted = {name_key(name) for name in names}
+        rows = {row for row, name in enumerate(self.target.classes) if name_key(name) in wanted}
+        pairs = zip(self.source.classes, self.rows, strict=True)
+        return tuple(k for k, (name, row) in enumerate(pairs) if name_key(name) in wanted or row in rows)
+
+    def labels(
+        self, labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], where: str
+    ) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+        """Map a label map of any shape; the ignore id stays one.
+
+        Raises DataError with `where` (the file) for an id that the source space does not have.
+        """
+        if self._keeps(labels):
+            return labels
+        table = self._table(labels.dtype.itemsize)
+        unknown = (table == UNKNOWN) & _present(labels)
+        if unknown.any():
+            ids = np.flatnonzero(unknown)
+            listed = ", ".join(str(i) for i in ids[:5]) + (", ..." if ids.size > 5 else "")
+            raise DataError(
+                f"{where}: label id {listed} ({np.count_nonzero(unknown[labels])} pixels) is outside the taxonomy"
+                f" {self.source.name} ({len(self.source)} classes,"
+                f" ids {min(self.source.ids)} to {max(self.source.ids)})"
+            )
+        return _look_up(table.astype(np.uint8 if len(self.target) <= IGNORE_8BIT else np.uint16), labels)
+
+    def _keeps(self, labels: npt.NDArray[Any]) -> bool:
+        """Whether the map stays as it is: 8-bit ids that are the rows already, and none but those and the ignore id."""
+        from semstab.model.pixel_kernel import has_other
+
+        K = len(self.target)
+        same = self.source.ids == self.rows == tuple(range(K)) and labels.dtype == np.uint8 and K < IGNORE_8BIT
+        return same and not has_other(flat(labels), K, IGNORE_8BIT)
+
+    def scores(self, scores: npt.NDArray[np.floating[Any]], where: str) -> npt.NDArray[np.floating[Any]]:
+        """Map soft scores (H, W, K of the source): classes that fall together are summed, ignored ones dropped.
+
+        Where an ignored class has the largest score, as where a label map has its id, all scores are 0: ignored.
+        Raises DataError where the number of classes differs from the source space's.
+        """
+        if scores.shape[2] != len(self.source):
+            raise DataError(
+                f"{where}: scores hold {scores.shape[2]} classes, {self.source.name} has {len(self.source)}"
+            )
+        if self.rows == tuple(range(len(self.target))):
+            return scores
+        mapped = np.zeros((*scores.shape[:2], len(self.target)), dtype=np.result_type(scores.dtype, np.float32))
+        for k, row in enumerate(self.rows):
+            if row is not None:
+                mapped[..., row] += scores[..., k]
+        ignored = np.array([row is None for row in self.rows])
+        if ignored.any():
+            mapped[ignored[scores.argmax(axis=2)]] = 0
+        return mapped
+
+    def _table(self, itemsize: int) -> npt.NDArray[np.int32]:
+        """Target row for each id a map can hold; the target's ignore id for ignored ones, UNKNOWN for the rest."""
+        ignore = IGNORE_8BIT if len(self.target) <= IGNORE_8BIT else IGNORE_16BIT
+        table = np.full(1 << (8 * itemsize), UNKNOWN, dtype=np.int32)
+        for class_id, row in zip(self.source.ids, self.rows, strict=True):
+            if class_id < len(table):
+                table[class_id] = ignore if row is None else row
+        table[-1] = ignore
+        if itemsize == 2 and max(self.source.ids) < IGNORE_8BIT:
+            table[IGNORE_8BIT] = ignore  # no class can have this id: an 8-bit map saved with 16 bits
+        return table
+
+
+def shipped_taxonomies() -> tuple[str, ...]:
+    """Names of the taxonomies that ship with semstab."""
+    folder = importlib.resources.files("semstab.configs") / "taxonomies"
+    return tuple(sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml")))
+
+
+def ignore_id(labels: npt.NDArray[Any]) -> int:
+    """The id of a pixel without a label in a map of that type: 255, or 65535 in 16-bit maps."""
+    return IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
+
+
+def fixed(array: Any) -> Any:
+    """The array contiguous and read-only, so that numba compiles one version for all."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
+def flat(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The image's values (n,), fixed."""
+    values: npt.NDArray[Any] = fixed(image).reshape(-1)
+    return values
+
+
+def _present(labels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """For each id that the type can hold, whether the map has it."""
+    if labels.dtype == np.uint8 and labels.ndim == 2 and labels.size:
+        import cv2
+
+        return cv2.calcHist([labels], [0], None, [256], [0, 256]).ravel() > 0  # eight times as fast as np.bincount
+    present = np.zeros(1 << (8 * labels.dtype.itemsize), dtype=np.bool_)
+    present[labels] = True
+    return present
+
+
+def _look_up(table: npt.NDArray[Any], labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """table[labels]."""
+    if labels.dtype == np.uint8 and labels.ndim == 2 and labels.size:
+        import cv2
+
+        return np.asarray(cv2.LUT(labels, table))  # ten times as fast as indexing
+    mapped: npt.NDArray[Any] = table[labels]
+    return mapped
+
+
+def _taxonomy_text(name: str) -> tuple[str, str]:
+    if name in shipped_taxonomies():
+        resource = importlib.resources.files("semstab.configs") / "taxonomies" / f"{name}.yaml"
+        return resource.read_text(encoding="utf-8"), f"{name}.yaml"
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        near = difflib.get_close_matches(name, shipped_taxonomies(), n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(shipped_taxonomies())}, or a .yaml file"
+        raise ConfigError(f"taxonomy '{name}' is not known; {hint}")
+    try:
+        return read_limited(path, MAX_YAML_BYTES).decode("utf-8"), str(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: the taxonomy cannot be read ({error})") from error
+
+
+def name_key(name: str) -> str:
+    """Names compare without case, surrounding space, and the choice between space, '_' and '-'."""
+    return " ".join(name.replace("_", " ").replace("-", " ").lower().split())
+
+
+def _ids(entries: list[dict[str, Any]], where: str) -> tuple[int, ...]:
+    ids = [entry.get("id", k) for k, entry in enumerate(entries)]
+    if not all(isinstance(i, int) and not isinstance(i, bool) for i in ids):
+        raise ConfigError(f"{where}: class ids must be whole numbers, got {reprlib.repr(ids)}")
+    return tuple(ids)
+
+
+def _color(value: Any, where: str) -> Color:
+    if isinstance(value, list | tuple) and len(value) == 3 and all(isinstance(c, int) and 0 <= c <= 255 for c in value):
+        return (value[0], value[1], value[2])
+    raise ConfigError(f"{where}: a colour is three whole numbers from 0 to 255, got {reprlib.repr(value)}")
+
+
+def _names(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise ConfigError(f"{where}: members and ignored are lists of names, got {reprlib.repr(value)}")
+    return tuple(value)

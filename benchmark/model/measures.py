@@ -1,0 +1,225 @@
+"""What is measured of a voxel: each measure declared once, its formula with its name, its digits, which way is good.
+
+Summaries, comparisons, tables, figures, Parquet, the terminal and the recording take all of it from here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import ConfigError
+from semstab.model.information import entropy_bits, normalise
+from semstab.runtime.json_form import fields_of
+
+Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
+
+
+class Beliefs(Protocol):
+    """What a measure is a function of, for n voxels: a VoxelTable has it, a growing map, and other rules of fusion."""
+
+    @property
+    def op(self) -> Int32:
+        """(n,) the number of frames that saw the voxel."""
+
+    @property
+    def evidence(self) -> Float64:
+        """(n, K) evidence of each class, up to a factor."""
+
+    @property
+    def drift_sum(self) -> Float64:
+        """(n,) sum over t >= 2 of D_JS(p^(t), p^(t-1)), bits."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Quantity:
+    """A number that is reported.
+
+    key      of its columns and JSON entries
+    title    in print; `short` where there is little room, `unit` where it has one
+    better   which way is good
+    digits   decimals where a map is summarised, and where maps are compared
+    needs    what it is computed from: the voxel table, the log of events as well, or the ground truth as well
+    section  of the paper, where it defines it
+    """
+
+    key: str
+    title: str
+    better: Literal["higher", "lower"]
+    digits: tuple[int, int] = (3, 4)
+    unit: str = ""
+    needs: Literal["table", "events", "truth"] = "table"
+    section: str = ""
+    short: str = ""
+
+    @property
+    def word(self) -> str:
+        """The title within a sentence: 'VSS', 'entropy'."""
+        return self.title if self.title.isupper() else f"{self.title[0].lower()}{self.title[1:]}"
+
+    @property
+    def symbol(self) -> str:
+        """The title where there is little room."""
+        return self.short or self.word
+
+    @property
+    def sign(self) -> float:
+        """Values times this sort the best first."""
+        return 1.0 if self.better == "lower" else -1.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measure(Quantity):
+    """A number of each voxel, from 0 to `largest`.
+
+    of         computes it: (n,), NaN where undefined
+    lowest_op  from which OP on it is defined
+    range      of its colours, in which maps differ; values beyond look like the ends
+    """
+
+    of: Callable[[Beliefs], Float64]
+    range: tuple[float, float]
+    lowest_op: int = 1
+    largest: float = 1.0
+
+
+# --- Formulas ---------------------------------------------------------------------------------------------------------
+
+
+def vss(table: Beliefs) -> Float64:
+    """Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
+    concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
+    return concentration
+
+
+def sbd(table: Beliefs) -> Float64:
+    """Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1]; NaN where OP < 2."""
+    return mean_drift(table.drift_sum, table.op)
+
+
+def mean_drift(drift_sum: Float64, op: Int32) -> Float64:
+    """SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
+    drift = np.full(len(op), np.nan)
+    again = op >= 2
+    drift[again] = drift_sum[again] / (op[again] - 1)
+    return drift
+
+
+def op(table: Beliefs) -> Int32:
+    """Observation Persistence (n,): the number of frames that observed the voxel."""
+    return table.op
+
+
+def entropy(table: Beliefs) -> Float64:
+    """Normalised entropy (n,): -sum_k p_k log p_k / log K, in [0, 1]; report it together with K."""
+    normalised: Float64 = entropy_bits(normalise(table.evidence)) / math.log2(table.evidence.shape[1])
+    return normalised
+
+
+def margin(table: Beliefs) -> Float64:
+    """How far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
+    second, first = np.partition(normalise(table.evidence), -2, axis=1)[:, -2:].T
+    lead: Float64 = first - second
+    return lead
+
+
+def dominant(table: Beliefs) -> npt.NDArray[np.int64]:
+    """Dominant class (n,): argmax_k e_k, the lowest on ties."""
+    label: npt.NDArray[np.int64] = table.evidence.argmax(axis=1)
+    return label
+
+
+# --- The register -----------------------------------------------------------------------------------------------------
+
+SBD_MAX = 1.5 - 0.75 * math.log2(3)
+"""The largest SBD there is, 0.311 bits: a voxel's second frame sees a class that its first one did not see at all."""
+
+_SECTION = "Voxel-Level Stability Metrics"
+
+VSS = Measure(key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), section=_SECTION)
+SBD = Measure(
+    key="sbd", title="SBD", unit="bits", better="lower", digits=(4, 4), of=sbd, range=(0.0, SBD_MAX), largest=SBD_MAX,
+    lowest_op=2, section=_SECTION,
+)  # fmt: skip
+ENTROPY = Measure(
+    key="entropy", title="Entropy", short="H", better="lower", digits=(4, 4), of=entropy, range=(0.0, 0.5),
+    section=_SECTION,
+)  # fmt: skip
+MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0))
+
+_REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
+
+
+def measures() -> tuple[Measure, ...]:
+    """Those of every summary, in the order of the paper's tables."""
+    return tuple(_REGISTER.values())
+
+
+def register(measure: Measure) -> None:
+    """Add a measure to every summary from now on. Raises ConfigError where its key is taken."""
+    if measure.key in _REGISTER:
+        raise ConfigError(f"there is a measure '{measure.key}' already; choose another key")
+    _REGISTER[measure.key] = measure
+
+
+@contextmanager
+def registered(measure: Measure) -> Iterator[None]:
+    """Add a measure while the block lasts."""
+    register(measure)
+    try:
+        yield
+    finally:
+        del _REGISTER[measure.key]
+
+
+# --- Means ------------------------------------------------------------------------------------------------------------
+
+
+def mean(values: npt.NDArray[Any]) -> float:
+    """The mean of the values that are defined; NaN where none is."""
+    defined = values[~np.isnan(values)]
+    return float(defined.mean()) if defined.size else math.nan
+
+
+@dataclass(frozen=True)
+class MeasureMeans:
+    """The mean of every measure over a group of voxels, by its key; NaN where undefined.
+
+    voxels has, for the measures that do not exist at every OP, over how many the mean runs. In JSON these are entries
+    KEY and KEY_voxels of what the means belong to.
+    """
+
+    value: Mapping[str, float]
+    voxels: Mapping[str, int]
+
+    @classmethod
+    def over(cls, values: Mapping[Measure, Float64], op: Int32, where: npt.NDArray[np.bool_]) -> MeasureMeans:
+        """Of values (n,) of each measure over the voxels for which `where` (n,) holds."""
+        rare = {m.key: int(np.count_nonzero(where & (op >= m.lowest_op))) for m in values if m.lowest_op > 1}
+        return cls({measure.key: mean(value[where]) for measure, value in values.items()}, rare)
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.value[measure.key]
+
+    def of_all(self) -> list[float]:
+        """The mean of every measure, in their order."""
+        return [self[measure] for measure in measures()]
+
+    def json_content(self) -> dict[str, float]:
+        """Entries by key."""
+        return {**self.value, **{f"{key}_voxels": n for key, n in self.voxels.items()}}
+
+    @classmethod
+    def of_json_content(cls, content: Any) -> MeasureMeans:
+        """The entries of all measures."""
+        rare = [measure.key for measure in measures() if measure.lowest_op > 1]
+        counts = fields_of(content, {f"{key}_voxels": int for key in rare})
+        value = fields_of(content, {measure.key: float for measure in measures()})
+        return cls(value, {key: counts[f"{key}_voxels"] for key in rare})

@@ -1,0 +1,215 @@
+"""What a run or a study found: one record a unit, and the voxel tables behind the units at its base settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from semstab.config import BACKENDS, BASE
+from semstab.model.comparison import BackboneComparison
+from semstab.model.results import Agreement, Unit, UnitSummary
+from semstab.model.statistics import MapStatistics
+from semstab.model.voxels import VoxelTable
+from semstab.runtime.json_form import INLINE
+
+UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
+"""Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
+the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
+SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
+where the dataset has it, color (H, W, 3)."""
+
+REGIONS = "region_maps"
+"""Not a sweep: the label sources that hold regions without classes."""
+
+
+@dataclass(frozen=True, order=True)
+class Variation:
+    """One point of one sweep, in one repeat: what differs from the base settings.
+
+    sweep   'base', 'shared_taxonomy', 'backends', or what is swept: 'voxel_size' (metres), 'pixel_stride',
+            'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
+            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise)
+    value   of it; None for 'base', 'shared_taxonomy' and 'backends'
+    repeat  counts the repeats of a random variation from 0; each has a seed of its own
+    """
+
+    sweep: str = BASE
+    value: float | None = None
+    repeat: int = 0
+
+
+@dataclass(frozen=True)
+class ImageSpace:
+    """Stability in image coordinates, over the sampled frames of a unit; NaN where it is not defined.
+
+    flicker_percent              pixels valid in both of two consecutive frames whose label differs
+    compensated_flicker_percent  the same after the previous map is warped by depth and pose, occluded pixels left out
+    compensated_share            co-visible share: pixels that the warped map reaches, of the valid ones, 0 to 1
+    vc8, vc16                    video consistency over clips of 8 and 16 frames, 0 to 1: of the pixels whose ground
+                                 truth stays the same, those whose prediction does; NaN without ground truth
+    self_vc8, self_vc16          the same of all pixels that are valid in each frame of a clip, without ground truth
+    """
+
+    flicker_percent: float = math.nan
+    compensated_flicker_percent: float = math.nan
+    compensated_share: float = math.nan
+    vc8: float = math.nan
+    vc16: float = math.nan
+    self_vc8: float = math.nan
+    self_vc16: float = math.nan
+
+
+@dataclass(frozen=True)
+class Record:
+    """One finished unit.
+
+    key         hash of its inputs and settings, under which it is kept
+    summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
+                what `semstab.statistics` says of the map
+    image_space of the 'base' units; all NaN elsewhere
+    voxels_file file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and without a folder
+    truth_file  file of the ground truth's voxels of the same frames, where the statistics fused it
+    """
+
+    key: str
+    variation: Variation
+    summary: UnitSummary = field(metadata=INLINE)
+    image_space: ImageSpace = ImageSpace()
+    voxels_file: Path | None = None
+    truth_file: Path | None = None
+
+    @property
+    def statistics(self) -> MapStatistics | None:
+        """What `semstab.statistics` says of the map."""
+        return self.summary.statistics
+
+    @property
+    def unit(self) -> Unit:
+        """Its scene, backbone and backend."""
+        return self.summary.unit
+
+    def table(self) -> VoxelTable:
+        """Its voxels, read from their file."""
+        if self.voxels_file is None:
+            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
+        return VoxelTable.load(self.voxels_file)
+
+    @property
+    def series(self) -> Path | None:
+        """File of its time series, beside that of its voxels."""
+        return None if self.voxels_file is None else self.voxels_file.parent.parent / "frames" / f"{self.unit.slug}.csv"
+
+
+@dataclass(frozen=True)
+class RegionFlicker:
+    """Flicker of a label source that holds regions without classes, by matched regions; it is not fused.
+
+    The percentages are means over pairs of sampled frames, see `semstab.metrics.matched_region_flicker`; compensated:
+    after the previous map is warped by depth and pose. compensated_share is that of `ImageSpace`.
+    """
+
+    scene: str
+    backbone: str
+    flicker_percent: float
+    compensated_flicker_percent: float
+    compensated_share: float
+
+
+@dataclass(frozen=True)
+class UnitContent:
+    """What the file of a finished unit holds, from which its record comes.
+
+    input    digest of its input
+    up       the scene's up axis, where it is known or could be estimated
+    files    digests of the unit's other files, by their path in the folder
+    regions  of a source of regions, instead of a summary
+    """
+
+    input: str
+    summary: UnitSummary | None = None
+    image_space: ImageSpace | None = None
+    up: tuple[float, float, float] | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    regions: RegionFlicker | None = None
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A unit that could not be computed, and the one line that says why."""
+
+    unit: Unit = field(metadata=INLINE)
+    variation: Variation
+    message: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """All that a run or a study found; tables, figures, report and terminal are made from it.
+
+    backend    the base backend: that of every unit but those of the 'backends' variation
+    records    in the order of the plan
+    agreement  of each pair of backends that must agree, on each scene and backbone that both fused
+    up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
+    regions    flicker of the label sources that are regions without classes
+    comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
+    """
+
+    name: str
+    backend: str
+    records: tuple[Record, ...]
+    failures: tuple[Failure, ...] = ()
+    agreement: tuple[Agreement, ...] = ()
+    up: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+    regions: tuple[RegionFlicker, ...] = ()
+    comparisons: tuple[BackboneComparison, ...] = ()
+
+    def select(
+        self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None
+    ) -> tuple[Record, ...]:
+        """The records of a sweep, of one scene, one backbone, one value where given."""
+        return tuple(
+            record
+            for record in self.records
+            if record.variation.sweep == sweep
+            and scene in (None, record.unit.scene)
+            and backbone in (None, record.unit.backbone)
+            and value in (None, record.variation.value)
+        )
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes of the base units, in order."""
+        return _distinct([record.unit.scene for record in self.select()])
+
+    @property
+    def backbones(self) -> tuple[str, ...]:
+        """Names of the backbones of the base units, in order."""
+        return _distinct([record.unit.backbone for record in self.select()])
+
+    def sweeps(self) -> dict[str, tuple[float, ...]]:
+        """The swept values, ascending, of each sweep that has values."""
+        found: dict[str, set[float]] = {}
+        for record in self.records:
+            if record.variation.value is not None:
+                found.setdefault(record.variation.sweep, set()).add(record.variation.value)
+        return {sweep: tuple(sorted(values)) for sweep, values in found.items()}
+
+    @property
+    def runs(self) -> tuple[UnitSummary, ...]:
+        """The summaries of the units at the base settings by every backend, a scene and backbone after the other."""
+        units = (*self.select(), *self.select(BACKENDS))
+        groups = dict.fromkeys((record.unit.scene, record.unit.backbone) for record in units)
+        return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.backbone) == group)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether backends that must agree do so everywhere."""
+        return all(row.agrees for row in self.agreement)
+
+
+def _distinct(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))

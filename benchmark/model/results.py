@@ -1,0 +1,167 @@
+"""What a run reports: the report of one fused frame, the summary of one unit, the agreement of two backends."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from semstab.model.measures import Measure, MeasureMeans
+from semstab.model.statistics import MapStatistics
+from semstab.runtime.json_form import INLINE
+
+SCHEMA = 2
+"""Version of summary.json."""
+
+STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
+"""Where a frame's time goes: decoding in a worker thread, beside the rest; waiting for it; flicker; the two parts of
+fusion, where the backend tells them apart; telling the observers."""
+
+RECURRENT = 3
+"""A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One cell of a run: a backbone's labels on a scene, fused by a backend."""
+
+    scene: str
+    backbone: str
+    backend: str
+
+    @property
+    def slug(self) -> str:
+        """SCENE__BACKBONE__BACKEND, usable as a file name."""
+        return slug(self.scene, self.backbone, self.backend)
+
+
+def slug(*names: str) -> str:
+    """Names joined to a file name: what is not a letter, digit, '.', '_' or '-' becomes '-'."""
+    return "__".join(re.sub(r"[^\w.-]+", "-", name) for name in names)
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What fusing one frame did. The map's means are those after the frame; NaN where a backend does not keep them.
+
+    frame            the frame's index
+    points           valid pixels ('sampled points')
+    voxels           voxels the frame touched ('observations')
+    new_voxels       of them, voxels seen for the first time
+    drift_sum        sum over the other ones of D_JS(p^(t), p^(t-1)), bits
+    seconds          wall-clock time of integrate
+    map_voxels       voxels in the map
+    map_vss          mean VSS over them
+    map_entropy      mean normalised entropy over them
+    map_recurrent    share of them with OP >= 3
+
+    Of `seconds`, where a backend tells them apart, association_seconds go from pixels to voxels with their evidence,
+    update_seconds into the map.
+    """
+
+    frame: int
+    points: int
+    voxels: int
+    new_voxels: int
+    drift_sum: float
+    seconds: float
+    map_voxels: int
+    map_vss: float = math.nan
+    map_entropy: float = math.nan
+    map_recurrent: float = math.nan
+    association_seconds: float = math.nan
+    update_seconds: float = math.nan
+
+    @property
+    def drift(self) -> float:
+        """Mean drift of the frame's updates, bits a re-observed voxel; NaN where it met none."""
+        updated = self.voxels - self.new_voxels
+        return self.drift_sum / updated if updated else math.nan
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means over a group of voxels: a stratum, a class, the recurrent ones; `means[VSS]` is that of a measure.
+
+    share is the group's part of all voxels, 0 to 1.
+    """
+
+    name: str
+    share: float
+    voxels: int
+    means: MeasureMeans = field(metadata=INLINE)
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means[measure]
+
+    def defined(self, measure: Measure) -> int:
+        """The voxels over which the measure's mean runs."""
+        return self.means.voxels.get(measure.key, self.voxels)
+
+
+@dataclass(frozen=True)
+class TableSummary:
+    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
+
+    `summary[VSS]` is the mean of a measure over all voxels where it is defined.
+    """
+
+    K: int
+    voxel_size: float
+    points: int
+    observations: int
+    voxels: int
+    mean_op: float
+    means: MeasureMeans = field(metadata=INLINE)
+    strata: tuple[Means, ...]
+    recurrent: Means
+    classes: tuple[Means, ...]
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means[measure]
+
+
+@dataclass(frozen=True)
+class UnitSummary:
+    """One entry of 'runs' in summary.json.
+
+    stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
+    fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose; statistics is
+    what `semstab.statistics.describe` says of the map, None where nothing was asked for.
+    """
+
+    unit: Unit = field(metadata=INLINE)
+    taxonomy: str
+    frames: int
+    table: TableSummary = field(metadata=INLINE)
+    flicker_percent: float
+    fuse_ms_per_frame: float
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
+    left_out: int = 0
+    frames_left_out: int = 0
+    statistics: MapStatistics | None = None
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Largest and mean absolute difference of one quantity over the voxels that two tables share."""
+
+    max: float
+    mean: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
+
+    differences  of OP, of every measure and of the evidence, by their keys
+    """
+
+    scene: str
+    backbone: str
+    backends: tuple[str, str]
+    voxels: tuple[int, int]
+    only_in: tuple[int, int]
+    differences: Mapping[str, Deviation]
+    agrees: bool

@@ -1,0 +1,263 @@
+"""What `semstab.statistics` says of a map; in JSON as the fields say.
+
+Undefined numbers are NaN; a section that could not be computed is None.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from semstab.model.measures import Measure, MeasureMeans
+from semstab.runtime.json_form import INLINE
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % confidence interval; NaN where undefined."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def percent(self) -> Estimate:
+        """Of a share, in percent."""
+        return Estimate(100 * self.value, 100 * self.low, 100 * self.high)
+
+
+UNDEFINED = Estimate(math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class StabilityVerdict:
+    """What the evidence says of a backbone on a scene: a key of ADVICE, and the line that gives the reason."""
+
+    level: str
+    line: str
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """The voxels with OP >= 2: how many they are, and of all voxels."""
+
+    voxels: int
+    share: float
+
+
+@dataclass(frozen=True)
+class BlockCut:
+    """Into how many occupied blocks the voxels with OP >= 2 were cut, and their edge in metres."""
+
+    count: int
+    size: float
+
+
+@dataclass(frozen=True)
+class ClassAgreement:
+    """Agreement on one class against all others, over the voxels with OP >= 2; NaN where undefined.
+
+    observations is the evidence for the class in these voxels, in frames.
+    """
+
+    name: str
+    observations: float
+    kappa: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class FrameAgreement:
+    """Do frames agree about a place? Over the voxels with OP >= 2."""
+
+    psa: Estimate
+    kappa: Estimate
+    alpha: Estimate
+    vss: Estimate
+    classes: tuple[ClassAgreement, ...]
+
+
+@dataclass(frozen=True)
+class DriftTests:
+    """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
+
+    trend_excess  the trend less that in random order
+    """
+
+    sbd_p: float
+    trend: float
+    trend_null: float
+    trend_excess: Estimate
+    trend_p: float
+    tested_voxels: int
+    unusual_sbd_voxels: int
+    drifting_voxels: int
+
+
+@dataclass(frozen=True)
+class FlipRates:
+    """Share of the steps at which the predicted class changes, that in random order; frames since the last change."""
+
+    rate: Estimate
+    null: Estimate
+    excess: Estimate
+    frames_since: Estimate
+
+
+@dataclass(frozen=True)
+class DriftStatistics:
+    """SBD in bits beside that of the same observations in random order, over the `voxels` where that is known."""
+
+    voxels: int
+    sbd: Estimate
+    null: Estimate
+    excess: Estimate
+    tests: DriftTests | None = None
+    flips: FlipRates | None = None
+
+
+@dataclass(frozen=True)
+class EntropyParts:
+    """Mean entropy of the belief, and of that what is there within each frame and between them."""
+
+    entropy: Estimate
+    within: Estimate
+    between: Estimate
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The pairwise disagreement 1 - PSA over voxels with OP >= 2 in both maps, and whose it is.
+
+    share is geometry's part of the total. Negative parts of the model mean that its labels agree better than the
+    view-independent ones: it errs alike in all views.
+    """
+
+    voxels: int
+    total: Estimate
+    geometry: Estimate
+    model: Estimate
+    share: Estimate
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """One bin of the reliability diagram: voxels whose largest belief lies in (low, high]."""
+
+    low: float
+    high: float
+    voxels: int
+    confidence: float
+    accuracy: float
+
+
+@dataclass(frozen=True)
+class Correctness:
+    """How right the fused labels of a group of voxels are; NaN where no voxel has a true class.
+
+    miou   mean over the classes that are true or predicted somewhere, of intersection over union
+    ece    expected calibration error: mean |accuracy - confidence| over 15 bins of the largest belief, by voxels
+    brier  mean over voxels of sum_k (p_k - y_k)^2, 0 to 2
+    """
+
+    name: str
+    voxels: int
+    accuracy: float
+    miou: float
+    ece: float
+    brier: float
+
+
+@dataclass(frozen=True)
+class Quadrants:
+    """Shares of the voxels with OP >= 3 and a true class that are stable or not, right or wrong.
+
+    wrong_of_stable is the share of the stable voxels that are wrong: what to expect where the map looks safe.
+    """
+
+    voxels: int
+    stable_right: Estimate
+    stable_wrong: Estimate
+    unstable_right: Estimate
+    unstable_wrong: Estimate
+    wrong_of_stable: Estimate
+
+
+@dataclass(frozen=True)
+class CorrectnessStatistics:
+    """Right beside stable; strata has all voxels with a true class first, then each stratum of OP."""
+
+    accuracy: Estimate
+    strata: tuple[Correctness, ...]
+    reliability: tuple[Reliability, ...]
+    quadrants: Quadrants
+
+
+@dataclass(frozen=True)
+class RuleMeans:
+    """Means over the voxels with OP >= 2 under a rule of fusion; how right it is where ground truth tells, else NaN."""
+
+    means: MeasureMeans = field(metadata=INLINE)
+    accuracy: float = math.nan
+    miou: float = math.nan
+    ece: float = math.nan
+    brier: float = math.nan
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means[measure]
+
+
+@dataclass(frozen=True)
+class RuleOutcome:
+    """What a rule of fusion makes of a map; relabelled_share is the part of the voxels that get another class."""
+
+    rule: str
+    values: RuleMeans = field(metadata=INLINE)
+    relabelled_share: float
+
+
+@dataclass(frozen=True)
+class StratumStatistics:
+    """Means over a stratum of OP."""
+
+    name: str
+    voxels: int
+    means: MeasureMeans = field(metadata=INLINE)
+    psa: float
+    sbd_null: float
+    sbd_excess: float
+    entropy_within: float
+    entropy_between: float
+
+
+# --- One map ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """All that the statistics say of one map."""
+
+    schema: int
+    name: str
+    seed: int
+    K: int
+    voxel_size: float
+    voxels: int
+    observations: int
+    repeated: Repeated
+    blocks: BlockCut
+    verdict: StabilityVerdict
+    agreement: FrameAgreement
+    drift: DriftStatistics
+    uncertainty: EntropyParts
+    geometry: Losses | None
+    correctness: CorrectnessStatistics | None
+    fusion_rules: tuple[RuleOutcome, ...] | None
+    strata: tuple[StratumStatistics, ...]
+
+    @property
+    def sections(self) -> int:
+        """How many of the sections that need more than the map could be computed."""
+        return sum(section is not None for section in (self.geometry, self.correctness, self.fusion_rules))

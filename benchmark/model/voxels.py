@@ -1,0 +1,295 @@
+"""What fusion leaves behind: one row a voxel, and the log of observations from which that row can be computed again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import DataError, one_line
+from semstab.model.information import entropy_bits, js_divergence, normalise
+from semstab.runtime.files import atomic_path
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SCHEMA = 1
+Int32 = npt.NDArray[np.int32]
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+Types = dict[str, type[np.generic]]
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelTable:
+    """The fused map: n voxels sorted by (ix, iy, iz). Everything reported about a voxel is a function of its row.
+
+    ix, iy, iz         (n,) int32 voxel index, floor(x_w / r)
+    op                 (n,) int32 observation persistence: the number of frames that saw the voxel
+    evidence           (n, K) float64 accumulated evidence e(q), the sum over frames of s_bar
+    drift_sum          (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits
+    pixels             (n,) int64 pixels that fell into the voxel, all frames
+    first_frame        (n,) int32 lowest frame index that saw it
+    last_frame         (n,) int32 highest frame index that saw it
+    self_sum           (n,) float64 sum over frames of ||s_bar||^2
+    frame_entropy_sum  (n,) float64 sum over frames of the entropy of s_bar, bits
+    voxel_size         r, metres
+    classes            the K class names, where they are known
+
+    Raises DataError where columns disagree in length or rows are not sorted and distinct.
+    """
+
+    ix: Int32
+    iy: Int32
+    iz: Int32
+    op: Int32
+    evidence: Float64
+    drift_sum: Float64
+    pixels: Int64
+    first_frame: Int32
+    last_frame: Int32
+    self_sum: Float64
+    frame_entropy_sum: Float64
+    voxel_size: float
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _freeze_columns(self, _VOXEL_TYPES, self.ix)
+        if self.evidence.ndim != 2 or (self.classes and len(self.classes) != self.K):
+            raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
+        before, after = self.index[:-1], self.index[1:]
+        change = after.astype(np.int64) - before
+        first = np.take_along_axis(change, (change != 0).argmax(axis=1)[:, None], axis=1)
+        if (first <= 0).any():
+            raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
+
+    def __len__(self) -> int:
+        return len(self.ix)
+
+    @property
+    def K(self) -> int:
+        """Number of classes."""
+        return int(self.evidence.shape[1])
+
+    @property
+    def index(self) -> Int32:
+        """(n, 3) int32 voxel indices."""
+        return np.stack([self.ix, self.iy, self.iz], axis=1)
+
+    @property
+    def centers(self) -> Float64:
+        """(n, 3) world coordinates of the voxel centres, metres."""
+        return (self.index.astype(np.float64) + 0.5) * self.voxel_size
+
+    def save(self, path: str | Path, extra: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
+        """Write Parquet, atomically; `extra` columns (n,) go along for other programs and are not read back."""
+        _write_parquet(self, _VOXEL_TYPES, path, extra or {})
+
+    @classmethod
+    def load(cls, path: str | Path) -> VoxelTable:
+        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        with _reading(path):
+            return cls(**_read_parquet(path, _VOXEL_TYPES))
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """The log of observations: m rows, one a (voxel, frame), grouped by voxel and in order of integration within one.
+
+    ix, iy, iz  (n,) int32 the voxels, sorted
+    voxel       (m,) int64 row into them, ascending
+    frame       (m,) int32 frame index
+    evidence    (m, K) float64 s_bar, the mean of the frame's evidence in the voxel
+    pixels      (m,) int64 pixels behind it
+    voxel_size  r, metres
+    classes     the K class names, where they are known
+    """
+
+    ix: Int32
+    iy: Int32
+    iz: Int32
+    voxel: Int64
+    frame: Int32
+    evidence: Float64
+    pixels: Int64
+    voxel_size: float
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _freeze_columns(self, _INDEX_TYPES, self.ix)
+        _freeze_columns(self, _EVENT_TYPES, self.voxel)
+        step = np.diff(self.voxel, prepend=-1, append=len(self.ix))
+        if ((step != 0) & (step != 1)).any() or step[0] != 1 or step[-1] != 1:
+            raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
+
+    def __len__(self) -> int:
+        return len(self.voxel)
+
+    @property
+    def starts(self) -> Int64:
+        """(n,) first row of each voxel."""
+        return np.searchsorted(self.voxel, np.arange(len(self.ix))).astype(np.int64)
+
+    def table(self) -> VoxelTable:
+        """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
+        starts, s_bar = self.starts, self.evidence
+        op = np.diff(np.append(starts, len(self)))
+        return VoxelTable(
+            self.ix,
+            self.iy,
+            self.iz,
+            op=op.astype(np.int32),
+            evidence=_sum_by_voxel(s_bar, starts),
+            drift_sum=_sum_by_voxel(self.drift(), starts),
+            pixels=_sum_by_voxel(self.pixels, starts),
+            first_frame=np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
+            last_frame=np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
+            self_sum=_sum_by_voxel((s_bar**2).sum(axis=1), starts),
+            frame_entropy_sum=_sum_by_voxel(entropy_bits(s_bar), starts),
+            voxel_size=self.voxel_size,
+            classes=self.classes,
+        )
+
+    def beliefs(self) -> Float64:
+        """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
+        accumulated = self.evidence.copy()
+        age = np.arange(len(self)) - self.starts[self.voxel]
+        by_age = np.argsort(age, kind="stable")
+        ends = np.cumsum(np.bincount(age, minlength=1))
+        for rows in np.split(by_age, ends)[1:]:
+            accumulated[rows] += accumulated[rows - 1]
+        return normalise(accumulated)
+
+    def drift(self) -> Float64:
+        """(m,) D_JS(p^(t), p^(t-1)) in bits, that each observation caused at its voxel; 0 for a voxel's first."""
+        belief = self.beliefs()
+        drift = np.zeros(len(self))
+        again = np.flatnonzero(np.diff(self.voxel, prepend=-1) == 0)
+        drift[again] = js_divergence(belief[again], belief[again - 1])
+        return drift
+
+    def coarsen(self, factor: int) -> Events:
+        """The log on voxels `factor` times as large, in order of frame index within a voxel.
+
+        s_bar of a frame is the mean over its pixels, so the mean of the finer voxels' s_bar weighted by their pixels.
+        """
+        index = np.stack([self.ix, self.iy, self.iz], axis=1) // factor
+        coarse, parent = np.unique(index, axis=0, return_inverse=True)
+        pairs = np.stack([parent.ravel()[self.voxel], self.frame], axis=1)
+        pairs, rows = np.unique(pairs, axis=0, return_inverse=True)
+        pixels = np.zeros(len(pairs), dtype=np.int64)
+        evidence = np.zeros((len(pairs), self.evidence.shape[1]))
+        np.add.at(pixels, rows.ravel(), self.pixels)
+        np.add.at(evidence, rows.ravel(), self.evidence * self.pixels[:, None])
+        return Events(
+            **index_columns(coarse),
+            voxel=pairs[:, 0].astype(np.int64),
+            frame=pairs[:, 1].astype(np.int32),
+            evidence=evidence / pixels[:, None],
+            pixels=pixels,
+            voxel_size=self.voxel_size * factor,
+            classes=self.classes,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write Parquet, atomically: one row an observation, with its voxel's index."""
+        _write_parquet(self, _EVENT_TYPES, path, {n: getattr(self, n)[self.voxel] for n in _INDEX_TYPES})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Events:
+        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        with _reading(path):
+            content = _read_parquet(path, _EVENT_TYPES | _INDEX_TYPES)
+            first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
+            return cls(**content | {name: content[name][first] for name in _INDEX_TYPES})
+
+
+_INDEX_TYPES: Types = {"ix": np.int32, "iy": np.int32, "iz": np.int32}
+_VOXEL_TYPES: Types = _INDEX_TYPES | {
+    "op": np.int32, "evidence": np.float64, "drift_sum": np.float64, "pixels": np.int64, "first_frame": np.int32,
+    "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
+}  # fmt: skip
+_EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
+
+
+def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
+    """Voxel indices (n, 3) as the columns ix, iy, iz."""
+    return dict(zip(_INDEX_TYPES, index.T.astype(np.int32), strict=True))
+
+
+def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:
+    return np.add.reduceat(values, starts, axis=0) if len(starts) else values
+
+
+def _freeze_columns(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
+    for name, dtype in types.items():
+        column: npt.NDArray[Any] = np.ascontiguousarray(getattr(table, name), dtype=dtype).view()
+        if len(column) != len(like):
+            raise DataError(f"{type(table).__name__}: column '{name}' has {len(column)} rows, expected {len(like)}")
+        column.setflags(write=False)
+        object.__setattr__(table, name, column)
+
+
+def _write_parquet(
+    table: VoxelTable | Events,
+    types: Types,
+    path: str | Path,
+    extra: Mapping[str, npt.NDArray[Any]],
+) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {name: getattr(table, name) for name in types} | dict(extra)
+    about = {"schema": SCHEMA, "kind": type(table).__name__, "voxel_size": table.voxel_size, "classes": table.classes}
+    content = pa.table({name: _to_arrow(values) for name, values in columns.items()})
+    content = content.replace_schema_metadata({"semstab": json.dumps(about)})
+    with atomic_path(path) as temporary:
+        pq.write_table(content, temporary, compression="zstd")
+
+
+def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
+    import pyarrow as pa
+
+    if values.ndim == 1:
+        return pa.array(values)
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+
+
+@contextmanager
+def _reading(path: str | Path) -> Iterator[None]:
+    """Whatever is wrong with a file's content is a DataError of one line that names the file."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
+        raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
+
+
+def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
+    import pyarrow.parquet as pq
+
+    content = pq.read_table(path)
+    about = json.loads((content.schema.metadata or {})[b"semstab"])
+    if about["schema"] != SCHEMA:
+        raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
+    columns: dict[str, Any] = {name: _to_numpy(content.column(name)) for name in types}
+    return columns | {"voxel_size": float(about["voxel_size"]), "classes": tuple(about["classes"])}
+
+
+def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any]:
+    import pyarrow as pa
+
+    if column.null_count:
+        raise DataError("a column has missing values")
+    if not pa.types.is_fixed_size_list(column.type):
+        values: npt.NDArray[Any] = column.to_numpy()
+    else:
+        values = column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
+    return values

@@ -1,0 +1,1 @@
+"""What is made of a result: terminal, tables, figures, report, recording."""

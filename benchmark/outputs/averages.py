@@ -1,0 +1,222 @@
+"""Means of a study's units over scenes and repeats: tables, figures and findings all take them from here."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from semstab.metrics import macro_mean, pool
+from semstab.model.measures import Measure
+from semstab.model.records import Record, Result, Variation
+from semstab.model.results import Means
+from semstab.statistics import Estimate, MapStatistics
+
+ENOUGH = 1000
+"""Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its
+standard error is up to 0.5 / sqrt(1000) = 0.016, even if the voxels were independent."""
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Voxels of several units together: a mean runs over all of them, so that a scene counts by its voxels.
+
+    every      all voxels
+    recurrent  those with OP >= 3
+    strata     by OP, as the units have them
+    classes    by dominant class, in order of appearance
+
+    Of the voxels with OP >= 2, macro means over the units, NaN where none has statistics:
+    psa        pairwise semantic agreement
+    alpha      Krippendorff's alpha
+    drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
+    """
+
+    voxels: int
+    points: int
+    observations: int
+    every: Means
+    recurrent: Means
+    strata: tuple[Means, ...]
+    classes: tuple[Means, ...]
+    fuse_ms_per_frame: float
+    psa: float = math.nan
+    alpha: float = math.nan
+    drift: float = math.nan
+    drift_null: float = math.nan
+
+    @property
+    def excess_drift(self) -> float:
+        """SBD less that of the same observations in random order, bits."""
+        return self.drift - self.drift_null
+
+    @property
+    def mean_op(self) -> float:
+        """Observations a voxel."""
+        return self.observations / self.voxels if self.voxels else math.nan
+
+    @property
+    def pixels(self) -> float:
+        """Sampled points an observation: how many pixels of a frame fall into a voxel."""
+        return self.points / self.observations if self.observations else math.nan
+
+    @property
+    def once(self) -> float:
+        """Share of the voxels that were seen once; NaN where the strata do not tell."""
+        return next((row.share for row in self.strata if row.name == "OP=1"), math.nan)
+
+
+def pooled(records: Sequence[Record]) -> Pooled:
+    """Pool the voxels of one or more units; the time of a frame is the macro mean."""
+    tables = [record.summary.table for record in records]
+    voxels = sum(table.voxels for table in tables)
+    strata = tuple(pool(rows, voxels) for rows in zip(*(table.strata for table in tables), strict=True))
+    names = dict.fromkeys(row.name for table in tables for row in table.classes)
+    of_class = [[row for table in tables for row in table.classes if row.name == name] for name in names]
+    return Pooled(
+        voxels=voxels,
+        points=sum(table.points for table in tables),
+        observations=sum(table.observations for table in tables),
+        every=dataclasses.replace(pool(strata, voxels), name="all"),
+        recurrent=pool([table.recurrent for table in tables], voxels),
+        strata=strata,
+        classes=tuple(pool(rows, voxels) for rows in of_class),
+        fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
+        psa=_macro(records, lambda found: found.agreement.psa),
+        alpha=_macro(records, lambda found: found.agreement.alpha),
+        drift=_macro(records, lambda found: found.drift.sbd),
+        drift_null=_macro(records, lambda found: found.drift.null),
+    )
+
+
+def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:
+    """The macro mean of an estimate in the units' statistics; NaN where none has it."""
+    return macro_mean([take(record.statistics).value for record in records if record.statistics is not None])
+
+
+def over_all(measure: Measure) -> Callable[[Pooled], float]:
+    """Takes a measure's mean over all voxels."""
+    return lambda pooled: pooled.every[measure]
+
+
+def over_recurrent(measure: Measure) -> Callable[[Pooled], float]:
+    """Takes a measure's mean over the voxels with OP >= 3."""
+    return lambda pooled: pooled.recurrent[measure]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation over the repeats of a random variation; sd is NaN of a single one."""
+
+    mean: float
+    sd: float
+    repeats: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Of the repeats where the value is defined."""
+        defined = [value for value in values if not math.isnan(value)]
+        sd = statistics.stdev(defined) if len(defined) > 1 else math.nan
+        return cls(macro_mean(defined), sd, len(defined))
+
+
+@dataclass(frozen=True)
+class Level:
+    """One value of a sweep: the pooled voxels of each repeat."""
+
+    value: float
+    repeats: tuple[Pooled, ...]
+
+    def spread(self, measure: Callable[[Pooled], float]) -> Spread:
+        """A measure over the repeats."""
+        return Spread.of([measure(repeat) for repeat in self.repeats])
+
+    def mean(self, measure: Callable[[Pooled], float]) -> float:
+        """The measure's mean over the repeats."""
+        return self.spread(measure).mean
+
+    @property
+    def judged(self) -> bool:
+        """Whether it has statistics that are defined."""
+        return not math.isnan(self.mean(lambda pooled: pooled.psa))
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """How a swept setting is named, in a sentence and above a column, and its values printed: `{value * scale:g} unit`.
+
+    noise  whether it disturbs the geometry: then 0 leaves it as it is
+    """
+
+    name: str
+    title: str
+    header: str
+    unit: str = ""
+    scale: float = 1.0
+    noise: bool = False
+
+    def text(self, value: float) -> str:
+        """A value of it, without the unit."""
+        return f"{value * self.scale:.6g}"
+
+
+_SWEEPS = (
+    Sweep("voxel_size", "voxel size", "Voxel (m)", "m"),
+    Sweep("depth_noise", "depth noise", "Noise (%)", "% of depth", 100.0, noise=True),
+    Sweep("translation_noise", "position noise, independent by frame", "Noise (m)", "m", noise=True),
+    Sweep("rotation_noise", "rotation noise, independent by frame", "Noise (°)", "°", noise=True),
+    Sweep("translation_drift", "position drift, a random walk", "Step (m)", "m a frame", noise=True),
+    Sweep("rotation_drift", "rotation drift, a random walk", "Step (°)", "° a frame", noise=True),
+    Sweep("frame_count", "temporal sampling", "Frames", "frames"),
+    Sweep("pixel_stride", "pixel stride", "Stride (px)", "px"),
+)
+
+
+def describe(sweep: str) -> Sweep:
+    """The description of a sweep; one that is not known goes by its name."""
+    return next((known for known in _SWEEPS if known.name == sweep), _unknown(sweep))
+
+
+def _unknown(name: str) -> Sweep:
+    title = name.replace("_", " ")
+    return Sweep(name, title, title.capitalize())
+
+
+def swept(result: Result) -> list[Sweep]:
+    """The sweeps of a study that have values, in a fixed order."""
+    present = result.sweeps()
+    known = [sweep for sweep in _SWEEPS if sweep.name in present]
+    return [*known, *(describe(name) for name in present if describe(name) not in known)]
+
+
+def levels(result: Result, sweep: str, backbone: str, scene: str | None = None) -> tuple[Level, ...]:
+    """The values of a sweep, ascending, over the scenes that have all of them: else levels would differ by scenes."""
+    scenes = complete_scenes(result, sweep, backbone)
+    found: dict[float, dict[int, list[Record]]] = {}
+    for record in result.select(sweep, backbone=backbone):
+        value, repeat = record.variation.value, record.variation.repeat
+        if value is not None and record.unit.scene in scenes and scene in (None, record.unit.scene):
+            found.setdefault(value, {}).setdefault(repeat, []).append(record)
+    return tuple(
+        Level(value, tuple(pooled(rows) for _, rows in sorted(repeats.items())))
+        for value, repeats in sorted(found.items())
+    )
+
+
+def complete_scenes(result: Result, sweep: str, backbone: str) -> tuple[str, ...]:
+    """The scenes of a sweep that have each of its values and repeats."""
+    points: dict[str, set[Variation]] = {}
+    for record in result.select(sweep, backbone=backbone):
+        points.setdefault(record.unit.scene, set()).add(record.variation)
+    wanted = set().union(*points.values())
+    return tuple(scene for scene, there in points.items() if there == wanted)
+
+
+def by_backbone(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """The records of each backbone, in order."""
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(record.unit.backbone, []).append(record)
+    return groups

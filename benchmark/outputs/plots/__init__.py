@@ -1,0 +1,144 @@
+"""The study's figures, PNG and SVG, at the widths of a paper's column and page; matplotlib is imported when used."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from semstab.model.records import OVERVIEW, Record, Result
+from semstab.model.results import slug
+from semstab.outputs.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
+from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
+from semstab.outputs.plots.histograms import Histograms, histograms, together
+from semstab.outputs.plots.judgement import statistics_figures
+from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability
+from semstab.outputs.plots.style import Figure
+from semstab.outputs.plots.sweeps import draw_sweep
+from semstab.runtime.files import keep_only
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+__all__ = ["Figure", "figures", "write_figures"]
+
+
+def write_figures(result: Result, folder: str | Path) -> list[Path]:
+    """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
+
+    Other figures there are removed.
+    """
+    target = Path(folder) / "figures"
+    written = [path for figure in figures(result, folder) for path in figure.save(target)]
+    keep_only(written, target)
+    return written
+
+
+def figures(result: Result, folder: str | Path) -> list[Figure]:
+    """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
+    kept = [record for record in result.select() if record.voxels_file is not None]
+    return [
+        *_overviews(result, kept, Path(folder) / OVERVIEW),
+        *_distributions(kept),
+        *_maps(result, kept),
+        *_sweeps(result),
+        *statistics_figures(result, kept),
+    ]
+
+
+def _overviews(result: Result, kept: list[Record], folder: Path) -> Iterator[Figure]:
+    """One a backbone, of the first scene that has a saved frame."""
+    for backbone, records in by_backbone(kept).items():
+        for record in records:
+            path = folder / f"{slug(record.unit.scene, backbone)}.npz"
+            if record.unit.scene in result.up and path.exists():
+                yield _overview(record, result.up[record.unit.scene], path)
+                break
+
+
+def _overview(record: Record, up: tuple[float, float, float], path: Path) -> Figure:
+    scene, backbone = record.unit.scene, record.unit.backbone
+    return Figure(
+        slug("overview", scene, backbone),
+        f"Overview: {scene}, {backbone}",
+        "A frame, its prediction, and the map that all sampled frames were fused into, seen from above: the dominant"
+        " class of the topmost voxels, in the prediction's colours.",
+        f"A camera image of {scene}, the classes that {backbone} predicts for it, and the fused map from above in the"
+        " same colours.",
+        lambda: draw_overview(record.table(), up, Overview.load(path)),
+        dense=True,
+    )
+
+
+def _distributions(kept: list[Record]) -> Iterator[Figure]:
+    if not kept:
+        return
+
+    @functools.cache
+    def of_all() -> dict[str, dict[str, Histograms]]:
+        """By backbone and scene."""
+        return {
+            backbone: {record.unit.scene: histograms(record.table()) for record in records}
+            for backbone, records in by_backbone(kept).items()
+        }
+
+    def ecdf(backbone: str) -> Canvas:
+        ends = informative(found for scenes in of_all().values() for found in scenes.values())
+        return draw_ecdf(of_all()[backbone], ends)
+
+    for backbone in by_backbone(kept):
+        yield Figure(
+            slug("ecdf", backbone),
+            f"The measures by scene: {backbone}",
+            "Empirical distributions over the voxels of each scene, of measures of which more is better as what they"
+            " lack: 1 - VSS is disagreement. SBD is that of the voxels seen twice or more. Dashed: the recurrent voxels"
+            " of all scenes. The x axes are the same for each backbone and end where 99% of the voxels of every scene"
+            " are reached.",
+            f"A panel a measure of cumulative curves, one a scene, for {backbone}: how many voxels have how much.",
+            partial(ecdf, backbone),
+        )
+    yield Figure(
+        "persistence",
+        "The measures against observation persistence",
+        "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
+        " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
+        "For each backbone, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
+        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in of_all().items()}),
+    )
+
+
+def _maps(result: Result, kept: list[Record]) -> Iterator[Figure]:
+    for record in kept:
+        scene, backbone = record.unit.scene, record.unit.backbone
+        if scene in result.up:
+            yield Figure(
+                slug("stability_map", scene, backbone),
+                f"Stability from above: {scene}, {backbone}",
+                "The topmost voxel of each column along the up axis: its stability category and every measure; grey:"
+                " seen once, which says nothing. Values beyond a scale look like its end.",
+                f"Maps of {scene} from above with the stability category and each measure of {backbone}'s voxels.",
+                partial(_draw_map, record, result.up[scene]),
+                dense=True,
+            )
+
+
+def _draw_map(record: Record, up: tuple[float, float, float]) -> Canvas:
+    return draw_stability(record.table(), up)
+
+
+def _sweeps(result: Result) -> Iterator[Figure]:
+    for sweep in swept(result):
+        backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
+        if backbones:
+            yield Figure(
+                f"sensitivity_{sweep.name}",
+                f"Sensitivity to {sweep.title}",
+                "The share of recurrent voxels, and every measure over all voxels (solid) and over the recurrent ones"
+                f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes; bars are the standard deviation"
+                " over repeats. Read the others with (a): which voxels there are to average changes along the sweep.",
+                f"Panels against {sweep.title}: the recurrent share and each measure, for all voxels and for the"
+                " recurrent ones.",
+                partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in backbones}),
+            )

@@ -1,0 +1,247 @@
+"""Maps from above: stability, drift, entropy and where it comes from; and the overview from image to map."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import DataError, one_line
+from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
+from semstab.model.measures import dominant, measures
+from semstab.model.results import RECURRENT
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
+from semstab.outputs.plots.topdown import EMPTY, Float64, Int64, top_down
+from semstab.statistics import decompose, psa
+from semstab.statistics.correctness import STABLE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.figure import Figure
+
+Image = npt.NDArray[np.uint8]
+Colors = Sequence[tuple[int, int, int]]
+
+BLANK = (255, 255, 255)
+UNDEFINED = "#cccccc"
+COLORMAP = "YlOrRd"
+RIGHT_COLORS = (
+    ("OP < 3, or no truth", (204, 204, 204)),
+    ("stable, right", (86, 180, 233)),
+    ("unstable, right", (0, 114, 178)),
+    ("unstable, wrong", (240, 228, 66)),
+    ("stable, wrong", (213, 94, 0)),
+)
+"""What is known of a voxel, in Okabe and Ito's colours."""
+
+WIDE = 1.4
+"""A map this many times as wide as high or more has its panels beneath each other."""
+
+
+def draw_stability(table: VoxelTable, up: Sequence[float]) -> Figure:
+    """Stability category and every measure of the topmost voxels, with a scale bar."""
+    rows, cell = top_down(table, up)
+    figure, (kind, *panels) = _panels(rows, 1 + len(measures()))
+    _draw_categories(figure, kind, rows, categories(table))
+    for axes, measure in zip(panels, measures(), strict=True):
+        values = np.where(table.op > 1, measure.of(table), np.nan)
+        _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
+    titles = ("stability", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in measures()))
+    for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
+        mark_panel(axes, letter, title)
+        _frame(axes)
+        _scale_bar(axes, rows.shape[1], cell)
+    return figure
+
+
+def draw_uncertainty(table: VoxelTable, up: Sequence[float], wrong: npt.NDArray[np.integer[Any]] | None) -> Figure:
+    """Entropy within and between frames of the topmost voxels and, where truth tells, which are stable and wrong.
+
+    `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel.
+    """
+    rows, cell = top_down(table, up)
+    figure, panels = _panels(rows, 2 if wrong is None else 3)
+    parts, again = decompose(table), table.op > 1
+    most = math.log(2) / math.log(table.K)
+    for axes, values in zip(panels, (parts.within, parts.between), strict=False):
+        _draw_measure(figure, axes, rows, np.where(again, values, np.nan), (0.0, most))
+    if wrong is not None:
+        panels[2].imshow(_painted(rows, wrong, [shade for _, shade in RIGHT_COLORS]), interpolation_stage="rgba")
+        entries = [(name, tuple(channel / 255 for channel in shade)) for name, shade in RIGHT_COLORS]
+        columns = len(entries) if figure.get_figwidth() > COLUMN else 2
+        figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
+    titles = ("entropy within frames", "entropy between frames", "right and wrong")
+    for axes, letter, title in zip(panels, "abc", titles, strict=False):
+        mark_panel(axes, letter, title)
+        _frame(axes)
+        _scale_bar(axes, rows.shape[1], cell)
+    return figure
+
+
+def right_or_wrong(table: VoxelTable, truth: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """What is known of each voxel (n,), a row of RIGHT_COLORS, by its true class (n,), -1 where that is not known."""
+    with np.errstate(invalid="ignore"):
+        stable = psa(table) >= STABLE - 1e-9
+    right = dominant(table) == truth
+    known = (truth >= 0) & (table.op >= RECURRENT)
+    return np.where(known, np.where(right, np.where(stable, 1, 2), np.where(stable, 4, 3)), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """What one frame showed to the camera and to the backbone.
+
+    frame      its index
+    labels     (H, W) predicted rows 0..K-1; K and above: ignored
+    color      (H, W, 3) the image; None where the dataset has none
+    palette    (K, 3) RGB of the classes
+    """
+
+    frame: int
+    labels: npt.NDArray[np.integer[Any]]
+    color: Image | None
+    palette: Image
+
+    @classmethod
+    def load(cls, path: Path) -> Overview:
+        """Read SCENE__BACKBONE.npz with the arrays frame, labels, palette and, where there is one, color.
+
+        Raises DataError where the file is damaged or of another kind.
+        """
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
+                color = content.get("color")
+                return cls(int(content["frame"]), content["labels"], color, content["palette"])
+        except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+            raise DataError(
+                f"{path}: not a saved frame ({one_line(error)}); delete it, and it is made again"
+            ) from error
+
+
+def draw_overview(table: VoxelTable, up: Sequence[float], overview: Overview) -> Figure:
+    """Image, prediction and the fused map from above, in one palette."""
+    rows, cell = top_down(table, up)
+    palette: Colors = [(int(r), int(g), int(b)) for r, g, b in overview.palette]
+    images = [] if overview.color is None else [("image", overview.color)]
+    images.append(
+        ("prediction", _colored(np.where(overview.labels < table.K, overview.labels.astype(np.int64), EMPTY), palette))
+    )
+    shapes = [*(image.shape for _, image in images), rows.shape]
+    figure = canvas(PAGE, PAGE / len(shapes) * max(shape[0] / shape[1] for shape in shapes) + 0.5)
+    axes = figure.subplots(1, len(shapes))
+    for panel, letter, (title, image) in zip(axes, "ab", images, strict=False):
+        panel.imshow(image)
+        mark_panel(panel, letter, f"{title}, frame {overview.frame}")
+    label = dominant(table)
+    axes[-1].imshow(_painted(rows, label, palette), interpolation_stage="rgba")
+    mark_panel(axes[-1], "abc"[len(images)], "fused, from above")
+    for panel in axes:
+        _frame(panel)
+    _scale_bar(axes[-1], rows.shape[1], cell)
+    names = table.classes or tuple(str(k) for k in range(table.K))
+    shown = {int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K}
+    entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in sorted(shown)]
+    figure.legend(handles=_handles(entries), loc="outside lower center", ncols=min(8, len(entries)))
+    return figure
+
+
+def _panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
+    """A figure for n maps: up to three side by side, or for wide maps beneath each other in one column of the page."""
+    height, width = rows.shape
+    if width >= WIDE * height:
+        figure = canvas(COLUMN, n * (max(0.3, COLUMN * height / width) + 0.5))
+        return figure, figure.subplots(n, 1)
+    columns = min(n, 3)
+    lines = math.ceil(n / columns)
+    figure = canvas(PAGE, min(8.0, lines * (PAGE / columns * height / width + 0.65)))
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes in panels[n:]:
+        axes.set_axis_off()
+    return figure, list(panels[:n])
+
+
+def _painted(rows: Int64, label: npt.NDArray[Any], colors: Colors) -> Image:
+    """The map in the colours of its voxels' labels (H, W, 3), blank where there are none."""
+    return _colored(np.where(rows == EMPTY, EMPTY, label.astype(np.int64)[rows]), colors)
+
+
+def _colored(labels: Int64, colors: Colors) -> Image:
+    """A label map in colours (H, W, 3), blank where a label is EMPTY."""
+    image: Image = np.array([*colors, BLANK], dtype=np.uint8)[labels]
+    return image
+
+
+def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: npt.NDArray[np.uint8]) -> None:
+    """The categories with their names on a colour bar."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    axes.imshow(_painted(rows, category, CATEGORY_COLORS), interpolation_stage="rgba")
+    shades = ListedColormap(np.array(CATEGORY_COLORS) / 255)
+    edges = np.arange(len(CATEGORIES) + 1) - 0.5
+    bar = _color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(CATEGORIES)), shades))
+    bar.set_ticks(range(len(CATEGORIES)), labels=[name.replace(" ", "\n") for name in CATEGORIES])
+    bar.ax.tick_params(length=0)
+
+
+def _draw_measure(
+    figure: Figure, axes: Axes, rows: Int64, values: Float64, ends: tuple[float, float], *, best_first: bool = True
+) -> None:
+    """A measure in colour between two ends, with its colour bar; undefined values are grey, empty cells blank."""
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    shades = matplotlib.colormaps[COLORMAP if best_first else f"{COLORMAP}_r"].with_extremes(bad=UNDEFINED)
+    colors = ScalarMappable(Normalize(*ends), shades)
+    image = colors.to_rgba(np.ma.masked_invalid(values[rows]), bytes=True)
+    image[rows == EMPTY, :3] = BLANK
+    axes.imshow(image, interpolation_stage="rgba")
+    _color_bar(figure, axes, colors)
+
+
+def _color_bar(figure: Figure, axes: Axes, colors: ScalarMappable) -> Colorbar:
+    bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03)
+    bar.outline.set_linewidth(0.4)
+    return bar
+
+
+def _frame(axes: Axes) -> None:
+    """A thin frame and no ticks: the scale bar says the size."""
+    axes.set(xticks=[], yticks=[], anchor="N")
+    axes.grid(visible=False)
+    for spine in axes.spines.values():
+        spine.set(visible=True, linewidth=0.4, color=FAINT)
+
+
+def scale_length(width: float) -> float:
+    """A round length of at most a quarter of the width: 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(width / 4))
+    return max(step * power for step in (1, 2, 5) if step * power <= width / 4)
+
+
+def _scale_bar(axes: Axes, cells: int, cell: float) -> None:
+    """A bar of round length in the lower left corner."""
+    from matplotlib.patheffects import withStroke
+
+    length = scale_length(cells * cell)
+    halo = [withStroke(linewidth=2.5, foreground="white")]
+    end = 0.03 + length / (cells * cell)
+    axes.plot([0.03, end], [0.05, 0.05], transform=axes.transAxes, color=INK, linewidth=1.8, path_effects=halo)
+    text = f"{length:g} m" if length >= 0.1 else f"{length * 100:g} cm"
+    axes.text(0.03, 0.08, text, transform=axes.transAxes, fontsize=6.5, va="bottom", path_effects=halo)
+
+
+def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
+    from matplotlib.patches import Patch
+
+    return [Patch(facecolor=shade, edgecolor=FAINT, linewidth=0.4, label=name) for name, shade in entries]

@@ -1,0 +1,55 @@
+"""The map seen from above: which voxel is the topmost one of each column along the up axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.voxels import VoxelTable
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+EMPTY = -1
+LARGEST = 2000
+"""Cells of a map's longer side; a larger map gets cells of several voxels."""
+
+OUTLIERS = 0.002
+"""Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
+
+
+def level_axes(up: Sequence[float]) -> tuple[Float64, Float64, Float64]:
+    """Right-handed unit vectors (right, ahead, up): right is the world's x axis, or y where up is x, laid level."""
+    up_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    along = np.eye(3)[0 if abs(up_axis[0]) < 0.9 else 1]
+    right = along - (along @ up_axis) * up_axis
+    right /= np.linalg.norm(right)
+    return right, np.cross(up_axis, right), up_axis
+
+
+def top_down(table: VoxelTable, up: Sequence[float]) -> tuple[Int64, float]:
+    """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
+
+    The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
+    each voxel covers the cells that a level square of its size touches.
+    """
+    right, ahead, up_axis = level_axes(up)
+    centers = table.centers
+    plane = np.stack([centers @ ahead, centers @ right], axis=1)
+    low, high = np.quantile(plane, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    factor = max(1, int(np.ceil((high - low).max() / table.voxel_size / LARGEST)))
+    cell = factor * table.voxel_size
+    aligned = np.isclose(np.abs(up_axis).max(), 1.0)
+    reach = 0.0 if aligned or factor > 1 else 0.499 * table.voxel_size
+    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
+    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
+    rows = np.tile(np.arange(len(table)), len(corners))
+    first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
+    inside = ((cells >= first) & (cells <= last)).all(axis=1)
+    cells, rows = cells[inside] - first, rows[inside]
+    order = np.argsort((centers @ up_axis)[rows], kind="stable")  # the topmost is written last
+    image = np.full(last - first + 1, EMPTY, dtype=np.int64)
+    image[tuple(cells[order].T)] = rows[order]
+    return image[::-1], cell

@@ -1,0 +1,465 @@
+"""The observer that records a run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import logging
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from semstab.backends import FusionBackend, GrowingMap
+from semstab.config import Config
+from semstab.engine.observer import Factory, Observer
+from semstab.engine.series import FrameRow
+from semstab.engine.units import Plan, Planned, PlannedUnit
+from semstab.errors import ConfigError
+from semstab.metrics import compensated_flicker
+from semstab.model.frames import Frame
+from semstab.model.measures import measures
+from semstab.model.records import Result, Variation
+from semstab.model.results import Unit, UnitSummary
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.recording import drift_colors, legend, series
+from semstab.outputs.recording.background import Background
+from semstab.outputs.recording.camera import (
+    IMAGE_SIDE,
+    CameraLog,
+    Overlay,
+    label_context,
+    stride_of,
+)
+from semstab.outputs.recording.difference import log_difference
+from semstab.outputs.recording.entities import Clock, path
+from semstab.outputs.recording.flips import FlipLog
+from semstab.outputs.recording.layout import Known, Scenery, blueprint, drawn, is_pointwise
+from semstab.outputs.recording.parts import Parts
+from semstab.outputs.recording.target import DEFAULT_URL, Target
+from semstab.outputs.recording.tracker import FrameDrift, Tracker
+from semstab.outputs.recording.voxel_maps import CHUNKS, MapLog, chunks_of
+from semstab.task import Task
+
+SAMPLING = 2
+"""In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
+
+FIRST_CHUNKS = 8
+"""Chunks of each map that the first layout knows; it is sent again where a map outgrows them."""
+
+SAMPLE = 20_000
+"""Voxels of a scene from which it follows where its maps are seen from."""
+
+ORIGIN_STEP = 1000.0
+"""Metres; map origins are multiples of it: a scene near its world's origin keeps its coordinates."""
+
+
+class Recording(Observer):
+    """Writes one recording while the run goes on; a killed run leaves what it recorded until a moment before.
+
+    target  a file, or a `Target`: a file and a viewer
+    run     the run folder, from which the recording of a resumed run takes what an earlier start finished
+
+    The file is opened at the first fused frame: a start that finds every group kept leaves an earlier recording alone.
+    Call `close` where a run does not come to its end. Raises ConfigError where the file cannot be written.
+    """
+
+    pictures_only = False
+    """Whether series, maps and layout are logged by another recording, of which this is a part."""
+
+    def __init__(self, target: str | Path | Target, run: Path | None = None) -> None:
+        self.target = target if isinstance(target, Target) else Target(Path(target))
+        self._run = run
+        self._plan: Plan
+        self._tasks: dict[tuple[str, str], Task] = {}
+        self._stream: rr.RecordingStream | None = None
+        self._clock = Clock()
+        self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
+        self._origins: dict[str, npt.NDArray[np.int64]] = {}
+        self._cameras: dict[str, CameraLog] = {}
+        self._known = Known()
+        self._sent = 0  # layouts
+        self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
+        self._group: _Group | None = None  # the backbone on a scene that is being fused
+        self._background: Background | None = None
+        self._parts: Parts | None = None
+
+    def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
+        """Keep the plan: layout, names and colours follow from it."""
+        self._plan = plan
+        self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
+        first = CHUNKS if self.target.live else FIRST_CHUNKS  # a live viewer keeps the layout that it got first
+        self._known.chunks = {task.scene.name: first for task in plan.tasks}
+
+    def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
+        """Keep the map, where it can be followed: the first one of a backbone on a scene will be."""
+        if isinstance(backend, GrowingMap):
+            self._growing.setdefault((unit.scene, unit.backbone), backend)
+
+    def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
+        """Log the unit's row of the time series."""
+        stream, _ = self._opened()
+        task = self._tasks[unit.scene, unit.backbone]
+        self._clock.set(stream, frame.index, frame.timestamp)
+        origin = self._origin(stream, task, frame.T_wc[:3, 3])
+        if self._group is None or self._group.task is not task:
+            growing = self._growing.pop((unit.scene, unit.backbone), None)
+            self._group = _Group(task, self._plan.config.voxel_size, origin, growing)
+        if not self.pictures_only:
+            values = series.values(row.cells())
+            series.log_row(stream, unit, task, values)
+            self._group.span(values)
+
+    def frame_finished(self, task: Task, frame: Frame) -> None:
+        """Log what the camera and the map show."""
+        (stream, background), group, scene = self._opened(), self._fused, task.scene.name
+        self._cameras[scene].log(stream, frame, background)
+        group.log(stream, frame, background, maps=not self.pictures_only)
+        if not self.pictures_only and chunks_of(group.grown) > self._known.chunks[scene]:
+            show = functools.partial(self._show_chunks, stream, scene, group.grown)
+            background.submit(frame.index, frame.timestamp, show)
+
+    def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
+        """Log the unit's voxels, while they are measured; the time is that of its last frame."""
+        if self.pictures_only:
+            return
+        (stream, background), group = self._opened(), self._fused
+        tolerance = self._plan.config.tolerance
+        background.submit(*group.last, functools.partial(group.log_map, stream, unit, table, tolerance))
+
+    def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
+        """Log the unit's final numbers."""
+        if self.pictures_only:
+            return
+        (stream, background), group = self._opened(), self._fused
+        background.drain()
+        self._clock.set(stream, *group.last)
+        self._log_numbers(stream, group, summary)
+
+    def group_finished(self, task: Task) -> None:
+        """Log what flipped, and lay out what there is now."""
+        (stream, background), group = self._opened(), self._group
+        if group is None:
+            return
+        if group.tables:
+            (*_, table) = group.tables.values()
+            background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
+        background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
+        background.drain()
+
+    def group_kept(self, task: Task, summaries: Sequence[UnitSummary]) -> None:
+        """Log the units' series and voxels from the folder: their pictures are not in this recording."""
+        self._kept.append((self._tasks[task.scene.name, task.backbone], summaries))
+        if self._stream is not None:
+            self._log_kept(self._stream)
+
+    def elsewhere(self, folder: Path) -> Factory:
+        """Each job records what only its frames show; series, maps and layout follow from the folder when all is done.
+
+        Raises ConfigError where a viewer is to follow the run.
+        """
+        if self.target.live:
+            raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
+        self._parts = Parts.of(folder)
+        self.target = self._parts.of_the_whole(self.target)
+        return functools.partial(PictureRecording, self._parts)
+
+    def run_finished(self, result: Result) -> None:
+        """Finish the file; where the recording is served, `serve` or `close` does that."""
+        if self._parts is not None:
+            self._finish_parts(self._parts, result)
+            return
+        if not self.target.file.exists():
+            self._opened()
+        if self.target.viewer != "serve":
+            self.close()
+
+    def _finish_parts(self, parts: Parts, result: Result) -> None:
+        """Add to the pictures what the folder tells, and make one file of all."""
+        logged = {(task.scene.name, task.backbone) for task, _ in self._kept}
+        for place, task in self._tasks.items():
+            summaries = [run for run in result.runs if (run.unit.scene, run.unit.backbone) == place]
+            if place not in logged and summaries:
+                self._kept.append((task, summaries))
+        self._opened()
+        self.close()
+        self.target = parts.merged(self.target)
+
+    def serve(self) -> None:
+        """Wait for viewers until the user interrupts, where the recording is served; else return at once."""
+        if self._stream is None:
+            return
+        logging.getLogger("semstab").warning("serving at %s until interrupted (Ctrl-C)", DEFAULT_URL)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+        self.close()
+
+    def close(self) -> None:
+        """Write out what is pending and close the file; a second call does nothing."""
+        stream, self._stream = self._stream, None
+        if stream is None:
+            return
+        try:
+            if self._background is not None:
+                self._background.close()
+            for camera in self._cameras.values():
+                if camera.unread is not None:
+                    stream.log(path(camera.scene.name, "log"), rr.TextLog(f"without colour: {camera.unread}"))
+        finally:
+            stream.flush()
+            stream.disconnect()
+
+    @property
+    def _fused(self) -> _Group:
+        """The group that is being fused."""
+        assert self._group is not None
+        return self._group
+
+    def _opened(self) -> tuple[rr.RecordingStream, Background]:
+        if self._stream is None or self._background is None:
+            self._stream = stream = self.target.open()
+            self._background = Background(stream, self._clock)
+            if self.pictures_only:
+                return stream, self._background
+            _log_static(stream, self._plan)
+            self._send_blueprint(stream)
+            self._log_kept(stream)
+        return self._stream, self._background
+
+    def _lay_out(self, stream: rr.RecordingStream, group: _Group, table: VoxelTable) -> None:
+        """All of a group is fused: send the layout again where there is more to it now. The table is one of its own."""
+        known, scene = self._known, group.task.scene.name
+        compared = len(group.task.backends) > 1
+        if compared:
+            known.spans[scene, group.task.backbone] = group.spans
+        first = scene not in known.sceneries and len(table) > 0
+        if first:
+            some = table.index[:: math.ceil(len(table) / SAMPLE)]
+            poses = np.reshape(self._cameras[scene].poses, (-1, 4, 4))
+            points = ((some - group.origin + 0.5) * table.voxel_size).astype(np.float64)
+            known.sceneries[scene] = Scenery(points, poses, group.task.scene.up)
+        self._show_chunks(stream, scene, group.voxels, anyway=first or compared)
+
+    def _log_numbers(self, stream: rr.RecordingStream, group: _Group, summary: UnitSummary) -> None:
+        text = _final(summary) + group.remarks.get(summary.unit.backend, "")
+        stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
+
+    def _send_blueprint(self, stream: rr.RecordingStream) -> None:
+        layout = blueprint(self._plan, self._known)
+        stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
+        self._sent += 1
+
+    def _show_chunks(self, stream: rr.RecordingStream, scene: str, voxels: int, *, anyway: bool = False) -> None:
+        """Send the layout again where a scene's map of that size has more chunks than it knows, or anyway."""
+        outgrown = chunks_of(voxels) > self._known.chunks[scene]
+        if outgrown:
+            self._known.chunks[scene] = CHUNKS
+        if outgrown or anyway:
+            self._send_blueprint(stream)
+
+    def _log_kept(self, stream: rr.RecordingStream) -> None:
+        kept, self._kept = self._kept, []
+        for task, summaries in kept:
+            group: _Group | None = None
+            for summary in summaries:
+                self._clock.set(stream, task.indices[-1])
+                if self._run is None:
+                    text = (
+                        f"{_final(summary)}; finished by an earlier start, series and voxels are not in this recording"
+                    )
+                    stream.log(path(task.scene.name, "log"), rr.TextLog(text))
+                    continue
+                unit = summary.unit
+                table = VoxelTable.load(self._run / "voxels" / f"{unit.slug}.parquet")
+                if group is None:
+                    at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
+                    group = _Group(task, table.voxel_size, self._origin(stream, task, at))
+                for values in series.send_rows(
+                    stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
+                ):
+                    group.span(values)
+                self._clock.set(stream, task.indices[-1])
+                group.log_map(stream, unit, table, self._plan.config.tolerance)
+                self._log_numbers(stream, group, summary)
+            if group is not None:
+                self._lay_out(stream, group, table)
+
+    def _origin(self, stream: rr.RecordingStream, task: Task, position: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """The scene's map origin, in voxels: settled near the first position that is known, and said."""
+        scene, voxel_size = task.scene.name, self._plan.config.voxel_size
+        if scene in self._origins:
+            return self._origins[scene]
+        steps = np.round(position / ORIGIN_STEP).astype(np.int64)
+        self._origins[scene] = origin = steps * round(ORIGIN_STEP / voxel_size)
+        self._cameras[scene] = CameraLog(task.scene, origin * voxel_size, len(task.indices))
+        if steps.any():
+            where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", origin * voxel_size, strict=True))
+            stream.log(path(scene, "log"), rr.TextLog(f"map coordinates are relative to {where} of the scene's world"))
+        return origin
+
+
+class PictureRecording(Recording):
+    """What only the frames of one job show, in a file of its own: camera, labels, drift and flips."""
+
+    pictures_only = True
+
+    def __init__(self, parts: Parts) -> None:
+        super().__init__(parts.folder / "unknown.rrd")
+        self._parts_of = parts
+
+    def group_started(self, task: Task, config: Config) -> None:
+        """The job's backbone on a scene: it is all of this recording's plan."""
+        self.target = self._parts_of.of_group(task)
+        units = (
+            PlannedUnit(Variation(), config, dataclasses.replace(task, backends=(backend,)), "", False, True)
+            for backend in task.backends
+        )
+        self.run_started(Plan(config, {}, tuple(units), ()), [])
+
+
+class _Group:
+    """What is recorded of one backbone on a scene."""
+
+    def __init__(
+        self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64], growing: GrowingMap | None = None
+    ) -> None:
+        self.task = task
+        self.origin = origin
+        self._classes = task.mapping.target
+        self._translation = origin * voxel_size
+        self._tracker = Tracker(voxel_size, len(self._classes), growing)
+        self._flips = FlipLog()
+        self._maps: dict[str, MapLog] = {}
+        self.tables: dict[str, VoxelTable] = {}
+        """By backend, as they are finished."""
+        self._previous: Frame | None = None
+        self._entity = path(task.scene.name, "camera", task.backbone)
+        self._overlay = Overlay()
+        self.last: tuple[int, float | None] = (task.indices[-1], None)
+        """Number and timestamp of the last frame."""
+        self.spans: dict[str, tuple[float, float]] = {}
+        """The lowest and highest value of each series in all backends."""
+        self.voxels = 0
+        """Of its largest final map."""
+        self.remarks: dict[str, str] = {}
+        """What there is to say of the final map of a backend."""
+
+    def span(self, values: Mapping[str, float]) -> None:
+        """A unit's series had these values in a frame."""
+        for name, value in values.items():
+            low, high = self.spans.get(name, (value, value))
+            self.spans[name] = min(low, value), max(high, value)
+
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, maps: bool) -> None:
+        """All units of the group fused the frame: log what it shows and what it changed, and where wanted the map."""
+        self._tracker.follow(frame)
+        self.last = frame.index, frame.timestamp
+        self._flips.update(self._tracker, frame)
+        drawn_map = self._map(drawn(self.task)) if maps and is_pointwise(drawn(self.task)) else None
+        grown = drawn_map.update(stream, self._tracker.map) if drawn_map is not None else []
+        drift, previous = self._tracker.drift_of(frame), self._previous
+        self._previous = frame
+
+        def job() -> None:
+            self._log_pictures(stream, drift)
+            if previous is not None:
+                self._log_flicker(stream, previous, frame)
+            for log_chunk in grown:
+                log_chunk()
+
+        background.submit(frame.index, frame.timestamp, job)
+
+    @property
+    def grown(self) -> int:
+        """Voxels of the map that is drawn while it grows."""
+        return len(self._tracker.map) if is_pointwise(drawn(self.task)) else 0
+
+    def log_map(self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float) -> None:
+        """Log a unit's final voxels, and where they differ from those of the drawn unit."""
+        first = drawn(self.task)
+        self.tables[unit.backend] = table
+        self.voxels = max(self.voxels, len(table))
+        if first in self.tables:
+            for backend in self.tables if unit.backend == first else [unit.backend]:
+                self._compare(stream, first, backend, tolerance)
+        self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
+
+    def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
+        """Log which frames changed the voxels that drifted most."""
+        suspects = list(self._flips.suspects(self._tracker))
+        self._flips.log(
+            stream, self.task.scene.name, self.task.backbone, suspects, self._classes, self._translation, clock
+        )
+
+    def _compare(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
+        if first == second:
+            return
+        scene, backbone = self.task.scene.name, self.task.backbone
+        entity = path(scene, "difference", backbone, f"{first} and {second}")
+        tables = {name: self.tables[name] for name in (first, second)}
+        found = log_difference(stream, entity, tables, self.origin, tolerance)
+        stream.log(path(scene, "log"), rr.TextLog(f"{backbone}: {found}"))
+        report = rr.TextDocument(f"{found}.", media_type=rr.MediaType.MARKDOWN)
+        stream.log(path(scene, "difference_report", backbone, f"{first} and {second}"), report, static=True)
+
+    def _log_pictures(self, stream: rr.RecordingStream, caused: FrameDrift) -> None:
+        frame = caused.frame
+        stride = stride_of(frame.shape)
+        labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
+        coarse = stride * _sampling(labels.shape)
+        for name, picture, step in (
+            ("labels", labels, stride),
+            ("drift", drift_colors.levels_of(*caused.at(coarse)), coarse),
+        ):
+            entity = f"{self._entity}/{name}"
+            self._overlay.log(stream, entity, frame.shape, picture.shape, step)
+            stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
+
+    def _log_flicker(self, stream: rr.RecordingStream, previous: Frame, frame: Frame) -> None:
+        """Motion-compensated flicker: of a sample of the frame's pixels, looked up in the whole frame before."""
+        stride = stride_of(frame.shape)
+        sample = frame.every(stride)
+        flicker = compensated_flicker(previous, sample.every(_sampling(sample.shape))).flicker_percent
+        if math.isfinite(flicker):
+            stream.log(series.entity("compensated_flicker", self.task.units[0]), rr.Scalars(flicker))
+
+    def _map(self, backend: str) -> MapLog:
+        if backend not in self._maps:
+            entity = path(self.task.scene.name, "map", self.task.backbone, backend)
+            self._maps[backend] = MapLog(entity, self._classes, self.origin, len(self.task.indices))
+        return self._maps[backend]
+
+
+def _sampling(shape: tuple[int, ...]) -> int:
+    """Every how many pixels a picture of that shape is sampled."""
+    return SAMPLING if max(shape) > IMAGE_SIDE // SAMPLING else 1
+
+
+def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
+    for scene, task in {task.scene.name: task for task in plan.tasks}.items():
+        if (up := task.scene.up) is not None:  # the axis of the world that is nearest to it
+            axis = int(np.abs(up).argmax())
+            name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
+            stream.log(path(scene), getattr(rr.ViewCoordinates, name), static=True)
+        legend.log_legend(stream, path(scene, "legend"), task.mapping.target)
+        drift_colors.log_legend(stream, path(scene, "drift_legend"), task.mapping.target)
+    for task in plan.tasks:
+        entity = path(task.scene.name, "camera", task.backbone)
+        stream.log(f"{entity}/labels", label_context(task.mapping.target), static=True)
+        stream.log(f"{entity}/drift", drift_colors.context(task.mapping.target), static=True)
+    series.log_styles(stream, plan)
+
+
+def _final(summary: UnitSummary) -> str:
+    unit, table = summary.unit, summary.table
+    means = (f"{m.symbol} {table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
+    return (
+        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, {', '.join(means)}"
+        f" (K = {table.K})"
+    )

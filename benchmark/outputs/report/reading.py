@@ -1,0 +1,128 @@
+"""What a study found, in sentences; one that has no numbers to stand on is left out."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+
+from semstab.metrics import macro_mean
+from semstab.model.measures import VSS
+from semstab.model.records import Record, Result
+from semstab.outputs.averages import ENOUGH, Pooled, by_backbone, pooled
+from semstab.outputs.findings import Finding
+from semstab.outputs.tables.stability import comparable
+
+
+def reading(result: Result, found: Sequence[Finding]) -> list[str]:
+    """The summary of a study for somebody who will not read its tables."""
+    records = result.select()
+    if not records:
+        return ["No unit at the study's own settings was finished: there is nothing to say yet."]
+    means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
+    return [
+        *_once(pooled(records)),
+        *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
+        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
+        *_ranking(result),
+        *_flicker(records),
+        *_least_seen(records),
+        *_findings(found),
+        *_implementations(result),
+    ]
+
+
+def _once(voxels: Pooled) -> Iterator[str]:
+    if not math.isnan(voxels.once):
+        yield (
+            f"{voxels.once:.0%} of the voxels were seen once. They look stable because no second look could contradict"
+            " them: read every measure where voxels recur (OP>=3)."
+        )
+
+
+def _recurrent(backbone: str, voxels: Pooled) -> Iterator[str]:
+    if voxels.recurrent.voxels >= ENOUGH:
+        yield (
+            f"Where {backbone} had three looks or more ({voxels.recurrent.share:.0%} of its voxels),"
+            f" {1 - voxels.recurrent[VSS]:.1%} of the evidence goes against the voxel's own class; over all voxels it"
+            f" seems to be {1 - voxels.every[VSS]:.1%}."
+        )
+    else:
+        yield f"{backbone} has {voxels.recurrent.voxels:,} voxels with three looks or more: too few to judge it by."
+
+
+def _verdict(records: Sequence[Record]) -> Iterator[str]:
+    """The verdict on a backbone; of several scenes, in how many each level was reached."""
+    judged = [record.statistics.verdict for record in records if record.statistics is not None]
+    if len(judged) == 1:
+        yield f"{judged[0].line}."
+    elif judged:
+        levels = Counter(verdict.level for verdict in judged)
+        parts = (f"{level} in {n} scene{'' if n == 1 else 's'}" for level, n in levels.items())
+        yield f"Verdict on {records[0].unit.backbone}: {', '.join(parts)}."
+
+
+def _ranking(result: Result) -> Iterator[str]:
+    """Does the order of the backbones change where only recurrent voxels count?"""
+    records = comparable(result)
+    means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
+    if not means or any(voxels.recurrent.voxels < ENOUGH for voxels in means.values()):
+        return
+    every = _order({name: voxels.every[VSS] for name, voxels in means.items()})
+    recurrent = _order({name: voxels.recurrent[VSS] for name, voxels in means.items()})
+    taxonomy = records[0].summary.taxonomy
+    if every == recurrent:
+        yield f"In one taxonomy ({taxonomy}) the order by VSS is {every}, over all voxels and for OP>=3 alike."
+    else:
+        yield f"In one taxonomy ({taxonomy}) the order by VSS is {every} over all voxels, but {recurrent} for OP>=3."
+
+
+def _order(values: Mapping[str, float]) -> str:
+    return " > ".join(sorted(values, key=lambda name: -values[name]))
+
+
+def _flicker(records: Sequence[Record]) -> Iterator[str]:
+    parts = []
+    for backbone, rows in by_backbone(records).items():
+        plain = macro_mean([row.image_space.flicker_percent for row in rows])
+        compensated = macro_mean([row.image_space.compensated_flicker_percent for row in rows])
+        if not math.isnan(compensated):
+            parts.append(f"{backbone} {plain:.0f}% ({compensated:.0f}%)")
+    if parts:
+        yield (
+            "Share of the pixels whose label changes from one sampled frame to the next, and in brackets what is left"
+            f" of it where the camera's motion is taken out: {', '.join(parts)}."
+        )
+
+
+def _least_seen(records: Sequence[Record]) -> Iterator[str]:
+    """The paradox between scenes: the one that looks steadiest may be the one that was hardly looked at."""
+    for backbone, rows in by_backbone(records).items():
+        tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
+        if len(tables) < 2:
+            continue
+        steadiest = max(tables, key=lambda name: tables[name][VSS])
+        if steadiest == min(tables, key=lambda name: tables[name].mean_op):
+            yield (
+                f"{backbone} looks steadiest in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
+                f" seen least: {tables[steadiest].mean_op:.2f} frames a voxel."
+            )
+
+
+def _findings(found: Sequence[Finding]) -> Iterator[str]:
+    parts = (f"{row.claim[0].lower()}{row.claim[1:].rstrip('.')} ({row.said})" for row in found)
+    if found:
+        yield f"The paper's findings here: {'; '.join(parts)}."
+
+
+def _implementations(result: Result) -> Iterator[str]:
+    """Which fusion implementations leave the base one's maps."""
+    rows = {
+        name: [row.agrees for row in result.agreement if row.backends == (result.backend, name)]
+        for name in dict.fromkeys(row.backends[1] for row in result.agreement)
+    }
+    if same := [name for name, agrees in rows.items() if all(agrees)]:
+        yield f"{' and '.join(same)} {'leaves' if len(same) == 1 else 'leave'} the same maps as {result.backend}."
+    for name, agrees in rows.items():
+        if not all(agrees):
+            yield f"{name} and {result.backend} disagree in {agrees.count(False)} of {len(agrees)} comparisons."

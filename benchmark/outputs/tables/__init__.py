@@ -1,0 +1,56 @@
+"""The study's tables: CSV, Markdown and LaTeX rounded as the paper's, JSON in full precision."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from semstab.model.records import Result
+from semstab.outputs.tables.comparison import comparison
+from semstab.outputs.tables.correctness import ceiling, correctness, rules
+from semstab.outputs.tables.fusion import agreement, fusion
+from semstab.outputs.tables.glance import glance
+from semstab.outputs.tables.image_space import flicker
+from semstab.outputs.tables.sensitivity import sensitivity
+from semstab.outputs.tables.stability import classes, cross_backbone, persistence, scenes
+from semstab.outputs.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
+from semstab.outputs.tables.table import Cell, Column, Group, Table
+from semstab.outputs.tables.writers import TEXT_WRITERS, to_csv, to_json, to_latex, to_markdown
+from semstab.runtime.files import keep_only, write_json, write_text
+
+__all__ = [
+    "Cell",
+    "Column",
+    "Group",
+    "Table",
+    "tables",
+    "to_csv",
+    "to_json",
+    "to_latex",
+    "to_markdown",
+    "write_tables",
+]
+
+BUILDERS = (
+    glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, class_agreement, drift, uncertainty,
+    ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, agreement,
+)  # fmt: skip
+"""In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
+
+
+def tables(result: Result) -> list[Table]:
+    """Every table that the study has records for, in the paper's order."""
+    return [table for build in BUILDERS for table in build(result)]
+
+
+def write_tables(result: Result, folder: str | Path) -> list[Path]:
+    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, in place of all others there; return the paths."""
+    written = []
+    for table in tables(result):
+        stem = Path(folder) / "tables" / table.name
+        for suffix, write in TEXT_WRITERS.items():
+            written.append(stem.with_suffix(f".{suffix}"))
+            write_text(written[-1], write(table))
+        written.append(stem.with_suffix(".json"))
+        write_json(written[-1], to_json(table))
+    keep_only(written, Path(folder) / "tables")
+    return written

@@ -1,0 +1,99 @@
+"""The backbones beside each other, on the same places and at the same number of observations."""
+
+from __future__ import annotations
+
+from semstab.model.comparison import BackboneComparison, MapCoverage
+from semstab.model.records import Result
+from semstab.outputs.tables.statistics import INTERVALS
+from semstab.outputs.tables.table import Column, Group, Row, Table
+from semstab.statistics.comparison import compared
+
+_COMMON = "On the voxels that every backbone saw twice or more."
+
+
+def comparison(result: Result) -> list[Table]:
+    """Paired differences, ranking, and what each map covers; one group a scene."""
+    return [_differences(result), _ranking(result), _coverage(result)] if result.comparisons else []
+
+
+def _differences(result: Result) -> Table:
+    columns = (
+        Column("a", "Backbone"),
+        Column("b", "less backbone"),
+        Column("measure", "Measure"),
+        Column("difference", "Difference", 4, signed=True),
+        Column("p_holm", "p (Holm)", 4),
+    )
+    caption = (
+        f"{_COMMON} p: of a paired test that flips the sign of a block's difference, corrected for the number of pairs."
+        f" {INTERVALS}"
+    )
+    groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
+    return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
+
+
+def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
+    return tuple((row.a, row.b, words[row.measure], row.difference, row.p_holm) for row in found.paired.differences)
+
+
+def _ranking(result: Result) -> Table:
+    columns = (
+        Column("measure", "Measure"),
+        Column("rank", "Rank", 0),
+        Column("backbone", "Backbone"),
+        Column("range", "95% of resamples"),
+        Column("best_percent", "first in (%)", 0),
+        Column("value", "Same places", 4),
+        Column("standardised", "Same OP", 4),
+    )
+    caption = (
+        f"Same places: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
+        f" strata of OP weighted by those of all maps together. {INTERVALS}"
+    )
+    groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
+    return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
+
+
+def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    quantities = {quantity.key: quantity for quantity in compared(truth=True)}
+    return tuple(
+        (
+            quantities[ranking.measure].word,
+            rank.rank,
+            rank.backbone,
+            f"{rank.low} to {rank.high}",
+            100 * rank.best,
+            found.paired.of(quantities[ranking.measure])[rank.backbone],
+            found.standardised.of(quantities[ranking.measure], rank.backbone),
+        )
+        for ranking in found.paired.rankings
+        for rank in ranking.ranks
+    )
+
+
+def _coverage(result: Result) -> Table:
+    columns = (
+        Column("backbone", "Backbone"),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("repeated", "OP>=2", 0),
+        Column("recurrent", "OP>=3", 0),
+        Column("common_percent", "in all maps (%)", 1),
+        Column("alone", "in no other", 0),
+    )
+    caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
+    groups = tuple(Group(found.scene, tuple(map(_coverage_row, found.coverage))) for found in result.comparisons)
+    return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
+
+
+def _coverage_row(row: MapCoverage) -> Row:
+    return (
+        row.backbone,
+        row.voxels,
+        row.mean_op,
+        row.repeated,
+        row.recurrent,
+        100 * row.common_share,
+        row.alone,
+    )

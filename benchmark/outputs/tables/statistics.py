@@ -1,0 +1,248 @@
+"""What the statistics say of each map: agreement, drift, where uncertainty comes from, the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+from semstab.metrics import macro_mean
+from semstab.model.measures import ENTROPY, VSS
+from semstab.model.records import Record, Result
+from semstab.model.statistics import UNDEFINED, DriftTests, Estimate, MapStatistics
+from semstab.outputs.averages import by_backbone
+from semstab.outputs.tables.table import Column, Group, Row, Table
+from semstab.statistics.agreement import ALPHA, KAPPA, PSA
+from semstab.statistics.drift import FLIP_RATE
+from semstab.statistics.verdict import ADVICE
+
+SCENE = Column("scene", "Scene")
+REPEATED = Column("repeated_voxels", "Voxels", 0)
+INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
+SEEN_TWICE = "Over the voxels seen twice or more."
+
+T = TypeVar("T")
+Number = Callable[[MapStatistics], float | Estimate]
+
+
+def temporal_agreement(result: Result) -> list[Table]:
+    """Do frames agree about a place? Measures that do not depend on OP."""
+    columns = (
+        REPEATED,
+        *map(Column.of, (VSS, PSA, KAPPA, ALPHA, FLIP_RATE)),
+    )
+    numbers: tuple[Number, ...] = (
+        lambda found: found.repeated.voxels,
+        lambda found: found.agreement.vss.value,
+        lambda found: found.agreement.psa,
+        lambda found: found.agreement.kappa.value,
+        lambda found: found.agreement.alpha,
+        lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
+    )
+    caption = (
+        f"{SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel; kappa (Fleiss) and alpha (Krippendorff):"
+        " the same beyond chance, 1 perfect, 0 chance; flip rate: share of the steps from one observation to the next"
+        f" at which the predicted class changes. {INTERVALS}"
+    )
+    return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
+
+
+def class_agreement(result: Result) -> list[Table]:
+    """Alpha of each class against all others, macro means over scenes."""
+    judged = judged_records(result)
+    if not judged:
+        return []
+    columns = (
+        Column("class", "Class"),
+        Column("observations", "Observations", 0),
+        *map(Column.of, (KAPPA, ALPHA)),
+    )
+    groups = tuple(Group(name, _class_rows(rows)) for name, rows in judged.items())
+    caption = (
+        f"{SEEN_TWICE} Each class against all others; observations are the evidence for it, in frames, of all scenes."
+        " Macro means: each scene counts once."
+    )
+    return [Table("class_agreement", "Agreement of the frames, by class", caption, columns, groups)]
+
+
+def drift(result: Result) -> list[Table]:
+    """SBD beside what a random order of the same observations gives, and the drift in one direction."""
+    columns = (
+        Column("voxels", "Voxels", 0),
+        Column("sbd", "as seen", 4, over="SBD (bits)"),
+        Column("sbd_null", "random order", 4, over="SBD (bits)"),
+        Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
+        Column("sbd_p", "p", 3, over="SBD (bits)"),
+        Column("trend", "one way", 3, over="Trend"),
+        Column("trend_null", "random order", 3, over="Trend"),
+        Column("trend_p", "p", 3, over="Trend"),
+        Column("drifting_voxels", "drifting", 0, over="Voxels"),
+        Column("tested_voxels", "tested", 0, over="Voxels"),
+    )
+    numbers: tuple[Number, ...] = (
+        lambda found: found.drift.voxels,
+        lambda found: found.drift.sbd.value,
+        lambda found: found.drift.null.value,
+        lambda found: found.drift.excess,
+        tested(lambda tests: tests.sbd_p),
+        tested(lambda tests: tests.trend),
+        tested(lambda tests: tests.trend_null),
+        tested(lambda tests: tests.trend_p),
+        tested(lambda tests: tests.drifting_voxels),
+        tested(lambda tests: tests.tested_voxels),
+    )
+    logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())
+    one_class = f"{SEEN_TWICE[:-1]}, each frame as one class; the others need a log (statistics: true)."
+    seen = SEEN_TWICE if logged else one_class
+    tests = (
+        " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
+        " the frames. Drifting: voxels whose own trend is significant at a false discovery rate of 5%, of those seen"
+        " six times or more."
+    )
+    caption = (
+        f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
+        f"{tests if logged else ''} {INTERVALS}"
+    )
+    return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
+
+
+def uncertainty(result: Result) -> list[Table]:
+    """The entropy of the belief, within frames and between them."""
+    columns = (
+        Column.of(ENTROPY),
+        Column("within", "within frames", 4, "lower"),
+        Column("between", "between frames", 4, "lower"),
+        Column("within_percent", "within (%)", 0),
+    )
+
+    def share(found: MapStatistics) -> float:
+        entropy = found.uncertainty.entropy.value
+        return 100 * found.uncertainty.within.value / entropy if entropy else math.nan
+
+    numbers: tuple[Number, ...] = (
+        lambda found: found.uncertainty.entropy,
+        lambda found: found.uncertainty.within,
+        lambda found: found.uncertainty.between,
+        share,
+    )
+    caption = (
+        f"{SEEN_TWICE} Entropy of the belief in units of log K, as the sum of what is there within each frame (borders,"
+        f" voxels larger than things, unsure scores) and of the frames' disagreement. {INTERVALS}"
+    )
+    return by_scene(result, "uncertainty", "Where the uncertainty comes from", caption, columns, numbers)
+
+
+def verdicts(result: Result) -> list[Table]:
+    """What the evidence says of each backbone on each scene, and what to do."""
+    judged = judged_records(result)
+    if not judged:
+        return []
+    columns = (
+        SCENE,
+        Column("verdict", "Verdict"),
+        Column.of(ALPHA),
+        Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
+        REPEATED,
+        Column("repeated_percent", "of the map (%)", 0),
+        Column("advice", "What to do"),
+    )
+    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
+    caption = (
+        f"{SEEN_TWICE} Decided by the intervals: stable where alpha is at least 0.8, usable from 0.667, unstable below;"
+        " misleading where more than 5% of the stable places are wrong, which only ground truth tells."
+        f" {INTERVALS}"
+    )
+    return [Table("verdicts", "Verdicts", caption, columns, groups)]
+
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+def by_scene(
+    result: Result, name: str, title: str, caption: str, columns: Sequence[Column], numbers: Sequence[Number]
+) -> list[Table]:
+    """One row a scene, and the macro mean of several; columns and units that have no number are left out."""
+    cells = {
+        backbone: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
+        for backbone, rows in judged_records(result).items()
+    }
+    cells = {backbone: {scene: row for scene, row in rows.items() if _known(row)} for backbone, rows in cells.items()}
+    known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
+    if not known:
+        return []
+
+    def row(scene: str, of: Sequence[float | Estimate]) -> Row:
+        return scene, *(of[k] for k in known)
+
+    groups = tuple(
+        Group(
+            backbone,
+            tuple(row(scene, own) for scene, own in rows.items()),
+            row("Mean", _means(list(rows.values()))) if len(rows) > 1 else None,
+        )
+        for backbone, rows in cells.items()
+        if rows
+    )
+    return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
+
+
+def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
+    """The base units that have statistics, with these, by backbone."""
+    judged = {
+        backbone: [(record, record.statistics) for record in records if record.statistics is not None]
+        for backbone, records in by_backbone(result.select()).items()
+    }
+    return {backbone: rows for backbone, rows in judged.items() if rows}
+
+
+def tested(take: Callable[[DriftTests], float]) -> Number:
+    """A number of the drift's tests; NaN where there are none."""
+    return lambda found: math.nan if found.drift.tests is None else take(found.drift.tests)
+
+
+def _value(found: float | Estimate) -> float:
+    return found.value if isinstance(found, Estimate) else found
+
+
+def _known(row: Sequence[float | Estimate]) -> list[int]:
+    """Which of the numbers are defined."""
+    return [k for k, cell in enumerate(row) if not math.isnan(_value(cell))]
+
+
+def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
+    """The macro mean of each column."""
+    return [macro_mean([_value(cell) for cell in column]) for column in zip(*rows, strict=True)]
+
+
+def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
+    """The rows of several units by their name, in order of appearance."""
+    found: dict[str, list[T]] = {}
+    for row in rows:
+        found.setdefault(name(row), []).append(row)
+    return found
+
+
+def _class_rows(judged: Sequence[tuple[Record, MapStatistics]]) -> tuple[Row, ...]:
+    by_name = grouped((row for _, found in judged for row in found.agreement.classes), lambda row: row.name)
+    return tuple(
+        (
+            name,
+            sum(row.observations for row in rows),
+            macro_mean([row.kappa for row in rows]),
+            macro_mean([row.alpha for row in rows]),
+        )
+        for name, rows in by_name.items()
+    )
+
+
+def _verdict_row(record: Record, found: MapStatistics) -> Row:
+    right = found.correctness
+    return (
+        record.unit.scene,
+        found.verdict.level,
+        found.agreement.alpha,
+        UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
+        found.repeated.voxels,
+        100 * found.repeated.share,
+        ADVICE[found.verdict.level],
+    )

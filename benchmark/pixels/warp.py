@@ -1,0 +1,80 @@
+"""One view's pixels as another view sees them, by depth and pose, with an occlusion test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import ConfigError
+from semstab.model.frames import Frame
+from semstab.model.labels import fixed
+
+DEPTH_TOLERANCE = 0.01
+"""Two views see the same surface where the depths that they give it differ by at most this share of its distance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondence:
+    """Which pixel of another view sees the surface point behind each pixel of a frame.
+
+    pixel  (H, W) int32 flat index into the other view's images, -1 where it does not see the point
+    """
+
+    pixel: npt.NDArray[np.int32]
+
+    @property
+    def visible(self) -> npt.NDArray[np.bool_]:
+        """(H, W): the point is in the other view's image, in front of it and not occluded."""
+        return self.pixel >= 0
+
+    def bring(self, values: npt.NDArray[Any], fill: Any = 0) -> npt.NDArray[Any]:
+        """Values (H', W', ...) of the other view at the frame's pixels, (H, W, ...); `fill` where not visible."""
+        flat = values.reshape(-1, *values.shape[2:])
+        brought: npt.NDArray[Any] = flat[self.pixel]
+        brought[~self.visible] = fill
+        return brought
+
+
+def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Correspondence:
+    """Look each pixel of `frame` up in `other` (backward warping, nearest pixel).
+
+    A pixel with valid depth is back-projected, moved into the other camera and projected; there the nearest pixel's
+    depth must be valid and differ from the point's distance z along the optical axis by at most depth_tolerance * z,
+    else the point is occluded. Labels do not matter. The frames may differ in size and intrinsics.
+
+    Raises ConfigError where the tolerance is not above 0 and below 1.
+    """
+    from semstab.pixels.warp_kernel import look_up
+
+    if not 0 < depth_tolerance < 1:
+        raise ConfigError(f"depth_tolerance = {depth_tolerance:g}: use a share of the distance, above 0 and below 1")
+    H, W = frame.shape
+    K, camera = frame.intrinsics, other.intrinsics
+    rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
+    pixel = np.empty((H, W), dtype=np.int32)
+    look_up(
+        fixed(frame.depth), rays, _motion(frame, other), fixed(other.depth),
+        (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
+    )  # fmt: skip
+    return Correspondence(pixel)
+
+
+def warp(
+    values: npt.NDArray[Any], source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, fill: Any = 0
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    """Values (H', W', ...) of the source's pixels as the target sees them, (H, W, ...), and where it does, (H, W).
+
+    Labels, scores, colours: the nearest pixel's value, never a mixture. See `correspond`.
+    """
+    found = correspond(target, source, depth_tolerance=depth_tolerance)
+    return found.bring(values, fill), found.visible
+
+
+def _motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
+    """(3, 4) from the frame's camera axes to the other's; exact for large coordinates, which cancel first."""
+    R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
+    t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]
+    return np.column_stack([R @ frame.T_wc[:3, :3], R @ t])

@@ -1,0 +1,43 @@
+"""The compiled loop behind `semstab.pixels.warp`: where each pixel of one view lies in another."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from semstab.runtime.compiled import serial
+
+
+@serial
+def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, tolerance: float, out: Any) -> None:
+    """For each pixel of a view the flat index of the other view's pixel that sees the same surface, or -1.
+
+    depth        (H, W) of the view, metres; 0, negative, NaN and inf are invalid
+    rays         (u - cx) / fx of each column, then (v - cy) / fy of each row
+    motion       (3, 4) from the view's camera axes to the other's
+    other_depth  (H', W') of the other view, whose intrinsics are camera = (fx, fy, cx, cy)
+    tolerance    of the occlusion test, relative to the distance from the other camera
+    out          (H, W) int32, is filled
+    """
+    ray_x, ray_y = rays
+    fx, fy, cx, cy = camera
+    H, W = other_depth.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            out[v, u] = -1
+            d = float(depth[v, u])
+            if not 0.0 < d < math.inf:
+                continue
+            x, y = ray_x[u] * d, ray_y[v] * d
+            z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * d + motion[2, 3]
+            if not z > 0.0:
+                continue
+            to_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * d + motion[0, 3]
+            to_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * d + motion[1, 3]
+            column = math.floor(fx * (to_x / z) + cx + 0.5)  # integers are pixel centres
+            row = math.floor(fy * (to_y / z) + cy + 0.5)
+            if not (0.0 <= column < W and 0.0 <= row < H):
+                continue
+            at_u, at_v = int(column), int(row)
+            if abs(float(other_depth[at_v, at_u]) - z) <= tolerance * z:
+                out[v, u] = at_v * W + at_u

@@ -1,0 +1,1 @@
+"""Files, JSON, processes, compiled code and threads: what all else rests on."""

@@ -1,0 +1,142 @@
+"""Files that are either there and whole, or not there: written beside, then renamed."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+import stat
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+import yaml
+
+from semstab.errors import ConfigError, DataError, one_line
+from semstab.runtime.json_form import to_json
+
+MAX_YAML_BYTES = 2**24
+MAX_ALIASED = 10**5
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; rename it to `path` if the block succeeds, else remove it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write `text` atomically, in UTF-8."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write `value`, a dataclass for example, atomically as JSON; undefined numbers (NaN, infinity) become null."""
+    write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
+    """Write a grey or BGR image atomically."""
+    import cv2
+
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def content_key(settings: Mapping[str, Any]) -> str:
+    """A hash of settings that JSON holds, in any order."""
+    return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def keep_only(written: Collection[Path], folder: Path) -> None:
+    """Remove other files of the same kinds from a folder of results: an earlier start's, which hold no longer."""
+    kinds = {path.suffix for path in written}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.suffix in kinds and path not in written:
+            path.unlink()
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file; raise DataError with the file's name where it cannot be read."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
+
+
+def read_limited(path: str | Path, limit: int) -> bytes:
+    """The content of a file. Raises OSError, too, for what is no file (a pipe, a device), or larger than the limit."""
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"{size} bytes are too many for such a file, at most {limit}")
+        return file.read()
+
+
+def open_file(path: str | Path) -> BufferedReader:
+    """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  an opener; the caller closes it
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return file
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a pipe at once, though nobody writes to it."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The content of a YAML text, without tags that make objects.
+
+    Raises ConfigError in one line that starts with `where` where it is not valid.
+    """
+    try:
+        loader = yaml.SafeLoader(text)
+        node = loader.get_single_node()
+        values: dict[int, float] = {}
+        if _expanded(node, values) > len(values) + MAX_ALIASED:
+            raise ConfigError(f"{where}: its aliases (*name) stand for more than {MAX_ALIASED} values; write them out")
+        return None if node is None else loader.construct_document(node)
+    except ConfigError:
+        raise
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
+        # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
+        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
+
+
+def _expanded(node: Any, known: dict[int, float]) -> float:
+    """How many values a YAML node stands for with its aliases written out: infinity where it holds itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        parts = getattr(node, "value", ())
+        parts = parts if isinstance(parts, list) else ()
+        children = (child for part in parts for child in (part if isinstance(part, tuple) else (part,)))
+        known[id(node)] = 1 + sum(_expanded(child, known) for child in children)
+    return known[id(node)]
