@@ -17,7 +17,7 @@ from tiny_study import Counting, Interrupting, summary
 from semstab.engine import DaskCluster, LocalProcesses, run_study
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
-from semstab.engine.work.jobs import Job
+from semstab.engine.work.jobs import Job, Request
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.settings import resolve
 
@@ -107,7 +107,7 @@ class Deadly:
 
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
     config = resolve(tiny_study.configure(root, sweeps={}, backends=["numpy"]))
-    fine = [Job("wall", cell.unit.backbone, (cell.request(),), "start", tmp_path) for cell in make_plan(config).units]
+    fine = [Job("wall", cell.unit.backbone, (Request.of(cell),), "start", tmp_path) for cell in make_plan(config).units]
     jobs = [fine[0], Job("wall", "x", (Deadly(),), "start", tmp_path), *fine[1:]]
     found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs, Observers([]))}
     assert sorted(found) == ["a", "b", "c", "d", "x"]

@@ -219,7 +219,7 @@ def _jobs(
     """The units by the sequence that they read; scene by scene, for what a scene's backbones share stays at hand."""
     sequences: dict[tuple[str, str], list[Request]] = {}
     for each in missing:
-        sequences.setdefault((each.unit.scene, each.unit.backbone), []).append(each.request())
+        sequences.setdefault((each.unit.scene, each.unit.backbone), []).append(Request.of(each))
     memory = None if config.memory_gb is None else config.memory_gb * GB
     return [
         Job(scene, backbone, tuple(requests), start, folder, config.threads, memory, tuple(observers))

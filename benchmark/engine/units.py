@@ -24,7 +24,6 @@ from semstab.config import (
     Sweeps,
 )
 from semstab.datasets import Scene, open_dataset
-from semstab.engine.work.jobs import Request
 from semstab.errors import ConfigError
 from semstab.model.measures import measures
 from semstab.model.records import REGIONS, Variation
@@ -95,12 +94,6 @@ class PlannedUnit:
         """Whether its backend can give the log of its observations."""
         return keeps_log(self.unit.backend)
 
-    def request(self) -> Request:
-        """What a job is told of it."""
-        frames = FrameSelection(list=tuple(self.task.indices))
-        config = self.config.model_copy(update={"frames": frames})
-        return Request(self.identity, config, self.image_space, self.kept, self.judged, self.task.left_out)
-
 
 @dataclass(frozen=True, eq=False)
 class PlannedRegions:
@@ -132,10 +125,6 @@ class PlannedRegions:
     def digest(self) -> str:
         """A hash of its input."""
         return self.scene.digest(frame_indices(self.scene, self.config, [self.backbone]), self.backbone)
-
-    def request(self) -> Request:
-        """What a job is told of it."""
-        return Request(self.identity, self.config, regions=True)
 
 
 Planned = PlannedUnit | PlannedRegions

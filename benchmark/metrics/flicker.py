@@ -49,9 +49,9 @@ def compensated_flicker(
 ) -> CompensatedFlicker:
     """Flicker after the previous frame's labels are warped into the current one, so that camera motion is not counted.
 
-    A pixel is co-visible where it is valid, the previous camera saw the same surface point
-    (`semstab.pixels.warp.correspond` with its occlusion test), and the pixel that saw it was valid too. Soft scores count by their largest class; the
-    frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
+    A pixel is co-visible where it is valid, the previous camera saw the same surface point (see
+    `semstab.pixels.warp.correspond`), and the pixel that saw it was valid too. Soft scores count by their largest
+    class; the frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
 
     Raises ConfigError where depth_tolerance is not above 0 and below 1.
     """

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from semstab.config import Config
+from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
+from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import SemstabError, one_line
 from semstab.model.records import UnitContent
 
@@ -29,6 +30,16 @@ class Request:
     judged: bool = True
     left_out: int = 0
     regions: bool = False
+
+    @classmethod
+    def of(cls, planned: Planned) -> Request:
+        """What a job is told of it."""
+        if not isinstance(planned, PlannedUnit):
+            return cls(planned.identity, planned.config, regions=True)
+        frames = FrameSelection(list=tuple(planned.task.indices))
+        config = planned.config.model_copy(update={"frames": frames})
+        wanted = (planned.image_space, planned.kept, planned.judged)
+        return cls(planned.identity, config, *wanted, planned.task.left_out)
 
 
 @dataclass(frozen=True)
