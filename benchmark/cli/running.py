@@ -149,7 +149,8 @@ def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, r
     observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
     gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
     try:
-        result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
+        told: dict[str, Any] = {"executor": executor, "observers": observers, "command": sys.argv}
+        result = run_study(config, out, **told, report=report == "on", processes=2)
         for line in failure_lines(result):
             say(f"error: {line}")
         if not quiet:

@@ -23,10 +23,10 @@ __all__ = [
 ]
 
 _HOMES = {
-    "DaskCluster": "executors",
-    "Executor": "executors",
-    "InProcess": "executors",
-    "LocalProcesses": "executors",
+    "DaskCluster": "work.executors",
+    "Executor": "work.executors",
+    "InProcess": "work.executors",
+    "LocalProcesses": "work.executors",
     "Observer": "observer",
     "load_result": "folder",
     "run": "execution",

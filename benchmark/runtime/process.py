@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+from multiprocessing.connection import Connection, wait
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
 """The parameters' numbers in glibc's malloc.h; see mallopt(3)."""
@@ -29,3 +32,14 @@ def settle() -> None:
     if hasattr(libc, "gnu_get_libc_version"):
         for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, KEPT), (ARENA_MAX, 1)):
             libc.mallopt(parameter, value)
+
+
+def follow_parent(listening: Connection) -> None:
+    """Let this worker process end with its parent, which holds the other end of a pipe, and leave Ctrl-C to it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches all processes; the parent decides
+
+    def end_with_parent() -> None:
+        wait([listening])  # readable once the other end is closed: by the parent, or by its death
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()

@@ -8,11 +8,9 @@ import dataclasses
 import importlib
 import multiprocessing
 import os
-import signal
-import threading
 from collections.abc import Generator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from semstab.engine.observer import Observers
@@ -21,7 +19,7 @@ from semstab.engine.work.memory import available_bytes
 from semstab.engine.work.passes import run_job
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.runtime.prefetch import default_threads
-from semstab.runtime.process import settle
+from semstab.runtime.process import follow_parent, settle
 
 CONNECT_SECONDS = 10
 
@@ -134,13 +132,7 @@ def _start_worker(listening: Connection, threads: int) -> None:
     import numba
 
     numba.set_num_threads(min(threads, numba.get_num_threads()))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
-
-    def end_with_parent() -> None:
-        wait([listening])  # readable once the other end is closed: by the parent, or by its death
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    follow_parent(listening)
 
 
 class DaskCluster:

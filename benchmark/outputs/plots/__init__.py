@@ -22,16 +22,22 @@ from semstab.runtime.files import keep_only
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+    from semstab.outputs.plots.drawing import DrawingProcess
+
 __all__ = ["Figure", "figures", "write_figures"]
 
 
-def write_figures(result: Result, folder: str | Path) -> list[Path]:
+def write_figures(result: Result, folder: str | Path, beside: DrawingProcess | None = None) -> list[Path]:
     """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
 
-    Other figures there are removed.
+    A process `beside` this one draws every second of them. Other figures there are removed.
     """
     target = Path(folder) / "figures"
-    written = [path for figure in figures(result, folder) for path in figure.save(target)]
+    ordered = sorted(figures(result, folder), key=lambda figure: figure.dense)
+    others, own = (ordered[::2], ordered[1::2]) if beside is not None else ([], ordered)
+    drawing = None if beside is None else beside.draw(Path(folder), [figure.name for figure in others])
+    written = [path for figure in own for path in figure.save(target)]
+    written += [] if drawing is None else drawing.result()
     keep_only(written, target)
     return written
 

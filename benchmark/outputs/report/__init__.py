@@ -7,10 +7,11 @@ import io
 import itertools
 import json
 import re
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from semstab.engine.observer import Observer
 from semstab.model.records import Failure, Result
@@ -24,6 +25,9 @@ from semstab.outputs.tables import Table, tables, write_tables
 from semstab.outputs.tables.writers import ARROWS, relations, sections
 from semstab.runtime.files import write_text
 
+if TYPE_CHECKING:
+    from semstab.outputs.plots.drawing import DrawingProcess
+
 __all__ = ["Reporting", "write_report"]
 
 SCREEN_DPI = 200
@@ -33,18 +37,37 @@ CSS_INCH = 122
 """Pixels of the page an inch of a figure: its smallest type then is as large as the text of the tables."""
 
 
-class Reporting(Observer):
-    """Writes tables, figures and report.html into the folder when all has been computed."""
+WORTH_A_PROCESS = 5.0
+"""Seconds of work from which on figures are drawn by two processes."""
 
-    def __init__(self, folder: str | Path) -> None:
+
+class Reporting(Observer):
+    """Writes tables, figures and report.html into the folder when all has been computed, by one process or two."""
+
+    def __init__(self, folder: str | Path, *, processes: int = 1) -> None:
         self._folder = Path(folder)
+        self._processes = processes
+        self._began = time.monotonic()
+        self._beside: DrawingProcess | None = None
+
+    def advanced(self, frames: int, what: str) -> None:
+        """What takes a while is worth a second process for its figures."""
+        if self._beside is None and self._processes > 1 and time.monotonic() - self._began > WORTH_A_PROCESS:
+            from semstab.outputs.plots.drawing import DrawingProcess
+
+            self._beside = DrawingProcess()
 
     def run_finished(self, result: Result) -> None:
         """Write them; nothing where every unit failed."""
         if result.select():
             write_tables(result, self._folder)
-            plots.write_figures(result, self._folder)
+            plots.write_figures(result, self._folder, self._beside)
             write_report(result, self._folder)
+
+    def close(self) -> None:
+        """End the second process."""
+        if self._beside is not None:
+            self._beside.close()
 
 
 def write_report(result: Result, folder: str | Path) -> list[Path]:
