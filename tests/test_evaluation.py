@@ -35,7 +35,6 @@ from semstab.outputs.terminal import print_summary
 from semstab.runtime.json_form import to_json
 from semstab.settings import load_config
 from semstab.statistics import Estimate, Reliability, analyse, describe
-from semstab.statistics.__main__ import main
 from semstab.statistics.correctness import ACCURACY
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
@@ -100,17 +99,14 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
     assert by_name["a"]["geometry"]["geometry"]["value"] == 0.0
 
 
-def test_the_module_says_of_the_folder_what_the_run_said(ran, tmp_path, monkeypatch, capsys) -> None:
-    run, _, summary = ran
-    monkeypatch.setattr("sys.argv", ["", str(run), "--json", str(tmp_path / "found.json")])
-    assert main() == 0
-    assert "Krippendorff's alpha" in capsys.readouterr().out
-    found = json.loads((tmp_path / "found.json").read_text())
-    for entry, row in zip(summary["runs"], found["maps"], strict=True):
-        assert {key: row[key] for key in entry["statistics"]} == entry["statistics"]
-    (here,), (there,) = summary["comparisons"], found["comparisons"]
-    assert {key for key in here if here[key] != there[key]} == {"fusion_rules"}  # a run does not keep all logs
-    assert here["paired"]["values"]["accuracy"].keys() == {"a", "b"}
+def test_all_that_was_found_is_printed_where_it_was_asked_for(ran) -> None:
+    _, printed, summary = ran
+    assert printed.count("Krippendorff's alpha") == len(summary["runs"]) == 3
+    for words in ("wall, a\n-------", "wall: a and b\n", "by alpha: 1.", "stable, wrong (OP >= 3)", "majority"):
+        assert words in printed
+    (found,) = summary["comparisons"]
+    assert found["fusion_rules"]["voxels"] > 0  # the logs of both were kept
+    assert found["paired"]["values"]["accuracy"].keys() == {"a", "b"}
 
 
 def test_the_verdict_on_each_backbone_is_printed(ran) -> None:

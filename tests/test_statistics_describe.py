@@ -7,22 +7,18 @@ import math
 
 import numpy as np
 import pytest
-import tiny_scene
 from simulated_events import grid, log_of
 
-import semstab
-from semstab.config import Config
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.comparison import BackboneComparison
 from semstab.model.statistics import UNDEFINED, MapStatistics
 from semstab.model.voxels import VoxelTable
+from semstab.outputs.statistics_text import comparison_lines, lines
 from semstab.runtime.files import read_json, write_json
 from semstab.runtime.json_form import from_json, to_json
 from semstab.statistics import Estimate, analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
-from semstab.statistics.__main__ import main
 from semstab.statistics.agreement import PSA
-from semstab.statistics.text import comparison_lines, lines
 
 SIDE, F = 24, 8
 
@@ -192,35 +188,3 @@ def test_voxels_seen_once_change_no_verdict():
     a, b = describe(table), describe(only)
     assert a.verdict.level == b.verdict.level
     assert to_json(a.agreement) == to_json(b.agreement)
-
-
-# --- The command ------------------------------------------------------------------------------------------------------
-
-
-def test_the_command_reads_a_run_folder(tmp_path, capsys, monkeypatch):
-    scene = tiny_scene.write(tmp_path / "wall")
-    config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": 0.25}
-    content = config | {"backbones": ["a", "b", "gt"], "backends": ["numpy"], "check": None, "events": True}
-    semstab.engine.run(Config.build(content, "test"), out=tmp_path / "run")
-    monkeypatch.setattr(
-        "sys.argv",
-        ["", str(tmp_path / "run"), "--json", str(tmp_path / "found.json"), "--maps", str(tmp_path / "maps")],
-    )
-    assert main() == 0
-    out = capsys.readouterr().out
-    assert "wall, a, numpy" in out
-    assert "Krippendorff's alpha" in out
-    assert "by alpha: 1." in out
-    found = read_json(tmp_path / "found.json")
-    assert [row["backbone"] for row in found["maps"]] == ["a", "b", "gt"]
-    assert found["maps"][2]["correctness"] is None
-    assert found["maps"][0]["correctness"]["accuracy"]["value"] > 0.5
-    assert found["comparisons"][0]["fusion_rules"]["voxels"] > 0
-    (path,) = (tmp_path / "maps").glob("wall__a__*.parquet")
-    assert len(VoxelTable.load(path)) == found["maps"][0]["voxels"]
-
-
-def test_the_command_says_in_one_line_what_is_wrong(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["", str(tmp_path)])
-    assert main() == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -31,10 +31,18 @@ def analyse_map(
     return analyse(table, events, truth, limit=truth, name=task.backbone, edges=config.strata)
 
 
-def comparison(scene: str, maps: Mapping[str, VoxelTable], truth: VoxelTable | None) -> BackboneComparison | None:
-    """Maps of a scene beside each other; None where there are not two or more of them in one label space."""
+def comparison(
+    scene: str,
+    maps: Mapping[str, VoxelTable],
+    truth: VoxelTable | None = None,
+    logs: Mapping[str, Events] | None = None,
+) -> BackboneComparison | None:
+    """Maps of a scene beside each other; None where there are not two or more of them in one label space.
+
+    With the logs of all of them, also under other rules of fusion.
+    """
     if len(maps) < 2 or len({table.classes for table in maps.values()}) > 1:
         return None
     if truth is not None and truth.classes != next(iter(maps.values())).classes:
         truth = None
-    return compare_backbones(maps, truth=truth, scene=scene)
+    return compare_backbones(maps, logs, truth, scene=scene)

@@ -28,7 +28,7 @@ from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
 from semstab.model.results import Agreement
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 from semstab.statistics import BackboneComparison
@@ -234,7 +234,7 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
     with found.watch("agreement"):
         agreement = tuple(_agreement(plan.config, records, tables))
     with found.watch("comparisons"):
-        comparisons = tuple(_comparisons(records, tables)) if plan.config.statistics else ()
+        comparisons = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
     return Result(
         name=plan.config.name,
         backend=plan.config.backends[0].name,
@@ -284,14 +284,17 @@ def _must_agree(name: str, check: bool | None) -> bool:
     return getattr(REGISTRY.load(name), "pointwise", True) if check is None else check
 
 
-def _comparisons(records: Sequence[Record], tables: _Tables) -> Iterator[BackboneComparison]:
+def _comparisons(config: Config, records: Sequence[Record], tables: _Tables) -> Iterator[BackboneComparison]:
     """The base units of each scene beside each other; accuracy where there is ground truth."""
     base = [record for record in records if record.variation.sweep == BASE]
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
         truths = [record.truth_file for record in there if record.truth_file is not None]
         truth = VoxelTable.load(truths[0]) if truths and len(there) > 1 else None
-        found = comparison(scene, {record.unit.backbone: tables.of(record) for record in there}, truth)
+        files = {record.unit.backbone: record.events_file for record in there if config.events}
+        logs = {name: Events.load(file) for name, file in files.items() if file is not None and file.exists()}
+        maps = {record.unit.backbone: tables.of(record) for record in there}
+        found = comparison(scene, maps, truth, logs if len(logs) == len(there) > 1 else None)
         if found is not None:
             yield found
 

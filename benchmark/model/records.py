@@ -100,7 +100,12 @@ class Record:
     @property
     def series(self) -> Path | None:
         """File of its time series, beside that of its voxels."""
-        return None if self.voxels_file is None else self.voxels_file.parent.parent / "frames" / f"{self.unit.slug}.csv"
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / FRAMES / f"{self.unit.slug}.csv"
+
+    @property
+    def events_file(self) -> Path | None:
+        """File of its log of observations, which is there where it was asked for and its backend keeps one."""
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
 
 
 @dataclass(frozen=True)

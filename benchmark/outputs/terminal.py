@@ -15,6 +15,7 @@ from semstab.metrics import macro_mean, pool
 from semstab.model.measures import measures
 from semstab.model.records import Result
 from semstab.model.results import STAGES, Agreement, Means, UnitSummary
+from semstab.outputs.statistics_text import comparison_lines, lines
 
 NOTHING = "-"
 
@@ -27,8 +28,8 @@ def print_summary(result: Result, console: Console) -> None:
     if result.agreement:
         console.print(_agreement_table(result.agreement))
     console.print(_stages_line(shown))
-    for line in _verdict_lines(result):
-        console.print(line, highlight=False, markup=False)
+    for text in _statistics(result):
+        console.print(text, highlight=False, markup=False)
     for run in shown:
         if run.frames_left_out:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
@@ -41,17 +42,27 @@ def print_summary(result: Result, console: Console) -> None:
     )
 
 
-def _verdict_lines(result: Result) -> Iterator[str]:
-    """The verdict on each backbone, scene by scene, from the fullest statistics that a backend of the run has."""
-    several = len(result.scenes) > 1
+def _statistics(result: Result) -> Iterator[str]:
+    """The verdict on each backbone, scene by scene; with `--statistics` all that was found, and the comparisons."""
     units = [record.summary for record in (*result.select(), *result.select(BACKENDS))]
     for base in result.select():
         group = (base.unit.scene, base.unit.backbone)
         same = [run for run in units if (run.unit.scene, run.unit.backbone) == group]
         judged = [run.statistics for run in same if run.statistics is not None]
         if judged:
-            scene = f"{base.unit.scene}, " if several else ""
-            yield f"{scene}{max(judged, key=lambda found: found.sections).verdict.line}\n"
+            fullest = max(judged, key=lambda found: found.sections)
+            if fullest.sections:
+                yield "\n".join([*_headline(f"{base.unit.scene}, {base.unit.backbone}"), *lines(fullest), ""])
+            else:
+                scene = f"{base.unit.scene}, " if len(result.scenes) > 1 else ""
+                yield f"{scene}{fullest.verdict.line}\n"
+    for compared in result.comparisons:
+        title = f"{compared.scene}: {_listed(compared.backbones)}"
+        yield "\n".join([*_headline(title), *comparison_lines(compared), ""])
+
+
+def _headline(title: str) -> tuple[str, str]:
+    return title, "-" * len(title)
 
 
 def _once(run: UnitSummary) -> int:

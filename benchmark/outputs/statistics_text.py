@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison
-from semstab.model.measures import measures
+from semstab.model.measures import SBD, measures
 from semstab.model.statistics import Estimate, MapStatistics, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
@@ -131,17 +131,16 @@ def _tables(found: MapStatistics) -> Iterable[str]:
 
 
 def _strata(found: MapStatistics) -> list[str]:
-    keys = (measure.key for measure in measures())
+    keys = ("OP", "voxels", "psa", "SBD", "SBD in random order", "entropy: within", "between")
     rows: list[Sequence[Cell]] = [
-        (r.name, r.voxels, r.psa, *r.means.of_all(), r.sbd_null, r.entropy_within, r.entropy_between)
-        for r in found.strata
+        (r.name, r.voxels, r.psa, r.means[SBD], r.sbd_null, r.entropy_within, r.entropy_between) for r in found.strata
     ]
-    return _table(("name", "voxels", "psa", *keys, "sbd_null", "entropy_within", "entropy_between"), rows)
+    return _table(keys, rows)
 
 
 def _rules(outcomes: Sequence[RuleOutcome], *, known: bool) -> list[str]:
     """How right each rule is only where that is known."""
-    keys = ("rule", *(measure.key for measure in measures()), "relabelled_share", ACCURACY.key, ECE.key)
+    keys = ("rule", *(measure.key for measure in measures()), "relabelled", ACCURACY.key, ECE.key)
     rows: list[Sequence[Cell]] = [
         (r.rule, *r.values.means.of_all(), r.relabelled_share, r.values.accuracy, r.values.ece) for r in outcomes
     ]
