@@ -205,7 +205,7 @@ def pixels(axes):
 def test_a_map_has_the_colours_of_its_categories():
     columns = {"op": [1, 4, 4], "evidence": [SURE, [2, 2, 0], [4, 0, 0]], "drift_sum": [0, 0.6, 0]}
     table = at([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **columns)
-    kind, _, drift, doubt, *_ = draw_stability(table, (0, 0, 1)).axes
+    kind, drift, doubt, *_ = draw_stability(table, (0, 0, 1)).axes
     assert pixels(kind)[0].tolist() == [list(CATEGORY_COLORS[k]) for k in categories(table)]
     grey = [204, 204, 204]
     assert pixels(drift)[0, 0, :3].tolist() == grey
@@ -215,7 +215,7 @@ def test_a_map_has_the_colours_of_its_categories():
 
 def test_nothing_is_white():
     table = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
-    for axes in draw_stability(table, (0, 0, 1)).axes[: 1 + len(measures())]:
+    for axes in draw_stability(table, (0, 0, 1)).axes[: 1 + sum(measure.panel for measure in measures())]:
         assert pixels(axes)[0, 1, :3].tolist() == [255, 255, 255]
 
 

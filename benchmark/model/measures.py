@@ -82,12 +82,14 @@ class Measure(Quantity):
     of         computes it: (n,), NaN where undefined
     lowest_op  from which OP on it is defined
     range      of its colours, in which maps differ; values beyond look like the ends
+    panel      whether it has a panel in the figure of a map: not where another one shows the same places
     """
 
     of: Callable[[Beliefs], Float64]
     range: tuple[float, float]
     lowest_op: int = 1
     largest: float = 1.0
+    panel: bool = True
 
 
 # --- Formulas ---------------------------------------------------------------------------------------------------------
@@ -143,7 +145,7 @@ SBD_MAX = 1.5 - 0.75 * math.log2(3)
 
 _SECTION = "Voxel-Level Stability Metrics"
 
-VSS = Measure(key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), section=_SECTION)
+VSS = Measure(key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), panel=False, section=_SECTION)
 SBD = Measure(
     key="sbd", title="SBD", unit="bits", better="lower", digits=(4, 4), of=sbd, range=(0.0, SBD_MAX), largest=SBD_MAX,
     lowest_op=2, section=_SECTION,
@@ -152,7 +154,7 @@ ENTROPY = Measure(
     key="entropy", title="Entropy", short="H", better="lower", digits=(4, 4), of=entropy, range=(0.0, 0.5),
     section=_SECTION,
 )  # fmt: skip
-MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0))
+MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0), panel=False)
 
 _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 

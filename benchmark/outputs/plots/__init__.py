@@ -33,11 +33,15 @@ def write_figures(result: Result, folder: str | Path, beside: DrawingProcess | N
     A process `beside` this one draws every second of them. Other figures there are removed.
     """
     target = Path(folder) / "figures"
-    ordered = sorted(figures(result, folder), key=lambda figure: figure.dense)
-    others, own = (ordered[::2], ordered[1::2]) if beside is not None else ([], ordered)
-    drawing = None if beside is None else beside.draw(Path(folder), [figure.name for figure in others])
-    written = [path for figure in own for path in figure.save(target)]
-    written += [] if drawing is None else drawing.result()
+    wanted = figures(result, folder)
+    ordered = sorted(wanted, key=lambda figure: figure.dense)  # these take longest: to each process its half of them
+    own = ordered if beside is None else ordered[1::2]
+    drawing = None if beside is None else beside.draw(Path(folder), [each.name for each in ordered[::2]])
+    for figure in own:
+        figure.save(target)
+    if drawing is not None:
+        drawing.result()
+    written = [path for figure in wanted for path in figure.paths(target)]
     keep_only(written, target)
     return written
 

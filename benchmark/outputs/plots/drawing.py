@@ -22,8 +22,8 @@ class DrawingProcess:
         self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(listening,))
         self._pool.submit(_load)
 
-    def draw(self, folder: Path, names: Sequence[str]) -> Future[list[Path]]:
-        """Begin to draw the figures of those names from the finished folder; the paths of their files."""
+    def draw(self, folder: Path, names: Sequence[str]) -> Future[None]:
+        """Begin to draw the figures of those names from the finished folder."""
         return self._pool.submit(_draw, folder, names)
 
     def close(self) -> None:
@@ -40,6 +40,7 @@ def _load() -> None:
     import pyarrow.parquet  # noqa: F401
 
 
-def _draw(folder: Path, names: Sequence[str]) -> list[Path]:
-    wanted = [figure for figure in figures(load_result(folder), folder) if figure.name in names]
-    return [path for figure in wanted for path in figure.save(folder / "figures")]
+def _draw(folder: Path, names: Sequence[str]) -> None:
+    for figure in figures(load_result(folder), folder):
+        if figure.name in names:
+            figure.save(folder / "figures")

@@ -48,14 +48,15 @@ WIDE = 1.4
 
 
 def draw_stability(table: VoxelTable, up: Sequence[float]) -> Figure:
-    """Stability category and every measure of the topmost voxels, with a scale bar."""
+    """Stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
     rows, cell = top_down(table, up)
-    figure, (kind, *panels) = _panels(rows, 1 + len(measures()))
+    shown = [measure for measure in measures() if measure.panel]
+    figure, (kind, *panels) = _panels(rows, 1 + len(shown))
     _draw_categories(figure, kind, rows, categories(table))
-    for axes, measure in zip(panels, measures(), strict=True):
+    for axes, measure in zip(panels, shown, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
         _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
-    titles = ("stability", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in measures()))
+    titles = ("stability", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         _frame(axes)

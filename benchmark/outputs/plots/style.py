@@ -68,11 +68,15 @@ class Figure:
     draw: Callable[[], Canvas]
     dense: bool = False
 
+    def paths(self, folder: Path) -> list[Path]:
+        """Its files in a folder: FOLDER/NAME.png and .svg."""
+        return [folder / f"{self.name}.png", folder / f"{self.name}.svg"]
+
     def save(self, folder: Path) -> list[Path]:
-        """Draw it and write FOLDER/NAME.png and .svg, byte for byte the same for the same content."""
+        """Draw it and write its files, byte for byte the same for the same content."""
         import matplotlib
 
-        png, svg = folder / f"{self.name}.png", folder / f"{self.name}.svg"
+        png, svg = self.paths(folder)
         with matplotlib.rc_context(_STYLE):
             canvas = self.draw()
             with atomic_path(png) as temporary:

@@ -45,7 +45,7 @@ class Parts:
         assert whole.final is not None
         parts = sorted(self.folder.glob("*.rrd"))
         whole.final.parent.mkdir(parents=True, exist_ok=True)
-        command = [rerun_program(), "rrd", "merge", *map(str, parts), "-o", str(whole.final)]
+        command = [rerun_program(), "rrd", "optimize", *map(str, parts), "-o", str(whole.final)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise ConfigError(
