@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from semstab.model.voxels import Events, VoxelTable
     from semstab.settings import load_config, load_study
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Config",
