@@ -9,8 +9,8 @@ import tiny_scene
 import semstab
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
-from semstab.engine import memory
 from semstab.engine.units import make_plan
+from semstab.engine.work import memory
 from semstab.engine.work.memory import available_bytes, estimate, require_memory
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics

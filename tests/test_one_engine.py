@@ -21,6 +21,8 @@ import semstab
 from semstab.config import BACKENDS
 from semstab.engine import LocalProcesses, load_result
 from semstab.metrics import compare
+from semstab.outputs.plots import write_figures
+from semstab.outputs.plots.drawing import DrawingProcess
 from semstab.outputs.recording import Recording, Target
 from semstab.settings import load_config, load_study
 
@@ -185,3 +187,18 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
     monkeypatch.undo()
     semstab.engine.run(load_config(overrides=settings(root, backbones=["a"])), out=out)
     assert not (out / "failures.log").exists()
+
+
+def test_two_processes_draw_the_figures_that_one_draws(root, tmp_path) -> None:
+    out = tmp_path / "run"
+    result = semstab.engine.run(load_config(overrides=settings(root, backends=["numpy"])), out=out)
+    drawn = []
+    for beside in (None, DrawingProcess()):
+        write_figures(result, out, beside)
+        drawn.append({file.name: file.read_bytes() for file in (out / "figures").iterdir()})
+        if beside is not None:
+            beside.close()
+            write_figures(result, out, beside)  # it is gone: all are drawn here
+            drawn.append({file.name: file.read_bytes() for file in (out / "figures").iterdir()})
+    assert len(drawn[0]) >= 8
+    assert drawn[0] == drawn[1] == drawn[2]

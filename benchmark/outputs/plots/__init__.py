@@ -35,12 +35,13 @@ def write_figures(result: Result, folder: str | Path, beside: DrawingProcess | N
     target = Path(folder) / "figures"
     wanted = figures(result, folder)
     ordered = sorted(wanted, key=lambda figure: figure.dense)  # these take longest: to each process its half of them
-    own = ordered if beside is None else ordered[1::2]
-    drawing = None if beside is None else beside.draw(Path(folder), [each.name for each in ordered[::2]])
+    own, others = (ordered, []) if beside is None else (ordered[1::2], ordered[::2])
+    drawn = None if beside is None else beside.draw(Path(folder), [figure.name for figure in others])
     for figure in own:
         figure.save(target)
-    if drawing is not None:
-        drawing.result()
+    if drawn is not None and not drawn():
+        for figure in others:
+            figure.save(target)
     written = [path for figure in wanted for path in figure.paths(target)]
     keep_only(written, target)
     return written

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
-from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -20,11 +22,25 @@ class DrawingProcess:
         context = multiprocessing.get_context("spawn")
         listening, self._alive = context.Pipe(duplex=False)
         self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(listening,))
-        self._pool.submit(_load)
+        with contextlib.suppress(BrokenProcessPool):
+            self._pool.submit(_load)
 
-    def draw(self, folder: Path, names: Sequence[str]) -> Future[None]:
-        """Begin to draw the figures of those names from the finished folder."""
-        return self._pool.submit(_draw, folder, names)
+    def draw(self, folder: Path, names: Sequence[str]) -> Callable[[], bool]:
+        """Begin to draw the figures of those names from the finished folder.
+
+        What is returned waits for them, and says whether they are there: not where the process died, or never came to
+        life, as in a script that cannot be imported.
+        """
+        drawing = None
+        with contextlib.suppress(BrokenProcessPool, RuntimeError):
+            drawing = self._pool.submit(_draw, folder, names)
+
+        def drawn() -> bool:
+            with contextlib.suppress(BrokenProcessPool):
+                return drawing is not None and drawing.result() is None
+            return False
+
+        return drawn
 
     def close(self) -> None:
         """End the process, also where it is at work."""
