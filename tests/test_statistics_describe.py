@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 import tiny_scene
+from posed_config import configure
 from simulated_events import grid, log_of
 
 import semstab
 from semstab.comparison_model import BackboneComparison
-from semstab.config import Config
 from semstab.errors import ConfigError, DataError
 from semstab.files import read_json, write_json
 from semstab.json_form import from_json, to_json
@@ -199,9 +199,8 @@ def test_voxels_seen_once_change_no_verdict():
 
 def test_the_command_reads_a_run_folder(tmp_path, capsys, monkeypatch):
     scene = tiny_scene.write(tmp_path / "wall")
-    config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": 0.25}
-    content = config | {"backbones": ["a", "b", "gt"], "backends": ["numpy"], "check": None, "events": True}
-    semstab.engine.run(Config.build(content, "test"), out=tmp_path / "run")
+    config = configure(scene, backbones=["a", "b", "gt"], check=None, events=True)
+    semstab.engine.run(config, out=tmp_path / "run")
     monkeypatch.setattr(
         "sys.argv",
         ["", str(tmp_path / "run"), "--json", str(tmp_path / "found.json"), "--maps", str(tmp_path / "maps")],
