@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import tiny_scene
+from posed_config import configure
 
 import semstab
 from semstab import backends, metrics
@@ -33,7 +34,6 @@ from semstab.recording.layout import Scenery, direction, fit
 from semstab.recording.series import OF_THE_BACKBONE
 from semstab.records import Record, Result, Variation
 from semstab.results import Unit, UnitSummary
-from semstab.settings import load_config
 from semstab.task import Task
 from semstab.voxels import VoxelTable
 
@@ -41,8 +41,7 @@ NANOSECONDS = 1_000_000_000
 
 
 def config_of(root: Path, backend: str = "numpy") -> Config:
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return load_config(overrides={"dataset": dataset, "backends": [backend], "voxel_size": 0.25})
+    return configure(root, backends=[backend])
 
 
 @pytest.fixture(scope="module")
