@@ -67,29 +67,29 @@ class ColourClusters(Backbone):
         self.fit_frames = options.fit_frames
         names = tuple(f"cluster {k}" for k in range(options.clusters))
         self.label_space = LabelSpace("colour clusters", names)
-        self._codebook = codebook
+        self.codebook = codebook
 
     def fit(self, images: Sequence[Image]) -> ColourClusters:
         """With the codebook of these images. Raises ConfigError where they have fewer pixels than clusters."""
         rng = np.random.default_rng(self.options.seed)
-        drawn = [_drawn(_features(image, self.options.scale), self.options.samples, rng) for image in images]
+        drawn = [_drawn(pixel_features(image, self.options.scale), self.options.samples, rng) for image in images]
         return ColourClusters(self.options, _codebook(np.concatenate(drawn), self.options))
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """Raises ConfigError where `fit` was not called."""
-        if self._codebook is None:
+        if self.codebook is None:
             raise ConfigError("colour-clusters has no codebook yet; call fit with the first images of the sequence")
-        return [_predict(_features(image, self.options.scale), self._codebook, scores) for image in images]
+        return [_predict(pixel_features(image, self.options.scale), self.codebook, scores) for image in images]
 
     def identity(self) -> dict[str, Any]:
         """The settings and the codebook."""
-        book = self._codebook
+        book = self.codebook
         arrays = () if book is None else (book.mean, book.deviation, book.centres)
         digest = hashlib.blake2b(b"".join(array.tobytes() for array in arrays), digest_size=16).hexdigest()
         return {**self.options.model_dump(mode="json"), "codebook": digest}
 
 
-def _features(image: Image, scale: float) -> Features:
+def pixel_features(image: Image, scale: float) -> Features:
     """(H, W, 4): Lab colour in a Gaussian window, lightness 0 to 100, and the deviation of lightness in it."""
     lab = cv2.cvtColor(image.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
     mean = cv2.GaussianBlur(lab, (0, 0), scale)

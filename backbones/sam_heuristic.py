@@ -95,7 +95,7 @@ class SamHeuristic(Backbone):
     def __init__(self, options: SamHeuristicOptions) -> None:
         self.rules = read_rules(options.rules)
         self.label_space = LabelSpace("sam heuristic", tuple(self.rules.names))
-        self._proposer = SamProposer(options)
+        self.proposer = SamProposer(options)
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`; there are no scores."""
@@ -103,12 +103,12 @@ class SamHeuristic(Backbone):
 
     def identity(self) -> dict[str, Any]:
         """The checkpoint's revision, the settings and the rules."""
-        return self._proposer.identity() | {"rules": self.rules.model_dump(mode="json")}
+        return self.proposer.identity() | {"rules": self.rules.model_dump(mode="json")}
 
     def _labels(self, image: Image) -> npt.NDArray[np.uint8]:
         hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV).astype(np.uint8, copy=False)
         labels = np.full(image.shape[:2], self.rules.names.index(self.rules.rest), dtype=np.uint8)
-        for mask in self._proposer.propose(image).by_area(self._proposer.options.min_area):
+        for mask in self.proposer.propose(image).by_area(self.proposer.options.min_area):
             labels[mask] = self.rules.class_of(look_of(hsv, mask))
         return labels
 

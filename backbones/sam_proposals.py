@@ -89,10 +89,10 @@ class SamProposer:
     def __init__(self, options: SamOptions) -> None:
         self.options = options
         self.checkpoint = Checkpoint.find(options)
-        self._processor = self.checkpoint.load(transformers.AutoImageProcessor)
-        self._model = self.checkpoint.load_model(transformers.AutoModelForMaskGeneration, options)
-        if not isinstance(self._model, transformers.SamModel):
-            kind = self._model.config.model_type
+        self.processor = self.checkpoint.load(transformers.AutoImageProcessor)
+        self.model = self.checkpoint.load_model(transformers.AutoModelForMaskGeneration, options)
+        if not isinstance(self.model, transformers.SamModel):
+            kind = self.model.config.model_type
             raise DataError(
                 f"{self.checkpoint.folder}: a '{kind}' model; name one of the first Segment Anything ('sam')"
             )
@@ -122,10 +122,10 @@ class SamProposer:
 
     @torch.inference_mode()
     def _propose(self, image: Image) -> Proposals:
-        inputs = self._processor(images=image, input_data_format="channels_last", return_tensors="pt")
+        inputs = self.processor(images=image, input_data_format="channels_last", return_tensors="pt")
         resized = tuple(int(side) for side in inputs["reshaped_input_sizes"][0])
-        pixels = inputs["pixel_values"].to(self._model.device, self._model.dtype)
-        embedding = self._model.get_image_embeddings(pixels)
+        pixels = inputs["pixel_values"].to(self.model.device, self.model.dtype)
+        embedding = self.model.get_image_embeddings(pixels)
         points = point_grid(self.options.points_per_side) * np.array(resized[::-1])
         sizes = (tuple(pixels.shape[-2:]), resized, image.shape[:2])
         kept = [
@@ -138,7 +138,7 @@ class SamProposer:
     def _ask(self, embedding: torch.Tensor, points: Array, sizes: Any) -> Iterator[_Found]:
         """The masks at these points that the model rates well and that are stable."""
         where = torch.as_tensor(points, dtype=embedding.dtype, device=embedding.device)
-        found = self._model(image_embeddings=embedding, input_points=where[None, :, None, :], multimask_output=True)
+        found = self.model(image_embeddings=embedding, input_points=where[None, :, None, :], multimask_output=True)
         scores = found.iou_scores[0].flatten().float()
         masks = found.pred_masks[0].flatten(0, 1)
         for k in torch.nonzero(scores > self.options.pred_iou).flatten().tolist():

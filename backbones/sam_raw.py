@@ -20,13 +20,13 @@ class SamRaw(Backbone):
     Options: type[BaseModel] = SamOptions
 
     def __init__(self, options: SamOptions) -> None:
-        self._proposer = SamProposer(options)
+        self.proposer = SamProposer(options)
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`; there are no scores."""
-        min_area = self._proposer.options.min_area
-        return [Prediction(region_map(self._proposer.propose(image), min_area)) for image in images]
+        min_area = self.proposer.options.min_area
+        return [Prediction(region_map(self.proposer.propose(image), min_area)) for image in images]
 
     def identity(self) -> dict[str, Any]:
         """The checkpoint's revision and the settings."""
-        return self._proposer.identity()
+        return self.proposer.identity()

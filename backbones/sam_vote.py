@@ -37,26 +37,26 @@ class SamVote(Backbone):
         self._voter = voter or create(options.voter, **options.voter_options)
         if self._voter.label_space is None:
             raise ConfigError(f"sam-vote: the voter '{options.voter}' has no classes; choose one that has")
-        self._proposer = proposer or SamProposer(options)
+        self.proposer = proposer or SamProposer(options)
         self.label_space = self._voter.label_space
         self.fit_frames = self._voter.fit_frames
 
     def fit(self, images: Sequence[Image]) -> Backbone:
         """With the fitted voter."""
-        return SamVote(self.options, self._proposer, self._voter.fit(images))
+        return SamVote(self.options, self.proposer, self._voter.fit(images))
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`; there are no scores."""
-        min_area = self._proposer.options.min_area
+        min_area = self.proposer.options.min_area
         votes = self._voter.predict(images)
         return [
-            Prediction(majority(vote.labels, self._proposer.propose(image), min_area))
+            Prediction(majority(vote.labels, self.proposer.propose(image), min_area))
             for image, vote in zip(images, votes, strict=True)
         ]
 
     def identity(self) -> dict[str, Any]:
         """Those of the proposals and of the voter."""
-        return self._proposer.identity() | {"voter": self.options.voter, "voter_options": self._voter.identity()}
+        return self.proposer.identity() | {"voter": self.options.voter, "voter_options": self._voter.identity()}
 
 
 def majority(labels: Labels, proposals: Proposals, min_area: int) -> Labels:

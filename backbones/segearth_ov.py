@@ -61,7 +61,7 @@ class SegEarthOV(Backbone):
         self.stride = options.stride or max(1, self.window // 2)
         if self.stride > self.window:
             raise ConfigError(f"segearth-ov: stride {self.stride} leaves gaps between windows of {self.window} pixels")
-        self._queries = self._text_features(self.checkpoint.load(transformers.AutoTokenizer), self.prompts)
+        self.queries = self._text_features(self.checkpoint.load(transformers.AutoTokenizer), self.prompts)
         self._class_of_query = torch.tensor([k for k, _ in self.prompts.queries], device=self._model.device)
         self._upsampler = _load_upsampler(options.upsampler, self._model)
 
@@ -84,7 +84,7 @@ class SegEarthOV(Backbone):
 
     def _prediction(self, image: Image, scores: bool) -> Prediction:
         pixels = torch.as_tensor(normalised(image, self.options.resize)).to(self._model.device, self._model.dtype)
-        logits = slide(pixels, self.window, self.stride, self._window_logits)
+        logits = slide(pixels, self.window, self.stride, self.window_logits)
         full = bilinear(logits.float(), image.shape[:2])
         probability = self._class_probability((self.options.sharpness * full).softmax(dim=0))
         best, label = probability.max(dim=0)
@@ -102,14 +102,14 @@ class SegEarthOV(Backbone):
         rows = range(len(self.prompts.classes))
         return torch.stack([probability[self._class_of_query == k].amax(dim=0) for k in rows])
 
-    def _window_logits(self, window: torch.Tensor) -> torch.Tensor:
+    def window_logits(self, window: torch.Tensor) -> torch.Tensor:
         """(queries, h, w) cosines of a window (3, h, w)."""
         pixels, place = padded(window[None], int(self._model.vision_model.config.patch_size))
         whole, patches = dense_features(self._model, pixels)
         if self._upsampler is not None:
             patches = self._upsampler(patches, pixels)
-        cosine = torch.einsum("qd,dhw->qhw", self._queries, nn.functional.normalize(patches[0], dim=0))
-        cosine = cosine + self.options.bias * (self._queries @ nn.functional.normalize(whole[0], dim=0))[:, None, None]
+        cosine = torch.einsum("qd,dhw->qhw", self.queries, nn.functional.normalize(patches[0], dim=0))
+        cosine = cosine + self.options.bias * (self.queries @ nn.functional.normalize(whole[0], dim=0))[:, None, None]
         return bilinear(cosine, pixels.shape[-2:])[:, *place]
 
     @torch.inference_mode()

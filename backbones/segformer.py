@@ -50,7 +50,7 @@ class Segformer(Backbone):
         self.processor = _processor(self.checkpoint)
         model = self.checkpoint.load_model(transformers.AutoModelForSemanticSegmentation, options)
         self.label_space = label_space(model.config.id2label, self.checkpoint.title)
-        self._logits = _engine(model, options)
+        self.engine = _engine(model, options)
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
@@ -62,7 +62,7 @@ class Segformer(Backbone):
             input_data_format="channels_last",
             return_tensors="pt",
         )["pixel_values"]
-        return [_prediction(logits, size, scores) for logits in self._logits(pixels)]
+        return [_prediction(logits, size, scores) for logits in self.engine(pixels)]
 
     def identity(self) -> dict[str, Any]:
         """The checkpoint's revision and the settings."""

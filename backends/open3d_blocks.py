@@ -49,10 +49,10 @@ class Open3DBlocks(FusionBackend):
         self.num_classes = num_classes
         self.block_resolution = block_resolution
         self.device = _device(device)
-        self._in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
+        self.in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
         self._pixels = Aggregator(voxel_size, num_classes)
         self._total = MapTotal(num_classes)
-        self._attributes = {
+        self.attributes = {
             "op": (o3c.int32, 1),
             "evidence": (o3c.float64, num_classes),
             "drift_sum": (o3c.float64, 1),
@@ -62,7 +62,7 @@ class Open3DBlocks(FusionBackend):
             "self_sum": (o3c.float64, 1),
             "frame_entropy_sum": (o3c.float64, 1),
         }
-        voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self._attributes.values())
+        voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self.attributes.values())
         self.grid = self._new_grid(max(64, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
     @staticmethod
@@ -90,15 +90,15 @@ class Open3DBlocks(FusionBackend):
         index = self._index_of(rows)
         order = np.lexsort(index.T[::-1])
         rows = rows[order]
-        values: dict[str, Any] = {name: self._read(name, rows) for name in self._attributes}
+        values: dict[str, Any] = {name: self._read(name, rows) for name in self.attributes}
         return VoxelTable(**index_columns(index[order]), **values, voxel_size=self.voxel_size)
 
     def _new_grid(self, blocks: int) -> VoxelBlockGrid:
         """An empty grid with room for that many blocks."""
         return VoxelBlockGrid(
-            attr_names=tuple(self._attributes),
-            attr_dtypes=tuple(dtype for dtype, _ in self._attributes.values()),
-            attr_channels=tuple((channels,) for _, channels in self._attributes.values()),
+            attr_names=tuple(self.attributes),
+            attr_dtypes=tuple(dtype for dtype, _ in self.attributes.values()),
+            attr_channels=tuple((channels,) for _, channels in self.attributes.values()),
             voxel_size=self.voxel_size,
             block_resolution=self.block_resolution,
             block_count=blocks,
@@ -114,7 +114,7 @@ class Open3DBlocks(FusionBackend):
             return
         grid = self._new_grid(2 * needed)
         if old.size():
-            _copy_blocks(self.grid, grid, tuple(self._attributes))
+            _copy_blocks(self.grid, grid, tuple(self.attributes))
         self.grid = grid
 
     def _activate(self, index: Int64) -> Int64:
@@ -144,11 +144,11 @@ class Open3DBlocks(FusionBackend):
 
     def _update(self, rows: Int64, seen: Observed, frame: int) -> Change:
         """Add one observation to each row."""
-        names = tuple(self._attributes)
-        values = {name: self._attribute(name).numpy() if self._in_place else self._read(name, rows) for name in names}
+        names = tuple(self.attributes)
+        values = {name: self._attribute(name).numpy() if self.in_place else self._read(name, rows) for name in names}
         columns = {name: value if name == "evidence" else value.reshape(-1) for name, value in values.items()}
-        change = update_rows(rows if self._in_place else np.arange(len(rows)), seen, frame, **columns)
-        if not self._in_place:
+        change = update_rows(rows if self.in_place else np.arange(len(rows)), seen, frame, **columns)
+        if not self.in_place:
             for name in names:
                 self._write(name, rows, values[name])
         return change

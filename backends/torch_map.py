@@ -44,17 +44,17 @@ class TorchMap(FusionBackend):
         reserve: int = 0,
     ) -> None:
         self.num_classes = num_classes
-        self._maps = TorchMaps(voxel_size, {"": num_classes}, device, precision, kernels, memory_gb, reserve)
+        self.maps = TorchMaps(voxel_size, {"": num_classes}, device, precision, kernels, memory_gb, reserve)
 
     @property
     def voxel_size(self) -> float:
         """Edge of a voxel, metres."""
-        return self._maps.voxel_size
+        return self.maps.voxel_size
 
     @property
     def device(self) -> torch.device:
         """Where the map is."""
-        return self._maps.device
+        return self.maps.device
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
@@ -65,7 +65,7 @@ class TorchMap(FusionBackend):
         """Fuse one frame, copied to the device."""
         started = time.perf_counter()
         view, said = DepthView.of_frame(frame, self.device), evidence_of_frame(frame, self.device)
-        return self._maps.fuse(view, {"": said}, started)[""]
+        return self.maps.fuse(view, {"": said}, started)[""]
 
     def integrate_tensors(
         self,
@@ -86,8 +86,8 @@ class TorchMap(FusionBackend):
         Raises DataError, with the map unchanged, where the frame cannot be fused.
         """
         said = TensorPrediction(labels=labels, scores=scores, logits=logits)
-        return self._maps.integrate_tensors(depth, intrinsics, T_wc, {"": said}, index=index)[""]
+        return self.maps.integrate_tensors(depth, intrinsics, T_wc, {"": said}, index=index)[""]
 
     def table(self) -> VoxelTable:
         """The map so far, brought to memory."""
-        return self._maps.table("")
+        return self.maps.table("")

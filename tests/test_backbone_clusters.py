@@ -42,7 +42,7 @@ def test_flat_colours_become_clusters_by_lightness():
 
 
 def test_clusters_are_numbered_by_lightness(fitted):
-    assert (np.diff(fitted._codebook.centres[:, 0]) >= 0).all()
+    assert (np.diff(fitted.codebook.centres[:, 0]) >= 0).all()
 
 
 def test_ids_stay_when_the_camera_moves(fitted):
@@ -53,9 +53,9 @@ def test_ids_stay_when_the_camera_moves(fitted):
 
 def test_labels_are_the_nearest_centres(fitted):
     """Brute force over pixels and centres, from the features up."""
-    from semstab.backbones.colour_clusters import _features
+    from semstab.backbones.colour_clusters import pixel_features
 
-    book, features = fitted._codebook, _features(IMAGES[2], 2.0)
+    book, features = fitted.codebook, pixel_features(IMAGES[2], 2.0)
     labels = fitted.predict([IMAGES[2]])[0].labels
     for y, x in np.random.default_rng(0).integers(0, 48, (50, 2)):
         distances = [np.sum(((features[y, x] - book.mean) / book.deviation - centre) ** 2) for centre in book.centres]

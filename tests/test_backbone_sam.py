@@ -80,8 +80,8 @@ def test_proposals_are_the_same_again_and_in_other_batches(options, proposer):
 
 def test_proposals_are_those_of_the_article(options, proposer):
     """All points at once, every mask at full size, the rules one after the other."""
-    model, settings = proposer._model, proposer.options
-    inputs = proposer._processor(images=IMAGE, return_tensors="pt")
+    model, settings = proposer.model, proposer.options
+    inputs = proposer.processor(images=IMAGE, return_tensors="pt")
     height, width = inputs["reshaped_input_sizes"][0].tolist()
     side = settings.points_per_side
     points = [[(x + 0.5) / side * width, (y + 0.5) / side * height] for y in range(side) for x in range(side)]
@@ -124,12 +124,12 @@ def test_the_thresholds_are_thresholds(options):
 def test_proposals_are_kept_in_a_folder(options, tmp_path, monkeypatch):
     cached = SamProposer(SamOptions(**options, cache=tmp_path))
     first = cached.propose(IMAGE)
-    monkeypatch.setattr(cached, "_propose", None)
+    monkeypatch.setattr(cached, "model", None)
     again = cached.propose(IMAGE)
     for field in dataclasses.fields(first):
         np.testing.assert_array_equal(getattr(first, field.name), getattr(again, field.name))
     other = SamProposer(SamOptions(**{**options, "min_area": 1000}, cache=tmp_path))
-    monkeypatch.setattr(other, "_propose", None)
+    monkeypatch.setattr(other, "model", None)
     assert len(other.propose(IMAGE)) == len(first)
     stricter = SamProposer(SamOptions(**{**options, "nms_iou": 0.1}, cache=tmp_path))
     stricter.propose(IMAGE)
@@ -211,7 +211,7 @@ def test_raw_proposals_have_no_classes(options):
     assert prediction.labels.dtype == np.uint16
     assert prediction.labels.shape == (48, 80)
     ids = np.unique(prediction.labels)
-    assert 0 < ids.max() <= len(backbone._proposer.propose(IMAGE))
+    assert 0 < ids.max() <= len(backbone.proposer.propose(IMAGE))
 
 
 # --- sam-heuristic ----------------------------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ def test_masks_become_classes(monkeypatch):
     halves = np.zeros((3, 4, 12), dtype=bool)
     for k in range(3):
         halves[k, :, 4 * k : 4 * k + 3] = True
-    monkeypatch.setattr(backbone._proposer, "propose", lambda image: proposals_of(*halves))
+    monkeypatch.setattr(backbone.proposer, "propose", lambda image: proposals_of(*halves))
     names = np.array(backbone.label_space.classes)[backbone.predict([image])[0].labels]
     assert names[0].tolist() == [*["road"] * 3, "clutter", *["vegetation"] * 3, "clutter", *["building"] * 3, "clutter"]
 
@@ -332,9 +332,9 @@ def test_the_vote_of_another_backbone(options):
     backbone = create("sam-vote", **options, voter="colour-clusters", voter_options={"clusters": 4}).fit([IMAGE])
     assert backbone.label_space == voter.label_space
     (prediction,) = backbone.predict([IMAGE])
-    proposals = backbone._proposer.propose(IMAGE)
+    proposals = backbone.proposer.propose(IMAGE)
     (vote,) = voter.predict([IMAGE])
-    expected = majority(vote.labels, proposals, backbone._proposer.options.min_area)
+    expected = majority(vote.labels, proposals, backbone.proposer.options.min_area)
     np.testing.assert_array_equal(prediction.labels, expected)
     assert backbone.identity()["voter_options"] == voter.identity()
 

@@ -310,7 +310,7 @@ def test_text_features_are_means_over_sentences(clip, tmp_path):
     file.write_text(yaml.safe_dump({"classes": ["car, van", "tree"], "templates": ["a {}.", "one big {}"]}))
     backbone = create("segearth-ov", model=str(tiny("clip")), prompts=file)
     tokenizer = AutoTokenizer.from_pretrained(tiny("clip"))
-    for row, name in zip(backbone._queries, ("car", "van", "tree"), strict=True):
+    for row, name in zip(backbone.queries, ("car", "van", "tree"), strict=True):
         features = []
         for sentence in (f"a {name}.", f"one big {name}"):
             found = clip.get_text_features(**tokenizer([sentence], return_tensors="pt")).pooler_output[0]
@@ -331,7 +331,7 @@ def test_the_likeliest_name_of_a_class_counts_and_unlikely_pixels_are_background
         column = torch.linspace(0, 2.999, window.shape[2]).long()
         return probability.log().clamp(min=-30)[column].T[:, None].expand(4, window.shape[1], -1)
 
-    monkeypatch.setattr(backbone, "_window_logits", window_logits)
+    monkeypatch.setattr(backbone, "window_logits", window_logits)
     (prediction,) = backbone.predict([np.zeros((32, 32, 3), dtype=np.uint8)], scores=True)
     labels, scores = prediction.labels[0], prediction.scores[0]
     assert labels[[2, 16, 29]].tolist() == [1, 0, 2]
@@ -344,10 +344,10 @@ def test_logits_are_cosines_with_the_images_own_taken_off(clip):
     backbone = create("segearth-ov", model=str(tiny("clip")), bias=-0.3)
     window = random(3, 32, 32)
     whole, patches = dense_features(clip, window[None])
-    found = backbone._window_logits(window)
+    found = backbone.window_logits(window)
     assert found.shape == (7, 32, 32)
     expected = np.zeros((7, 4, 4))
-    for q, query in enumerate(backbone._queries):
+    for q, query in enumerate(backbone.queries):
         for y in range(4):
             for x in range(4):
                 patch = patches[0, :, y, x]

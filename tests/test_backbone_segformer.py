@@ -101,8 +101,8 @@ def test_the_image_keeps_its_shape(image, shorter, size):
 def test_the_size_that_the_model_sees(monkeypatch, image_size, seen):
     backbone = create("segformer", model=str(tiny("segformer")), image_size=image_size)
     sizes = []
-    logits = backbone._logits
-    monkeypatch.setattr(backbone, "_logits", lambda pixels: sizes.append(tuple(pixels.shape[2:])) or logits(pixels))
+    logits = backbone.engine
+    monkeypatch.setattr(backbone, "engine", lambda pixels: sizes.append(tuple(pixels.shape[2:])) or logits(pixels))
     assert backbone.predict(IMAGES[:1])[0].labels.shape == (48, 80)
     assert sizes == [seen]
 

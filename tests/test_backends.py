@@ -77,7 +77,7 @@ class TestOpen3DByRows(BackendConformance):
 
     def create(self, voxel_size, num_classes):
         backend = open3d_map(voxel_size, num_classes, initial_bytes=2**24)
-        backend._in_place = False
+        backend.in_place = False
         return backend
 
 
@@ -306,7 +306,7 @@ def test_the_table_of_a_band_never_outgrows_its_memory(entries):
     for n in range(1, entries + 1):  # as in kernels.find_entries
         if 2 * n > mask:
             mask = 2 * mask + 1
-    assert mask < aggregator._slots_for(entries)
+    assert mask < aggregator.slots_for(entries)
 
 
 @pytest.mark.parametrize("columns", [1024, 1500])

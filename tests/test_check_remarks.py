@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from posed_config import configure, dataset_of
 from posed_writer import write_posed
 from room_scene import CLASSES, Room, walk, write
 from typer.testing import CliRunner
@@ -18,14 +19,12 @@ from semstab.check.registration import depth_edges, find_offset, grey_levels, im
 from semstab.check.sentinels import find_sentinel
 from semstab.cli import app
 from semstab.datasets import open_dataset
-from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 
 
 def remarks(root, **options):
-    dataset = {"name": "posed_folder", "options": {"root": str(root), **options}}
-    (checked,) = check(resolve(load_config(None, {"dataset": dataset, "check_geometry": False})))
+    (checked,) = check(configure(root, dataset=dataset_of(root, **options), check_geometry=False))
     return checked.remarks
 
 

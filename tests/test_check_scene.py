@@ -14,6 +14,7 @@ import pytest
 import tiny_scene
 import yaml
 from PIL import Image
+from posed_config import configure, dataset_of
 from room_scene import AXES, CAMERA, CLASSES, RAY_LENGTH, Room, opened, rigid, walk, write
 from typer.testing import CliRunner
 
@@ -23,18 +24,12 @@ from semstab.check.coverage import SIZES, plane_residuals
 from semstab.check.histogram import Tally
 from semstab.check.views import View
 from semstab.cli import app
-from semstab.config import Config
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
 from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
-
-
-def configured(root, **content) -> Config:
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return resolve(load_config(None, {"dataset": dataset} | content))
 
 
 def of_memory(room: Room, **content):
@@ -54,7 +49,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sound(folder):
-    (checked,) = check(configured(folder, voxel_size=0.1))
+    (checked,) = check(configure(folder, voxel_size=0.1))
     return checked
 
 
@@ -80,7 +75,7 @@ def test_motion_is_that_of_the_poses(sound):
 
 def test_persistence_is_that_of_the_run(folder, sound):
     """All 12 frames are fused, so that OP is the run's own."""
-    (run,) = semstab.engine.run(configured(folder, voxel_size=0.1, backbones=["gt"], backends=["numpy"])).runs
+    (run,) = semstab.engine.run(configure(folder, voxel_size=0.1, backbones=["gt"])).runs
     row = next(row for row in sound.persistence if row.voxel_size == 0.1)
     assert sound.fused_frames == 12
     assert (row.voxels, row.mean_op) == (run.table.voxels, pytest.approx(run.table.mean_op))
@@ -135,7 +130,7 @@ def test_suggestions_follow_from_the_data():
 
 
 def test_voxels_too_small_to_count_are_left_out(folder):
-    (checked,) = check(configured(folder, voxel_size=1e-9))
+    (checked,) = check(configure(folder, voxel_size=1e-9))
     assert (checked.verdict.state, checked.persistence) == ("sound", ())
     result = bench("check", "--data", folder, "--voxel-size", 1e-9)
     assert "observation persistence" not in result.stdout
@@ -143,13 +138,13 @@ def test_voxels_too_small_to_count_are_left_out(folder):
 
 def test_without_depth_nothing_is_said_about_motion(tmp_path):
     folder = write(tmp_path / "room", Room(walk(3), told_depth=lambda z: z * np.nan))
-    (checked,) = check(configured(folder))
+    (checked,) = check(configure(folder))
     assert (checked.motion, checked.noise, checked.suggestion) == (None, None, None)
     assert "nan" not in bench("check", "--data", folder).stdout
 
 
 def test_frames_are_those_that_are_selected(folder):
-    (checked,) = check(configured(folder, frames={"start": 2, "stride": 3}))
+    (checked,) = check(configure(folder, frames={"start": 2, "stride": 3}))
     assert (checked.frames, checked.selected, checked.fused_frames) == (12, 4, 4)
     assert checked.suggestion.frame_stride % 3 == 0
 
@@ -197,9 +192,9 @@ def test_maps_without_a_label_are_a_problem():
 
 def test_every_backbone_is_counted(tmp_path):
     folder = tiny_scene.write(tmp_path / "wall")
-    (checked,) = check(configured(folder))
+    (checked,) = check(configure(folder))
     assert [labels.backbone for labels in checked.labels] == ["a", "b"]
-    (checked,) = check(configured(folder, backbones=["gt"]))
+    (checked,) = check(configure(folder, backbones=["gt"]))
     assert [labels.backbone for labels in checked.labels] == ["gt"]
     assert sum(checked.labels[0].classes.values()) == pytest.approx(1)
 
@@ -207,7 +202,7 @@ def test_every_backbone_is_counted(tmp_path):
 def test_unknown_classes_are_a_problem_beside_the_geometry(tmp_path):
     folder = write(tmp_path / "room")
     (folder / "scene.yaml").write_text("")
-    (checked,) = check(configured(folder))
+    (checked,) = check(configure(folder))
     assert checked.verdict.state == "sound"
     (problem,) = checked.problems
     assert "the classes of 'net' are not known" in problem
@@ -216,11 +211,11 @@ def test_unknown_classes_are_a_problem_beside_the_geometry(tmp_path):
 def test_a_scene_without_labels_is_checked_by_its_depth(tmp_path):
     folder = write(tmp_path / "room", Room(walk(6)))
     shutil.rmtree(folder / "labels")
-    (checked,) = check(configured(folder))
+    (checked,) = check(configure(folder))
     assert (checked.verdict.state, checked.labels, checked.problems) == ("sound", (), ())
     assert all(np.isnan(row.agreement) for row in checked.overlaps)
     np.savetxt(folder / "pose/003.txt", np.full((4, 4), np.nan))
-    (checked,) = check(configured(folder))
+    (checked,) = check(configure(folder))
     assert (checked.frames, checked.selected, checked.verdict.state) == (6, 5, "sound")
 
 
@@ -239,7 +234,7 @@ def test_a_selection_that_does_not_fit_is_refused(folder):
         ({"frames": {"start": 20}}, "leaves none of its 12"),
     ):
         with pytest.raises(ConfigError, match=message):
-            list(check(configured(folder, **content)))
+            list(check(configure(folder, **content)))
 
 
 # --- the command
@@ -359,7 +354,7 @@ def test_a_file_that_cannot_be_written_is_one_line(folder, tmp_path):
 
 def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    config = configured(folder, backbones=["net"], backends=["numpy"], check=None)
+    config = configure(folder, backbones=["net"], check=None)
     with pytest.raises(DataError, match=r"room: depth reprojects .* pose_convention: world_to_camera"):
         semstab.engine.run(config, out=tmp_path / "run")
     assert not list((tmp_path / "run").rglob("*.parquet"))
@@ -376,7 +371,7 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
 
 def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    content = {"dataset": {"name": "posed_folder", "options": {"root": str(folder)}}, "backends": ["numpy"]}
+    content = {"dataset": dataset_of(folder), "backends": ["numpy"]}
     file = tmp_path / "room.yaml"
     file.write_text(yaml.safe_dump(content | {"backbones": ["net"]}))
     refused = bench("study", file, "--out", tmp_path / "study", "-q")
@@ -395,7 +390,7 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
         def geometry_checked(self, task, verdict):
             seen.append((task.scene.name, verdict.state))
 
-    config = configured(folder, backends=["numpy"], backbones=["net", "gt"])
+    config = configure(folder, backbones=["net", "gt"])
     semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
     assert manifest["geometry"]["room"]["state"] == "sound"
@@ -440,7 +435,7 @@ def real(name) -> Path:
 
 @pytest.mark.parametrize(("name", "error"), [("apc_shelf", 0.007), ("hololens", 0.003)])
 def test_real_scenes_are_sound_with_the_errors_of_their_notes(name, error):
-    (checked,) = check(configured(real(name)))
+    (checked,) = check(configure(real(name)))
     assert checked.problems == ()
     assert checked.overlaps[0].error == pytest.approx(error, abs=0.002)
     assert checked.verdict.undetermined == ()
@@ -482,5 +477,5 @@ def test_intrinsics_of_the_colour_image_are_recognised(tmp_path):
     (folder / "color").mkdir()
     for i in range(9):
         Image.fromarray(np.zeros((*size[::-1], 3), np.uint8)).save(folder / f"color/{i:03d}.png")
-    (checked,) = check(configured(folder))
+    (checked,) = check(configure(folder))
     assert checked.verdict.mend == ("intrinsics_size: [125, 94]",)

@@ -62,8 +62,8 @@ def packed(q: np.ndarray) -> np.ndarray:
 def view_of(scene: CityScene, index: int, *, as_frame: int | None = None) -> View:
     """A frame's view, pretending on request that it was taken as another frame."""
     frame = scene.frame(index, GROUND_TRUTH)
-    rendered = scene._rendered[index]
-    return View(index if as_frame is None else as_frame, rendered, frame.intrinsics, frame.T_wc, scene._origin)
+    rendered = scene.rendered[index]
+    return View(index if as_frame is None else as_frame, rendered, frame.intrinsics, frame.T_wc, scene.origin)
 
 
 def simulated(scene: CityScene, seen: View, **model: Any) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_frames_do_not_depend_on_the_order_of_calls(small: City) -> None:
 def test_depth_is_the_nearest_triangles(small: City) -> None:
     scene = small.scene("scene1")
     frame = scene.frame(1, GROUND_TRUTH)
-    surfaces = [scene._world.still, scene._world.traffic.at(frame.timestamp, frame.T_wc[:3, 3])]
+    surfaces = [scene.world.still, scene.world.traffic.at(frame.timestamp, frame.T_wc[:3, 3])]
     rng = np.random.default_rng(5)
     errors = []
     for u, v in zip(rng.integers(0, 96, 24), rng.integers(0, 54, 24), strict=True):
@@ -163,7 +163,7 @@ def f_size(frames: list[Frame]) -> int:
 
 
 def test_moving_cars_move_and_buildings_do_not() -> None:
-    traffic = full("scene0")._world.traffic
+    traffic = full("scene0").world.traffic
     camera = np.zeros(3)
     before, after = traffic.at(1.0, camera), traffic.at(2.0, camera)
     assert set(np.unique(before.classes)) == {6, 7}
@@ -195,7 +195,7 @@ def test_utm_origin_shifts_the_voxels(small: City) -> None:
 def test_a_large_frame_is_cast_in_bounded_memory() -> None:
     """12 bytes a pixel stay; what is needed on the way does not grow with the image (a 4K frame peaks at 180 MB)."""
     scene = city(width=1440, height=810).scene("scene0")
-    scene._still = full("scene0")._still
+    scene.still = full("scene0").still
     tracemalloc.start()
     frame = scene.frame(1, "sim-flicker")
     peak = tracemalloc.get_traced_memory()[1]
@@ -239,14 +239,14 @@ def test_digest_tells_contents_apart_without_rendering() -> None:
     }
     assert len(digests) == 7
     assert city(cache_megabytes=1).scene("scene0").digest([0, 1], "sim-steady") in digests
-    assert "_world" not in vars(scene)
+    assert "world" not in vars(scene)
 
 
 def test_the_cache_is_bounded() -> None:
     scene = city(width=640, height=360, cache_megabytes=6).scene("scene0")
     for index in range(3):
         scene.frame(index, GROUND_TRUTH)
-    assert 0 < sum(r.nbytes for r in scene._rendered.values()) <= 6_000_000
+    assert 0 < sum(r.nbytes for r in scene.rendered.values()) <= 6_000_000
 
 
 @pytest.mark.parametrize(

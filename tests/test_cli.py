@@ -14,24 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny_scene
-
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
-
-
-def bench(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
-    return subprocess.run(
-        [COMMAND, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True, text=True, check=False
-    )
-
-
-def error_of(result: subprocess.CompletedProcess[str]) -> str:
-    """The one line that bad input leaves; exit code 2, no traceback."""
-    assert result.returncode == 2, result.stderr
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("error: ")
-    return lines[0]
+from command_line import bench, error_of, started
 
 
 @pytest.fixture
@@ -41,7 +24,6 @@ def wall(tmp_path):
 
 def test_help_shows_the_options_and_the_commands(tmp_path) -> None:
     result = bench("--help", cwd=tmp_path)
-    assert result.returncode == 0
     for word in ("--backend", "--voxel-size", "--rerun", "list", "view"):
         assert word in result.stdout
 
@@ -60,14 +42,12 @@ def test_help_imports_nothing_heavy(tmp_path) -> None:
 
 def test_list_names_what_there_is(tmp_path) -> None:
     result = bench("list", cwd=tmp_path)
-    assert result.returncode == 0
     for word in ("open3d", "numpy", "city", "posed_folder", "uavid7", "ready"):
         assert word in result.stdout
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:
     result = bench("--backend", "open3d", "--data", wall, "--voxel-size", "0.25", "--out", "run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
     for word in ("wall", "OP=1", "3<=OP<=5", "agree", "seen once", "folder: run", "report: run/report.html"):
         assert word in result.stdout
     for name in ("config.yaml", "manifest.json", "summary.json", "recording.rrd", "voxels/wall__a__open3d.parquet"):
@@ -91,7 +71,7 @@ def test_options_reach_the_run(wall, tmp_path) -> None:
         "--events",
     )
     result = bench("run", *arguments, *more, "--data", wall, cwd=tmp_path)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert (result.stdout, result.stderr) == ("", "")
     (run,) = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
     assert (run["frames"], run["points"], run["backbone"]) == (2, 24, "gt")
     assert [row["name"] for row in run["strata"]] == ["OP=1", "2<=OP<=4", "OP>4"]
@@ -101,7 +81,7 @@ def test_options_reach_the_run(wall, tmp_path) -> None:
 
 def test_the_default_run_folder_is_new_each_time(wall, tmp_path) -> None:
     arguments = ("--backend", "numpy", "--data", wall, "--rerun", "off", "-q")
-    assert bench(*arguments, cwd=tmp_path).returncode == 0
+    bench(*arguments, cwd=tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     assert (folder / "summary.json").exists()
 
@@ -128,7 +108,7 @@ def test_the_default_run_folder_is_new_each_time(wall, tmp_path) -> None:
 def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.yaml").write_text("voxel_sise: 1\n")
-    assert message in error_of(bench(*arguments, cwd=tmp_path))
+    assert message in error_of(*arguments, cwd=tmp_path)
 
 
 def damage_depth_size(wall: Path) -> str:
@@ -171,7 +151,6 @@ def damage_intrinsics(wall: Path) -> str:
 def test_a_lost_pose_is_left_out_and_said(wall, tmp_path) -> None:
     np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
     result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
     assert "wall: 1 of 3 selected frames have no pose (tracking was lost) and are left out: 1" in result.stderr
 
 
@@ -189,9 +168,8 @@ def test_a_lost_pose_is_left_out_and_said(wall, tmp_path) -> None:
 )
 def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage) -> None:
     message = damage(wall)
-    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path)
+    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path, code=2)
     lines = [line for line in result.stderr.splitlines() if line.strip()]
-    assert result.returncode == 2
     assert all(line.startswith("error: ") for line in lines)  # one for each backbone that it concerns
     assert message in lines[0]
     assert not list((tmp_path / "run").rglob("wall__a*"))
@@ -214,11 +192,8 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: twice\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text("[semstab.backends]\ntwice = twice:Twice\n")
     arguments = ["--data", "wall", "--backend", "twice", "--rerun", "off", "--out", "run"]
-    environment = {**os.environ, "PYTHONPATH": str(package.parent), "COLUMNS": "160"}
-    result = subprocess.run(
-        [COMMAND, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 3, result.stderr
+    paths = os.pathsep.join([str(package.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    result = bench(*arguments, cwd=tmp_path, code=3, PYTHONPATH=paths)
     assert "DISAGREE" in result.stdout
     assert "error: the backends disagree" in result.stderr
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
@@ -226,9 +201,8 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
 
 def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     wall = tiny_scene.write(tmp_path / "wall", backbones=("a", "b"), frames=400)
-    arguments = [COMMAND, "--data", str(wall), "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off"]
-    arguments += ["--out", str(tmp_path / "run")]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    arguments = ("--data", wall, "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off", "--out", "run")
+    process = started(*arguments, cwd=tmp_path)
     units = tmp_path / "run" / "units"
     deadline = time.monotonic() + 60
     while not list(units.glob("[!.]*.json")) and time.monotonic() < deadline:
@@ -238,6 +212,5 @@ def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     assert process.returncode == 130, stderr
     assert "interrupted" in stderr
     assert "Traceback" not in stderr
-    again = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert again.returncode == 0, again.stderr
+    again = bench(*arguments, cwd=tmp_path)
     assert "kept from before: 1 of 2 units" in again.stderr

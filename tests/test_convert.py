@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
+from posed_config import configure
 from room_scene import CAMERA, Room, opened, walk, write
 from typer.testing import CliRunner
 
@@ -39,13 +40,10 @@ CITY = {
 }
 
 
-def configured(name="city", options=None, **content) -> Config:
-    base = {"dataset": {"name": name, "options": options or CITY}, "backbones": None, "taxonomy": None}
+def of_city(name="city", options=CITY, **content) -> Config:
+    """Of the city, or of another dataset."""
+    base = {"dataset": {"name": name, "options": options}, "backbones": None, "taxonomy": None}
     return resolve(load_config(None, base | content))
-
-
-def of_folder(root, **content) -> Config:
-    return configured("posed_folder", {"root": str(root)}, **content)
 
 
 def fused(scene, backbone, voxel_size=0.5):
@@ -62,7 +60,7 @@ def fused(scene, backbone, voxel_size=0.5):
 
 
 def of_memory(room, tmp_path, **content):
-    return convert_scene(room, configured(**content), tmp_path / "out", 0.0, lambda *_: None)
+    return convert_scene(room, of_city(**content), tmp_path / "out", 0.0, lambda *_: None)
 
 
 def snapshot(folder):
@@ -71,7 +69,7 @@ def snapshot(folder):
 
 def test_the_city_gives_the_same_voxels(tmp_path):
     """Depth of float32, hard labels, soft scores and ground truth, at UTM coordinates."""
-    config = configured(scenes=["scene0"])
+    config = of_city(scenes=["scene0"])
     (converted,) = convert(config, tmp_path)
     assert (converted.frames, converted.written, converted.depth) == (4, 4, "float32 .npy")
     assert converted.renamed == {"soft": "soft-scores"}
@@ -96,7 +94,7 @@ def test_a_folder_of_millimetres_stays_one(tmp_path):
     root = tiny_scene.write(tmp_path / "wall")
     with (root / "scene.yaml").open("a") as file:
         file.write("depth_scale: 10000\npose_convention: world_to_camera\ncamera_axes: opengl\n")
-    (converted,) = convert(of_folder(root), tmp_path / "out")
+    (converted,) = convert(configure(root), tmp_path / "out")
     assert converted.depth == "16-bit PNG, 1000 units a metre"
     source, scene = opened(root), opened(tmp_path / "out/wall")
     assert (scene.options.pose_convention, scene.options.camera_axes) == ("camera_to_world", "opencv")
@@ -105,28 +103,28 @@ def test_a_folder_of_millimetres_stays_one(tmp_path):
 
 
 def test_frames_keep_their_number(tmp_path):
-    (converted,) = convert(configured(scenes=["scene1"], frames={"start": 1, "stride": 2}), tmp_path)
+    (converted,) = convert(of_city(scenes=["scene1"], frames={"start": 1, "stride": 2}), tmp_path)
     assert converted.frames == 2
     names = sorted(path.stem for path in (tmp_path / "scene1/depth").iterdir())
     assert names == ["000001", "000003"]
 
 
 def test_label_sources_and_scenes_are_selected(tmp_path):
-    done = list(convert(configured(scenes=["scene0", "scene2"], backbones=["hard"]), tmp_path))
+    done = list(convert(of_city(scenes=["scene0", "scene2"], backbones=["hard"]), tmp_path))
     assert [converted.scene for converted in done] == ["scene0", "scene2"]
     scene = open_dataset("posed_folder", {"root": tmp_path}).scene("scene2")
     assert (scene.backbones, scene.ground_truth) == (("hard",), False)
     with pytest.raises(ConfigError, match="no scene 'scene9'"):
-        list(convert(configured(scenes=["scene9"]), tmp_path))
+        list(convert(of_city(scenes=["scene9"]), tmp_path))
     with pytest.raises(ConfigError, match="no backbone 'hart'; did you mean 'hard'"):
-        list(convert(configured(backbones=["hart"]), tmp_path))
+        list(convert(of_city(backbones=["hart"]), tmp_path))
 
 
 # --- going on
 
 
 def test_what_is_there_is_kept(tmp_path):
-    config = configured(scenes=["scene0"])
+    config = of_city(scenes=["scene0"])
     list(convert(config, tmp_path))
     images = {path: at for path, at in snapshot(tmp_path).items() if path.suffix in (".png", ".npy", ".npz", ".txt")}
     (tmp_path / "scene0/labels/hard/000002.png").unlink()
@@ -139,7 +137,7 @@ def test_what_is_there_is_kept(tmp_path):
 
 
 def test_an_interrupted_conversion_goes_on(tmp_path):
-    config = configured(scenes=["scene0"])
+    config = of_city(scenes=["scene0"])
     seen = []
 
     def interrupting(what, done, total):
@@ -163,20 +161,20 @@ def test_an_interrupted_conversion_goes_on(tmp_path):
 
 def test_more_frames_can_follow_but_not_fewer(tmp_path):
     for stop, written in ((2, 2), (4, 2)):
-        (converted,) = convert(configured(scenes=["scene0"], frames={"stop": stop}), tmp_path)
+        (converted,) = convert(of_city(scenes=["scene0"], frames={"stop": stop}), tmp_path)
         assert (converted.frames, converted.written) == (stop, written)
     with pytest.raises(ConfigError, match="holds frame 000003, which is not selected now"):
-        list(convert(configured(scenes=["scene0"], frames={"stop": 3}), tmp_path))
+        list(convert(of_city(scenes=["scene0"], frames={"stop": 3}), tmp_path))
 
 
 def test_a_folder_of_something_else_is_not_touched(tmp_path):
     (tmp_path / "scene0").mkdir()
     (tmp_path / "scene0/mine.txt").write_text("mine")
-    config = configured(scenes=["scene0"])
+    config = of_city(scenes=["scene0"])
     with pytest.raises(ConfigError, match="is there already and holds no conversion"):
         list(convert(config, tmp_path))
     list(convert(config, tmp_path / "out"))
-    changed = configured(options=CITY | {"seed": 1}, scenes=["scene0"])
+    changed = of_city(options=CITY | {"seed": 1}, scenes=["scene0"])
     with pytest.raises(ConfigError, match="was converted from other data or with other settings"):
         list(convert(changed, tmp_path / "out"))
     (tmp_path / "out/scene0/conversion.json").write_text('{"key": 1, "depth_scale": "x"}')
@@ -184,14 +182,14 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path):
         list(convert(config, tmp_path / "out"))
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="is there already"):
-        convert_scene(Room(walk(2)), configured(), tmp_path / "file", 0.0, lambda *_: None)
+        convert_scene(Room(walk(2)), of_city(), tmp_path / "file", 0.0, lambda *_: None)
 
 
 def test_a_scene_is_not_converted_onto_itself(tmp_path):
     root = write(tmp_path / "room", Room(walk(2)))
     before = snapshot(root)
     with pytest.raises(ConfigError, match="is there already"):
-        list(convert(of_folder(root), tmp_path))
+        list(convert(configure(root), tmp_path))
     assert snapshot(root) == before
 
 
@@ -231,7 +229,7 @@ def test_the_scale_of_a_dataset_is_found_again(tmp_path, scale):
 
 def test_a_stated_error_is_kept(tmp_path):
     room = Room(walk(3))
-    converted = convert_scene(room, configured(), tmp_path / "out", 1e-3, lambda *_: None)
+    converted = convert_scene(room, of_city(), tmp_path / "out", 1e-3, lambda *_: None)
     assert converted.depth.startswith("16-bit PNG")
     worst = max(np.abs(opened(tmp_path / "out").depth(i) - room.frame(i, "net").depth).max() for i in range(3))
     assert 0 < worst <= 1e-3
@@ -346,7 +344,7 @@ def test_masks_are_kept(tmp_path):
     root = tiny_scene.write(tmp_path / "wall")
     (root / "mask").mkdir()
     Image.fromarray(np.eye(6, 8, dtype=np.uint8)).save(root / "mask/0001.png")
-    list(convert(of_folder(root), tmp_path / "out"))
+    list(convert(configure(root), tmp_path / "out"))
     source, scene = opened(root), opened(tmp_path / "out/wall")
     np.testing.assert_array_equal(scene.frame(1, "a").mask, source.frame(1, "a").mask)
     assert scene.frame(1, "a").mask.sum() == 6 * 8 - 6
@@ -362,7 +360,7 @@ def test_a_scene_without_labels_keeps_depth_poses_colour_and_masks(tmp_path):
         Image.fromarray(np.full((72, 96, 3), 7, np.uint8)).save(root / f"color/{path.stem}.png")
     (root / "mask").mkdir()
     Image.fromarray(np.eye(72, 96, dtype=np.uint8)).save(root / "mask/001.png")
-    (converted,) = convert(of_folder(root), tmp_path / "out")
+    (converted,) = convert(configure(root), tmp_path / "out")
     assert converted.frames == 3
     source, scene = opened(root), opened(tmp_path / "out/room")
     np.testing.assert_array_equal(scene.depth(2), source.depth(2))
@@ -425,7 +423,7 @@ def test_every_format_gives_the_same_voxels(tmp_path, name):
     frames = source(form.scale)
     write_labels(tmp_path / "data", form.write(tmp_path / "data", frames), frames)
     needed = {key: value() if callable(value) else value for key, value in form.options.items()}
-    config = configured(form.dataset, {"root": str(tmp_path / "data"), "classes": FORMAT_CLASSES, **needed})
+    config = of_city(form.dataset, {"root": str(tmp_path / "data"), "classes": FORMAT_CLASSES, **needed})
     (converted,) = convert(config, tmp_path / "out")
     reader, scene = dataset_writers.opened(form, tmp_path / "data"), opened(converted.folder)
     assert scene.backbones == reader.backbones == ("net",)

@@ -3,27 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+from command_line import bench
+
 SMALL = ("width=96", "height=54", "frames=4")
 
 
 def test_the_built_in_city_from_the_command_line(tmp_path) -> None:
     small = [word for option in SMALL for word in ("--set", f"dataset.options.{option}")]
-    environment = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
-    result = subprocess.run(
-        [COMMAND, "--backend", "open3d", *small],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
+    result = bench("--backend", "open3d", *small, cwd=tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     summary = json.loads((folder / "summary.json").read_text())
     units = {(run["scene"], run["backbone"], run["backend"]) for run in summary["runs"]}

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,10 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 import tiny_scene
 import tiny_study
+from command_line import bench
+from posed_config import configure
 from records import record, study, voxels
 
 import semstab
-from semstab.config import Config
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.units import make_plan
 from semstab.engine.work.memory import estimate
@@ -33,29 +31,10 @@ from semstab.outputs.tables import tables
 from semstab.outputs.tables import to_json as table_content
 from semstab.outputs.terminal import print_summary
 from semstab.runtime.json_form import to_json
-from semstab.settings import load_config
 from semstab.statistics import Estimate, Reliability, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 BACKBONES = ("a", "b", "gt")
-
-
-def command(*arguments: str | Path, cwd: Path) -> str:
-    """What it prints."""
-    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
-    done = subprocess.run(
-        [COMMAND, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def configure(root: Path, **settings) -> Config:
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return load_config(
-        overrides={"dataset": dataset, "backends": ["numpy"], "check": None, "voxel_size": 0.25, **settings}
-    )
 
 
 # --- A run ------------------------------------------------------------------------------------------------------------
@@ -67,10 +46,10 @@ def ran(tmp_path_factory):
     base = tmp_path_factory.mktemp("ran")
     tiny_scene.write(base / "wall", frames=6)
     chosen = [word for name in BACKBONES for word in ("-m", name)]
-    printed = command(
+    printed = bench(
         "--data", "wall", "-b", "numpy", *chosen, "--voxel-size", "0.25", "--check", "none", "--rerun", "off",
-        "--statistics", "--events", "--set", "strata=[1, 3]", "--out", "run", cwd=base,
-    )  # fmt: skip
+        "--statistics", "--events", "--set", "strata=[1, 3]", "--out", "run", cwd=base, columns=80,
+    ).stdout  # fmt: skip
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
@@ -186,14 +165,14 @@ def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=30)
-    plain, full = (configure(root, backends=["numba"], statistics=wanted) for wanted in (False, True))
+    plain, full = (configure(root, backends=["numba"], check=None, statistics=wanted) for wanted in (False, True))
     (task,) = make_plan(plain).tasks
     without, expected = estimate(task, plain), estimate(task, full)
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
     assert expected.observations == without.observations == 30 * 48
     assert expected.bytes - without.bytes > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):
-        semstab.engine.run(configure(root, backends=["numba"], statistics=True, memory_gb=1e-6))
+        semstab.engine.run(configure(root, backends=["numba"], check=None, statistics=True, memory_gb=1e-6))
 
 
 def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, capsys) -> None:

@@ -11,6 +11,7 @@ import pytest
 import tiny_scene
 from hypothesis import given
 from hypothesis import strategies as st
+from posed_config import configure
 
 import semstab
 from semstab.engine.units import make_plan
@@ -33,11 +34,6 @@ def frame_of(labels=None, **fields) -> Frame:
 @pytest.fixture
 def root(tmp_path):
     return tiny_scene.write(tmp_path / "wall", backbones=("a",))
-
-
-def configure(root, **settings):
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25, **settings})
 
 
 def write_masks(root, mask) -> None:

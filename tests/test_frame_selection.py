@@ -11,6 +11,7 @@ import tiny_scene
 from dataset_writers import FORMATS, matrix_text, opened, source, write_labels, write_lines
 from hypothesis import given
 from hypothesis import strategies as st
+from posed_config import configure, dataset_of
 
 from semstab.config import Config, FrameSelection
 from semstab.datasets import open_dataset
@@ -208,10 +209,8 @@ def test_frames_are_selected_on_the_sequence_and_what_lacks_a_file_is_counted(tm
 
 
 def plan_of(root, settings, **options):
-    dataset = {"name": "posed_folder", "options": {"root": str(root), **options}}
-    return make_plan(Config.build({"dataset": dataset, **settings}))
+    return make_plan(configure(root, dataset=dataset_of(root, **options), **settings))
 
 
 def run_of(root, settings, **options):
-    dataset = {"name": "posed_folder", "options": {"root": str(root), **options}}
-    return run(Config.build({"dataset": dataset, **settings})).runs
+    return run(configure(root, dataset=dataset_of(root, **options), **settings)).runs

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 import rerun as rr
 import tiny_study
+from posed_config import configure
 from rich.console import Console
 
 import semstab
-from semstab.config import Config
 from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
 from semstab.model.measures import VSS, Measure, measures, register, registered
@@ -54,12 +54,7 @@ def run(tmp_path_factory, registered_rival):
     """A run of two backends with statistics and a recording: its result and folder."""
     base = tmp_path_factory.mktemp("rival")
     root, out = tiny_study.write(base / "data" / "wall"), base / "run"
-    config = Config.build(
-        {
-            "dataset": {"name": "posed_folder", "options": {"root": str(root)}}, "voxel_size": 0.25,
-            "backends": ["numba"], "check": "numpy", "statistics": True,
-        }
-    )  # fmt: skip
+    config = configure(root, backends=["numba"], check="numpy", statistics=True)
     return semstab.run(config, out=out, observers=[Recording(out / "recording.rrd")]), out
 
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny_scene
 import tiny_study
 import yaml
+from command_line import bench
 from compare_summaries import differences
+from posed_config import dataset_of
 from test_recording import read
 
 import semstab
@@ -26,7 +24,6 @@ from semstab.outputs.plots.drawing import DrawingProcess
 from semstab.outputs.recording import Recording, Target
 from semstab.settings import load_config, load_study
 
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 TIMES = {"decode_ms", "wait_ms", "fuse_ms", "association_ms", "update_ms"}
 
 
@@ -36,17 +33,7 @@ def root(tmp_path):
 
 
 def settings(root, **more):
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return {"dataset": dataset, "backends": ["numba", "numpy"], "check": None, "voxel_size": 0.25, **more}
-
-
-def bench(*words, cwd, code=0):
-    environment = os.environ | {"COLUMNS": "80"}
-    done = subprocess.run(
-        [COMMAND, *map(str, words)], cwd=cwd, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == code, done.stderr
-    return done
+    return {"dataset": dataset_of(root), "backends": ["numba", "numpy"], "check": None, "voxel_size": 0.25, **more}
 
 
 def summary(folder):

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import tiny_scene
+from posed_config import configure
 
 import semstab
-from semstab.config import Config, Perturbation
+from semstab.config import Perturbation
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
@@ -142,12 +144,7 @@ def test_depth_that_falls_below_zero_is_invalid() -> None:
 @pytest.fixture
 def config(tmp_path):
     root = tiny_scene.write(tmp_path / "wall", frames=4)
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-
-    def configure(**settings) -> Config:
-        return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25, **settings})
-
-    return configure
+    return functools.partial(configure, root)
 
 
 NOISE = {"depth_noise": 0.003, "translation_noise": 0.01, "rotation_drift": 0.5}

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 import tiny_scene
 import yaml
+from posed_config import configure
 
 import semstab
 from semstab import metrics
-from semstab.config import Config
 from semstab.datasets.formats import disk
 from semstab.engine import Observer, load_result
 from semstab.engine.folder import Folder
@@ -29,11 +29,6 @@ from semstab.settings import load_config
 @pytest.fixture
 def root(tmp_path):
     return tiny_scene.write(tmp_path / "data" / "wall")
-
-
-def configure(root, **settings) -> Config:
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return load_config(overrides={"dataset": dataset, "backends": ["numpy"], "voxel_size": 0.25, **settings})
 
 
 def without_times(result: Result) -> list:

@@ -7,16 +7,15 @@ import dataclasses
 import io
 import itertools
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import predicted_scene
 import pytest
 import yaml
+from command_line import bench, error_of
 from PIL import Image
+from posed_config import configure, dataset_of
 
 from semstab.backbones import Prediction, create
 from semstab.config import Config, DatasetConfig, FrameSelection
@@ -35,7 +34,6 @@ from semstab.predict.sequence import PredictionObserver, SequenceOptions, predic
 from semstab.predict.sources import ImageFiles
 from semstab.settings import predicted_config
 
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}
 
 
@@ -420,13 +418,11 @@ def test_regions_that_lack_frames_stop_nobody_else(scene):
 
 
 def test_a_study_measures_regions_by_name(scene):
-    from semstab.config import Config
     from semstab.engine.units import make_plan
 
     predict(scene, Tiles(), name="tiles")
     predict(scene, Shifting(), name="thirds")
-    content = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "region_maps": ["tiles"]}
-    grid = make_plan(Config.build(content))
+    grid = make_plan(configure(scene, region_maps=["tiles"]))
     assert [cell.backbone for cell in grid.regions] == ["tiles"]
     assert {cell.unit.backbone for cell in grid.units} == {"thirds"}
 
@@ -484,8 +480,7 @@ def test_every_option_of_a_predictor_is_filled_in(tmp_path, monkeypatch):
 
 
 def live_config(scene: Path, *predictors: str, **overrides) -> Config:
-    dataset = {"name": "posed_folder", "options": {"root": str(scene)}}
-    settings = {"dataset": dataset, "voxel_size": 0.25, "backends": ["numba"], "check": None, **overrides}
+    settings = {"dataset": dataset_of(scene), "voxel_size": 0.25, "backends": ["numba"], "check": None, **overrides}
     return predicted_config([parse_predictor(text) for text in predictors], None, settings)
 
 
@@ -630,22 +625,14 @@ def test_a_damaged_label_space_is_named(scene):
 # --- The command line -------------------------------------------------------------------------------------------------
 
 
-def bench(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
-    words = [COMMAND, *map(str, arguments)]
-    return subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
-
-
 def test_predict_and_run_from_the_command_line(scene, tmp_path):
     options = ("--set", "clusters=3", "--name", "three", "--frames", ":4")
     result = bench("predict", "-m", "colour-clusters", "--data", scene, *options, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
     assert "flight: 4 frames predicted" in result.stdout
     assert "frames/s (model" in result.stdout
     command = next(line for line in result.stdout.splitlines() if line.startswith("fuse them: "))
     words = command.removeprefix("fuse them: semstab-bench ").split()
-    result = bench(*words, "--rerun", "off", "--voxel-size", "0.25", "-q", "--out", "run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    bench(*words, "--rerun", "off", "--voxel-size", "0.25", "-q", "--out", "run", cwd=tmp_path)
     runs = json.loads((tmp_path / "run/summary.json").read_text())["runs"]
     assert {(unit["backbone"], unit["K"], unit["frames"]) for unit in runs} == {("three", 3, 4)}
 
@@ -653,7 +640,6 @@ def test_predict_and_run_from_the_command_line(scene, tmp_path):
 def test_run_with_a_model_from_the_command_line(scene, tmp_path):
     arguments = ("--predict", "colour-clusters,clusters=3", "--data", scene, "--voxel-size", "0.25", "--rerun", "off")
     result = bench(*arguments, "--out", "run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
     assert "agree" in result.stdout
     assert not (scene / "labels").exists()
 
@@ -678,11 +664,7 @@ def test_run_with_a_model_from_the_command_line(scene, tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_exit_2(scene, tmp_path, arguments, message):
-    result = bench("predict", *arguments, cwd=tmp_path)
-    assert result.returncode == 2, result.stderr
-    (line,) = result.stderr.strip().splitlines()
-    assert line.startswith("error: ")
-    assert message in line
+    assert message in error_of("predict", *arguments, cwd=tmp_path)
 
 
 def test_a_report_is_said_in_numbers():

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import error_of
 from dataset_writers import CLASSES, COUNT, FORMATS, opened, source, write_labels, write_lines
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from image_files import raw_png
 from posed_scene import fails
-from test_cli import bench, error_of
 
 from semstab.config import FrameSelection
 from semstab.datasets.formats.colmap_depth import read_depth_map
@@ -288,4 +288,4 @@ def test_a_run_reads_a_dataset_and_the_command_line_says_what_is_wrong_with_it(t
     assert VoxelTable.load(tmp_path / f"out/voxels/{summary.unit.slug}.parquet").op.max() > 1
     (tmp_path / f"data/labels/net/{names[COUNT - 1]}.png").write_bytes(raw_png(60_000, 60_000, 8, 0, b""))
     command = ["run", "--config", tmp_path / "out/config.yaml", "--out", "again", "--rerun", "off"]
-    assert "claims 60000x60000 pixels" in error_of(bench(*command, cwd=tmp_path))
+    assert "claims 60000x60000 pixels" in error_of(*command, cwd=tmp_path)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import tiny_scene
+from posed_config import configure
 
 import semstab
 from semstab import backends, metrics
@@ -34,15 +35,13 @@ from semstab.outputs.recording import SERIES, Recording, background, looks, obse
 from semstab.outputs.recording.entities import Clock
 from semstab.outputs.recording.layout import Scenery, direction, fit
 from semstab.outputs.recording.series import OF_THE_BACKBONE
-from semstab.settings import load_config
 from semstab.task import Task
 
 NANOSECONDS = 1_000_000_000
 
 
 def config_of(root: Path, backend: str = "numpy") -> Config:
-    dataset = {"name": "posed_folder", "options": {"root": str(root)}}
-    return load_config(overrides={"dataset": dataset, "backends": [backend], "voxel_size": 0.25})
+    return configure(root, backends=[backend])
 
 
 @pytest.fixture(scope="module")

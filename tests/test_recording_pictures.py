@@ -157,7 +157,7 @@ def test_colour_that_is_not_a_small_jpeg_is_encoded_anew(tmp_path, kind) -> None
     scene = make_plan(config_of(tiny_scene.write(tmp_path / "wall"))).tasks[0].scene
     frames = camera.COLOR_BYTES // (len(data) - 1) if kind == "large" else 1
     seen = camera.CameraLog(scene, np.zeros(3), frames)
-    color = seen._color(view)
+    color = seen.color(view)
     if kind in ("cut off", "not an image"):
         assert color is None
         assert seen.unread == f"{file}: the image cannot be decoded"
@@ -358,7 +358,7 @@ def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -
     tracker, log = tracked(alternating(12))
     monkeypatch.setattr(flips, "MAX_MOVES", 12)
     tracker_bounded, bounded = tracked(alternating(12))
-    kept = sum(len(part) for part in bounded._parts)
+    kept = sum(len(part) for part in bounded.moves)
     assert kept <= 12
     first, second = (next(each.suspects(t)) for each, t in ((log, tracker), (bounded, tracker_bounded)))
     np.testing.assert_array_equal(first.center, second.center)
@@ -416,19 +416,21 @@ def test_what_is_not_drawn_yet_comes_before_what_changed(tmp_path) -> None:
     growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
-    growing._allowed = 1e6
+    growing.allowed = 1e6
     fused.integrate(frame(0, np.zeros((240, 640))))
     for job in growing.update(stream, fused):
         job()
     known = len(fused)
     assert growing.logged == known
     fused.integrate(frame(1, np.ones((240, 644))))
-    c = int(growing._chunk_of[known])
-    first, after = growing._edges[c : c + 2]
+    edges = voxel_maps.edges()
+    c = int(np.searchsorted(edges, known, side="right")) - 1
+    first, after = edges[c : c + 2]
     assert c >= 1
     assert len(fused) > known > first
     size = min(after, len(fused)) - first
-    growing._share, growing._allowed = 0.0, float(growing.logged + size)  # enough for one chunk
+    # with the next frame's share it is enough for one chunk
+    growing.allowed = float(growing.logged + size - voxel_maps.MOST_A_FRAME)
     (job,) = growing.update(stream, fused)
     job()
     stream.flush()

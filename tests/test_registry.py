@@ -5,8 +5,8 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from semstab import backends
-from semstab.runtime import registry
 from semstab.errors import ConfigError, MissingDependencyError, SemstabError
+from semstab.runtime import registry
 from semstab.runtime.registry import Entry, Registry
 
 SHAPES = Registry(

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import re
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 import tiny_study
 import yaml
+from command_line import bench, started
 
 from semstab.engine import run_study
-
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
-ENVIRONMENT = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
 
 
 @pytest.fixture
@@ -34,20 +29,10 @@ def file(root, tmp_path):
     return path
 
 
-def started(*arguments: str | Path, cwd: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [COMMAND, "study", *map(str, arguments)],
-        cwd=cwd, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-
-
 def study(*arguments: str | Path, cwd: Path, code: int = 0) -> tuple[str, str]:
     """What it prints to stdout and stderr."""
-    process = started(*arguments, cwd=cwd)
-    out, errors = process.communicate()
-    assert process.returncode == code, errors
-    assert "Traceback" not in errors
-    return out, errors
+    done = bench("study", *arguments, cwd=cwd, code=code, columns=80)
+    return done.stdout, done.stderr
 
 
 def units(out: Path) -> int:
@@ -66,7 +51,7 @@ def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file,
     run_study(tiny_study.configure(root, backends=["numpy"]), tmp_path / "whole")
     moments = random.Random(jobs)
     for after in (0, moments.randrange(1, 6), moments.randrange(7, 12)):
-        process = started(file, "--out", "out", "--jobs", jobs, "--quiet", cwd=tmp_path)
+        process = started("study", file, "--out", "out", "--jobs", jobs, "--quiet", cwd=tmp_path)
         wait_for_units(tmp_path / "out", after)
         time.sleep(moments.random() * 0.05)
         process.kill()
@@ -99,7 +84,7 @@ def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
 
 
 def test_ctrl_c_keeps_what_is_finished(file, tmp_path) -> None:
-    process = started(file, "--out", "out", "--jobs", "2", "--quiet", cwd=tmp_path)
+    process = started("study", file, "--out", "out", "--jobs", "2", "--quiet", cwd=tmp_path)
     wait_for_units(tmp_path / "out", 1)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
@@ -161,13 +146,6 @@ def test_bad_input_is_one_line(file, tmp_path, arguments, message) -> None:
 
 
 def test_list_names_the_studies_that_ship(tmp_path) -> None:
-    result = subprocess.run(
-        [COMMAND, "list"],
-        cwd=tmp_path,
-        env=ENVIRONMENT | {"COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = bench("list", cwd=tmp_path, columns=200)
     rows = [line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["study"]]
     assert [row[2] for row in rows] == ["city", "uavid3d"]

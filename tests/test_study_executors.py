@@ -19,14 +19,8 @@ from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
 from semstab.engine.work.jobs import Job, Request
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.settings import resolve
 
 BACKBONES = ("a", "b", "c", "d")
-
-
-def configure(root):
-    """Eight units in four jobs."""
-    return tiny_study.configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"])
 
 
 @pytest.fixture
@@ -35,16 +29,22 @@ def root(tmp_path):
 
 
 @pytest.fixture
-def expected(root, tmp_path):
+def config(root):
+    """Eight units in four jobs."""
+    return tiny_study.configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"])
+
+
+@pytest.fixture
+def expected(config, tmp_path):
     """What the study finds in this process."""
-    run_study(configure(root), tmp_path / "expected")
+    run_study(config, tmp_path / "expected")
     return summary(tmp_path / "expected")
 
 
-def children() -> set[int]:
-    found = subprocess.run(
-        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(os.getpid())], capture_output=True, text=True, check=False
-    )
+def children(parent: int | None = None) -> set[int]:
+    """The worker processes of this process, or of another."""
+    command = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(parent or os.getpid())]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
     return {int(line.split()[0]) for line in found.stdout.splitlines() if "spawn_main" in line}
 
 
@@ -77,21 +77,21 @@ class Killing(Counting):
             os.kill(process, signal.SIGKILL)
 
 
-def test_local_processes_give_the_same_numbers(root, tmp_path, expected) -> None:
+def test_local_processes_give_the_same_numbers(config, tmp_path, expected) -> None:
     counting = Counting()
-    result = run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[counting])
+    result = run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[counting])
     assert summary(tmp_path / "out") == expected
     assert result.manifest["units"]["executor"] == "2 local processes"
     assert len(counting.computed) == counting.units
     assert children() == set()
     again = Counting()
-    run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[again])
+    run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[again])
     assert again.computed == []
 
 
-def test_a_local_process_that_is_killed_costs_no_unit(root, tmp_path, expected) -> None:
+def test_a_local_process_that_is_killed_costs_no_unit(config, tmp_path, expected) -> None:
     killing = Killing(lambda: min(children()))
-    result = run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[killing])
+    result = run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[killing])
     assert result.failures == ()
     assert summary(tmp_path / "out") == expected
 
@@ -106,7 +106,7 @@ class Deadly:
 
 
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
-    config = resolve(tiny_study.configure(root, sweeps={}, backends=["numpy"]))
+    config = tiny_study.configure(root, sweeps={}, backends=["numpy"])
     fine = [Job("wall", cell.unit.backbone, (Request.of(cell),), "start", tmp_path) for cell in make_plan(config).units]
     jobs = [fine[0], Job("wall", "x", (Deadly(),), "start", tmp_path), *fine[1:]]
     found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs, Observers([]))}
@@ -115,38 +115,38 @@ def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path
     assert [found[name].error for name in BACKBONES] == [None] * 4
 
 
-def test_an_interruption_ends_the_processes_and_keeps_what_is_finished(root, tmp_path, expected) -> None:
+def test_an_interruption_ends_the_processes_and_keeps_what_is_finished(config, tmp_path, expected) -> None:
     with pytest.raises(KeyboardInterrupt):
-        run_study(configure(root), tmp_path / "out", executor=LocalProcesses(2), observers=[Interrupting(1)])
+        run_study(
+            config,
+            tmp_path / "out",
+            executor=LocalProcesses(2),
+            observers=[Interrupting(1)],
+        )
     wait_until(lambda: all(gone(process) for process in children()))
     counting = Counting()
-    run_study(configure(root), tmp_path / "out", observers=[counting])
+    run_study(config, tmp_path / "out", observers=[counting])
     assert counting.kept >= 1
     assert summary(tmp_path / "out") == expected
 
 
-def test_worker_processes_end_with_a_parent_that_was_killed(root, tmp_path) -> None:
-    code = (
-        "import multiprocessing, time\n"
-        "from semstab.engine.work.executors import _start_worker\n"
+def test_worker_processes_end_with_a_parent_that_was_killed(tmp_path) -> None:
+    (tmp_path / "parent.py").write_text(
+        "import pathlib\n"
+        "from semstab.engine import LocalProcesses\n"
+        "from semstab.engine.work.jobs import Job\n"
+        "from semstab.engine.observer import Observers\n"
+        "class Endless:\n"
+        "    identity = 'endless'\n"
+        "    def __reduce__(self):\n"
+        "        return exec, ('import pathlib, time; pathlib.Path(\"at work\").touch(); time.sleep(600)',)\n"
         "if __name__ == '__main__':\n"
-        "    context = multiprocessing.get_context('spawn')\n"
-        "    listening, alive = context.Pipe(duplex=False)\n"
-        "    import worker\n"
-        "    process = context.Process(target=worker.work, args=(listening,))\n"
-        "    process.start()\n"
-        "    print(process.pid, flush=True)\n"
-        "    time.sleep(60)\n"
+        "    job = Job('wall', 'a', (Endless(),), 'start', pathlib.Path('out'))\n"
+        "    list(LocalProcesses(1).run([job], Observers([])))\n"
     )
-    (tmp_path / "parent.py").write_text(code)
-    (tmp_path / "worker.py").write_text(
-        "import time\nfrom semstab.engine.work.executors import _start_worker\n"
-        "def work(listening):\n    _start_worker(listening, 1)\n    time.sleep(60)\n"
-    )
-    parent = subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    with parent:
-        worker = int(parent.stdout.readline())
+    with subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path) as parent:
+        wait_until((tmp_path / "at work").exists)
+        (worker,) = children(parent.pid)
         parent.kill()
     wait_until(lambda: gone(worker))
 
@@ -183,27 +183,28 @@ def dask(*command: str):
 @pytest.fixture
 def cluster(tmp_path):
     """The address of a scheduler with two workers, and the workers' processes."""
-    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     file = tmp_path / "scheduler.json"
     arguments = ("--scheduler-file", str(file), "--no-dashboard")
     with dask("scheduler", "--port", "0", *arguments):
         wait_until(file.exists)
         quiet = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path), *arguments)
         with dask(*quiet) as first, dask(*quiet) as second:
-            yield json.loads(file.read_text())["address"], (first, second)
+            address = json.loads(file.read_text())["address"]
+            with distributed.Client(address, set_as_default=False) as client:
+                client.wait_for_workers(2, timeout=30)
+            yield address, (first, second)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(root, tmp_path, expected, cluster) -> None:
+def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(config, tmp_path, expected, cluster) -> None:
     address, workers = cluster
-    executor = DaskCluster(address)
-    wait_until(lambda: len(executor._client.nthreads()) == 2)
     killing = Killing(lambda: workers[0].pid)
-    result = run_study(configure(root), tmp_path / "out", executor=executor, observers=[killing])
+    result = run_study(config, tmp_path / "out", executor=DaskCluster(address), observers=[killing])
     assert workers[0].wait(10) == -signal.SIGKILL
     assert result.failures == ()
     assert summary(tmp_path / "out") == expected
-    assert result.manifest["units"]["executor"].startswith("Dask")
+    assert result.manifest["units"]["executor"] == "Dask, 2 threads"
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:

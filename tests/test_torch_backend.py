@@ -146,7 +146,7 @@ def test_single_precision_differs_only_next_to_a_voxel_face():
 
 def test_single_precision_takes_less_memory():
     double, single = new_map(num_classes=20), new_map(num_classes=20, precision="float32")
-    assert single._maps.bytes < 0.7 * double._maps.bytes
+    assert single.maps.bytes < 0.7 * double.maps.bytes
 
 
 def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
@@ -390,7 +390,7 @@ def test_a_map_stops_at_its_bound_and_goes_on_with_what_it_knows():
         backend.integrate(column_of(5000, index=1, along="x"))
     assert len(backend.table()) == 100
     assert backend.integrate(column_of(100, index=2)).map_voxels == 100
-    assert backend._maps.bytes <= 2e5
+    assert backend.maps.bytes <= 2e5
 
 
 @pytest.mark.usefixtures("small")
@@ -400,15 +400,15 @@ def test_a_map_takes_what_the_bound_leaves():
         backend = new_map(1.0, 3, memory_gb=memory_gb)
         backend.integrate(column_of(800))
         backend.integrate(column_of(200, index=1, along="x"))
-        assert backend._maps._map.columns[""].capacity == capacity
+        assert backend.maps.storage.columns[""].capacity == capacity
         assert len(backend.table()) == 1000
 
 
 def test_reserved_room_is_made_at_once_within_the_bound():
     backend = new_map(1.0, 3, reserve=5000)
-    before = backend._maps.bytes
+    before = backend.maps.bytes
     backend.integrate(column_of(4000))
-    assert backend._maps.bytes == before
+    assert backend.maps.bytes == before
     with pytest.raises(DataError, match=r"reserve = 5000: to hold 5,000 voxels"):
         new_map(1.0, 3, reserve=5000, memory_gb=1e-4)
 
@@ -433,7 +433,7 @@ def test_a_device_that_is_full_says_so(monkeypatch):
 def test_the_estimate_covers_what_a_map_takes():
     backend = new_map(1.0, 20)
     backend.integrate(column_of(3000))
-    assert backend._maps.bytes <= backends.expected_bytes("torch", 3000, 3000, 20) <= 3 * backend._maps.bytes
+    assert backend.maps.bytes <= backends.expected_bytes("torch", 3000, 3000, 20) <= 3 * backend.maps.bytes
 
 
 # --- The hash ---------------------------------------------------------------------------------------------------------

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import posed_config
 import tiny_scene
+from posed_config import dataset_of
 
 from semstab.config import Config
 from semstab.engine import Observer
@@ -31,7 +33,7 @@ def content(root: Path, **settings: Any) -> dict[str, Any]:
     """Settings of a study of the scene, or the scenes, in a folder."""
     return {
         "name": "tiny",
-        "dataset": {"name": "posed_folder", "options": {"root": str(root)}},
+        "dataset": dataset_of(root),
         "voxel_size": 0.25,
         "frames": {"spacing": "even", "count": 5},
         "sweeps": SWEEPS,
@@ -42,7 +44,7 @@ def content(root: Path, **settings: Any) -> dict[str, Any]:
 
 
 def configure(root: Path, **settings: Any) -> Config:
-    return Config.build(content(root, **settings))
+    return posed_config.configure(root, **content(root, **settings))
 
 
 def summary(out: Path) -> dict[str, Any]:

@@ -7,9 +7,9 @@ import functools
 from pathlib import Path
 
 import numpy as np
+from posed_config import configure
 from posed_writer import write_posed
 
-from semstab.config import Config
 from semstab.engine import run_study
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.records import Result
@@ -47,19 +47,17 @@ def wall_study(base: Path) -> tuple[Result, Path]:
     """What the study found, and its folder, made once in `base`; times are set to 12.5 ms a frame."""
     for scene, step in STEPS.items():
         write_wall(base / "walls" / scene, step)
-    config = Config.build(
-        {
-            "name": "wall & <door>",
-            "dataset": {"name": "posed_folder", "options": {"root": str(base / "walls")}},
-            "voxel_size": 0.0625,
-            "sweeps": {
-                "voxel_size": [0.0625, 0.125],
-                "depth_noise": {"values": [0, 0.01], "repeats": 2},
-                "frame_count": {"values": [5, 9], "scenes": ["often"]},
-            },
-            "backends": ["numpy", {"name": "numba", "scenes": ["often"]}],
-            "check": None,
-        }
+    config = configure(
+        base / "walls",
+        name="wall & <door>",
+        voxel_size=0.0625,
+        sweeps={
+            "voxel_size": [0.0625, 0.125],
+            "depth_noise": {"values": [0, 0.01], "repeats": 2},
+            "frame_count": {"values": [5, 9], "scenes": ["often"]},
+        },
+        backends=["numpy", {"name": "numba", "scenes": ["often"]}],
+        check=None,
     )
     folder = base / "wall study"
     result = run_study(config, folder)

@@ -107,7 +107,7 @@ class Aggregator:
             room = min(self._band_room, rows * W)
             key, label = self._room("key", bands * room, np.int64), self._room("label", bands * room, np.uint16)
             count = self._room("count", bands * room, np.int32)
-            slots = self._room("slots", threads * _slots_for(room), np.int32).reshape(threads, -1)
+            slots = self._room("slots", threads * slots_for(room), np.int32).reshape(threads, -1)
             entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
             highest = np.full(bands, -1, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
@@ -188,6 +188,6 @@ def _widened(scores: Any) -> Any:
     return scores.astype(np.float32) if scores.dtype == np.float16 else scores
 
 
-def _slots_for(entries: int) -> int:
+def slots_for(entries: int) -> int:
     """Slots of a hash table that doubles whenever more than half of it is taken, the last time for its last entry."""
     return 1 << max(10, (2 * entries).bit_length())

@@ -70,14 +70,14 @@ class TorchMaps:
         self._associate = self._kernels.Associator()
         self._grid: MapGrid | None = None
         with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
-            self._map = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
-            self._map.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or FIRST_ROWS)
+            self.storage = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
+            self.storage.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or FIRST_ROWS)
         self._totals = {name: MapTotal(K) for name, K in num_classes.items()}
 
     @property
     def bytes(self) -> int:
         """Memory that the maps take on the device."""
-        return self._map.bytes
+        return self.storage.bytes
 
     def integrate_tensors(
         self,
@@ -112,11 +112,11 @@ class TorchMaps:
         evidence = {name: self._evidence(seen, image, name, view) for name, image in said.items()}
         rows, voxels = self._look_up(seen, evidence, view, grid)
         associated = time.perf_counter()
-        self._map.make_room(voxels, f"frame {view.camera.index}")
-        self._map.add(seen.keys, rows, voxels)
+        self.storage.make_room(voxels, f"frame {view.camera.index}")
+        self.storage.add(seen.keys, rows, voxels)
         self._grid = grid
         changes = [
-            self._kernels.update(self._map.columns[name], rows, of_name, view.camera.index)
+            self._kernels.update(self.storage.columns[name], rows, of_name, view.camera.index)
             for name, of_name in evidence.items()
         ]
         sums = torch.stack(changes).tolist() if changes else []
@@ -128,9 +128,9 @@ class TorchMaps:
     def table(self, name: str) -> VoxelTable:
         """The map of a backbone so far, brought to memory. Raises ConfigError for an unknown name."""
         columns = self._columns_of(name)
-        used = torch.nonzero(self._map.hash.keys != EMPTY)[:, 0]
-        keys, order = torch.sort(self._map.hash.keys[used])  # packed keys sort like (ix, iy, iz)
-        rows = self._map.hash.rows[used[order]].to(torch.int64)
+        used = torch.nonzero(self.storage.hash.keys != EMPTY)[:, 0]
+        keys, order = torch.sort(self.storage.hash.keys[used])  # packed keys sort like (ix, iy, iz)
+        rows = self.storage.hash.rows[used[order]].to(torch.int64)
         seen = columns.op[rows] > 0
         keys, rows = keys[seen].cpu(), rows[seen]
         values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES}
@@ -139,12 +139,12 @@ class TorchMaps:
         return VoxelTable(**index_columns(index), **values, voxel_size=self.voxel_size)
 
     def _columns_of(self, name: str) -> Columns:
-        if name not in self._map.columns:
-            raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self._map.columns)}")
-        return self._map.columns[name]
+        if name not in self.storage.columns:
+            raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self.storage.columns)}")
+        return self.storage.columns[name]
 
     def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
-        K = self._map.columns[name].num_classes
+        K = self.storage.columns[name].num_classes
         evidence: ViewEvidence
         if isinstance(said, Labels):
             evidence = self._kernels.count_labels(seen, said, K)
@@ -159,24 +159,24 @@ class TorchMaps:
         self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
     ) -> tuple[torch.Tensor, int]:
         """Rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
-        rows = self._kernels.find(self._map.hash, seen.keys)
+        rows = self._kernels.find(self.storage.hash, seen.keys)
         observed = torch.zeros_like(rows, dtype=torch.bool)
         for of_name in evidence.values():
             observed |= of_name.pixels > 0
         new = observed & (rows == EMPTY)
-        row_of_new = torch.cumsum(new, dim=0) + (self._map.voxels - 1)
+        row_of_new = torch.cumsum(new, dim=0) + (self.storage.voxels - 1)
         wrong = [of_name.flags for of_name in evidence.values()]
         added, *flags = torch.cat([new.sum()[None], *wrong]).tolist()  # the one wait for the device before the update
         for n, name in enumerate(evidence):
             highest, lost, negative = flags[3 * n : 3 * n + 3]
             self._check(name, highest, bool(lost), bool(negative), view, grid, seen)
-        return torch.where(new, row_of_new, rows), self._map.voxels + int(added)
+        return torch.where(new, row_of_new, rows), self.storage.voxels + int(added)
 
     def _check(
         self, name: str, highest: int, lost: bool, negative: bool, view: DepthView, grid: MapGrid, seen: Association
     ) -> None:
         """Raise DataError where a label, score or point is none that the map can hold."""
-        K = self._map.columns[name].num_classes
+        K = self.storage.columns[name].num_classes
         if highest >= K:
             where = _where(view, "labels", name)
             raise DataError(f"{where}: label id {highest} is outside 0 to {K - 1}; map it or ignore it")

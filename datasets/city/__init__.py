@@ -68,8 +68,9 @@ class CityScene(Scene):
         self.up = np.array([0.0, 0.0, 1.0])
         self._options = options
         self._flight = FLIGHTS[name]
-        self._origin = np.array(options.origin, dtype=np.float64)
-        self._rendered: dict[int, Rendered] = {}
+        self.origin = np.array(options.origin, dtype=np.float64)
+        self.rendered: dict[int, Rendered] = {}
+        """The frames that are kept, by their index."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -100,12 +101,12 @@ class CityScene(Scene):
         model = self._model(backbone)
         T = self._pose(index)
         T_wc = T.copy()
-        T_wc[:3, 3] += self._origin
+        T_wc[:3, 3] += self.origin
         rendered = self._render(index, T)
         labels: npt.NDArray[np.uint8] | None = rendered.classes
         scores = None
         if model is not None:
-            view = View(index, rendered, self.camera, T_wc, self._origin)
+            view = View(index, rendered, self.camera, T_wc, self.origin)
             simulation = Simulation(model, self._options.seed, backbone, self.name)
             labels, scores = (None, simulation.scores(view)) if model.softness else (simulation.labels(view), None)
         where = f"city/{self.name}/frame {index}"
@@ -135,17 +136,19 @@ class CityScene(Scene):
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @cached_property
-    def _world(self) -> World:
+    def world(self) -> World:
+        """The town and its traffic, built when first asked for."""
         return build_world(self._options.seed, self._flight)
 
     @cached_property
-    def _still(self) -> Caster:
-        return Caster(self._world.still)
+    def still(self) -> Caster:
+        """What rays hit of the town, whatever the time."""
+        return Caster(self.world.still)
 
     @cached_property
     def _ground(self) -> float:
         """Mean height of the ground under the flight."""
-        return float(self._world.terrain.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
+        return float(self.world.terrain.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
 
     def _share(self, index: int) -> float:
         """How much of the flight lies behind at a frame."""
@@ -165,14 +168,14 @@ class CityScene(Scene):
         of them just before it is needed.
         """
         with self._lock:
-            if index in self._rendered:
-                return self._rendered[index]
-            moving = Caster(self._world.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
+            if index in self.rendered:
+                return self.rendered[index]
+            moving = Caster(self.world.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
-            rendered = render(self._still, moving, T, self.camera, size)
-            kept = sum(other.nbytes for other in self._rendered.values())
+            rendered = render(self.still, moving, T, self.camera, size)
+            kept = sum(other.nbytes for other in self.rendered.values())
             if kept + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
-                self._rendered[index] = rendered
+                self.rendered[index] = rendered
             return rendered
 
     def _model(self, backbone: str) -> SimulatedBackbone | None:

@@ -97,7 +97,7 @@ class Pass:
         self._outcomes: list[Outcome] = []
         self._watch = Stopwatch()
         self._streams = streams_of([one for request in requests for one in self._created(request)])
-        self._memory_before = _resident_bytes()
+        self._memory_before = resident_bytes()
         self._bound = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
 
     def run(self) -> list[Outcome]:
@@ -197,7 +197,7 @@ class Pass:
     def _make_room(self) -> None:
         """Put maps off to the next pass where they take more than the memory bound: half, but none that is watched."""
         maps = [one for stream in self._streams for one in stream.maps]
-        if len(maps) < 2 or _resident_bytes() - self._memory_before <= self._bound:
+        if len(maps) < 2 or resident_bytes() - self._memory_before <= self._bound:
             return
         most = sorted(maps, key=lambda one: not one.request.kept)[max(1, len(maps) // 2) :]
         off = {one.request.identity for one in most if not one.request.kept}
@@ -250,7 +250,8 @@ def _ground_truth(scene: Scene, index: int) -> Frame | None:
         return None
 
 
-def _resident_bytes() -> int:
+def resident_bytes() -> int:
+    """Memory that this process takes."""
     import psutil
 
     return int(psutil.Process().memory_info().rss)

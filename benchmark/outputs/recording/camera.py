@@ -91,7 +91,7 @@ class CameraLog:
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride_of(frame.shape)))
-        if (color := self._color(frame)) is not None:
+        if (color := self.color(frame)) is not None:
             jpeg, size = color
             self._overlay.log(stream, self._path("color"), frame.shape, size)
             stream.log(self._path("color"), rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=-20))
@@ -124,7 +124,7 @@ class CameraLog:
         units = np.clip(np.round(depth * self._depth_unit), 0, 65535).astype(np.uint16)
         return rr.DepthImage(units, meter=self._depth_unit, colormap="turbo")
 
-    def _color(self, frame: Frame) -> tuple[bytes, tuple[int, int]] | None:
+    def color(self, frame: Frame) -> tuple[bytes, tuple[int, int]] | None:
         """Colour as JPEG, and its size (H, W); None where the frame has none, or it cannot be read."""
         import cv2
 

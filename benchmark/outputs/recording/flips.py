@@ -56,7 +56,8 @@ class FlipLog:
     """Keeps what moved a voxel's belief, above all its dominant class, and from which file the frame's labels came."""
 
     def __init__(self) -> None:
-        self._parts: list[npt.NDArray[np.void]] = []
+        self.moves: list[npt.NDArray[np.void]] = []
+        """Records of `MOVE`, in the order of the frames."""
         self._count = 0
         self._frames: dict[int, tuple[float | None, str]] = {}  # timestamp, label file
 
@@ -67,7 +68,7 @@ class FlipLog:
         moves = np.zeros(len(at), dtype=MOVE)
         moves["row"], moves["frame"], moves["bits"] = changes.row[at], frame.index, changes.drift[at]
         moves["before"], moves["after"] = changes.before[at], changes.after[at]
-        self._parts.append(moves)
+        self.moves.append(moves)
         self._count += len(at)
         name = frame.files.get("labels") or frame.files.get("scores") or ""
         file = PurePath(name)
@@ -85,7 +86,7 @@ class FlipLog:
         first_frame, op = (fused.column(name, rows) for name in ("first_frame", "op"))
         centers = (fused.index_of(rows) + 0.5) * fused.voxel_size
         dominant, sbd = fused.evidence_of(rows).argmax(axis=1), mean_drift(total[rows], op)
-        moves = np.concatenate([np.zeros(0, dtype=MOVE), *self._parts])
+        moves = np.concatenate([np.zeros(0, dtype=MOVE), *self.moves])
         for i, row in enumerate(rows):
             own = moves[moves["row"] == row]
             first = int(own["before"][0]) if len(own) else int(dominant[i])
@@ -146,7 +147,7 @@ class FlipLog:
 
     def _drop(self, total_drift: npt.NDArray[np.float64]) -> None:
         """Keep half as many: the moves of the voxels that drifted most."""
-        moves = np.concatenate(self._parts)
+        moves = np.concatenate(self.moves)
         order = np.argsort(-total_drift[moves["row"]], kind="stable")[: MAX_MOVES // 2]
-        self._parts = [moves[np.sort(order)]]
+        self.moves = [moves[np.sort(order)]]
         self._count = len(order)

@@ -214,7 +214,8 @@ class MapLog:
         self._edges = edges()
         self._chunk_of = np.repeat(np.arange(CHUNKS, dtype=np.uint8), np.diff(self._edges))
         self._share = min(BUDGET / frames, MOST_A_FRAME)
-        self._allowed = 0.0
+        self.allowed = 0.0
+        """How many of them the frames so far pay for."""
         self._changed = np.zeros(CHUNKS, dtype=np.int64)  # observations in each chunk since it was logged
         self._drawn = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
 
@@ -222,12 +223,12 @@ class MapLog:
         """A frame went into the map: what logs as much of it as the budget allows, whatever becomes of the map."""
         rows = fused.changes.row
         self._changed += np.bincount(self._chunk_of[rows[rows < MAX_VOXELS]], minlength=CHUNKS)
-        self._allowed += self._share
+        self.allowed += self._share
         sizes = np.diff(np.minimum(self._edges, len(fused)))
         urgent = (self._changed + NEW * (sizes - self._drawn)) / np.maximum(sizes, 1)
         jobs: list[Callable[[], None]] = []
         for c in np.argsort(-urgent, kind="stable"):
-            if self._changed[c] == 0 or self.logged + sizes[c] > self._allowed:
+            if self._changed[c] == 0 or self.logged + sizes[c] > self.allowed:
                 break
             jobs.append(self._job(stream, fused, int(c), int(sizes[c])))
         return jobs

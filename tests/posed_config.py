@@ -1,0 +1,20 @@
+"""The one way in which tests configure a run or a study of posed folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from semstab.config import Config
+from semstab.settings import load_config, resolve
+
+
+def dataset_of(root: Path, **options: Any) -> dict[str, Any]:
+    """The setting `dataset` of the scene, or the scenes, in a folder."""
+    return {"name": "posed_folder", "options": {"root": str(root), **options}}
+
+
+def configure(root: Path, **settings: Any) -> Config:
+    """Fused by the reference into voxels of 0.25 m, unless the settings say otherwise."""
+    usual = {"dataset": dataset_of(root), "backends": ["numpy"], "voxel_size": 0.25}
+    return resolve(load_config(overrides={**usual, **settings}))
