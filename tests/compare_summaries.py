@@ -74,8 +74,15 @@ def _name(item: Any) -> str | None:
     if not isinstance(item, dict):
         return None
     given = [key for key in NAMED_BY if key in item and not _base(key, item)]
-    found = [json.dumps(item[key], sort_keys=True).strip('"') for key in given]
+    found = [json.dumps(_plain(item[key]), sort_keys=True).strip('"') for key in given]
     return " ".join(found) or None
+
+
+def _plain(value: Any) -> Any:
+    """Whole numbers are numbers: 5 is 5.0."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return float(value) if type(value) is int else value
 
 
 def _base(key: str, item: dict[str, Any]) -> bool:
