@@ -101,7 +101,7 @@ def test_the_terminal_shows_it(run) -> None:
         assert "rival ↓" in part.partition("──")[0]
         assert "parts" in part.partition("──")[0]
     assert f" {result.runs[0].table[RIVAL]:.2f} " in scenes
-    assert "|ΔR2|" in agreement
+    assert "ΔR2" in agreement
     assert "R2 rival" in agreement
 
 

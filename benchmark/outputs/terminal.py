@@ -143,7 +143,7 @@ def _stages_line(runs: Sequence[UnitSummary]) -> str:
 
 def _agreement_table(agreement: Sequence[Agreement]) -> Table:
     symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures()}, "evidence": "e"}
-    numbers = ("voxels in\none only", *(f"|Δ{symbol}|" for symbol in symbols.values()), "")
+    numbers = ("voxels\nin one", *(f"Δ{symbol}" for symbol in symbols.values()), "")
     short = [f"{measure.symbol} {measure.word}" for measure in measures() if measure.short]
     title = f"agreement: largest differences of a voxel ({', '.join([*short, 'e evidence'])})"
     table = _table(title, ("scene, backbone",), numbers)
