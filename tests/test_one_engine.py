@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 
 import numpy as np
@@ -18,11 +19,14 @@ from test_recording import read
 import semstab
 from semstab.config import BACKENDS
 from semstab.engine import LocalProcesses, load_result
-from semstab.metrics import compare
+from semstab.engine.units import make_plan
+from semstab.engine.work import image_space
+from semstab.metrics import compare, compensated_flicker
 from semstab.outputs.plots import write_figures
 from semstab.outputs.plots.drawing import DrawingProcess
 from semstab.outputs.recording import Recording, Target
 from semstab.settings import load_config, load_study
+from semstab.task import read as read_frame
 
 TIMES = {"decode_ms", "wait_ms", "fuse_ms", "association_ms", "update_ms"}
 
@@ -189,3 +193,16 @@ def test_two_processes_draw_the_figures_that_one_draws(root, tmp_path) -> None:
             drawn.append({file.name: file.read_bytes() for file in (out / "figures").iterdir()})
     assert len(drawn[0]) >= 8
     assert drawn[0] == drawn[1] == drawn[2]
+
+
+def test_large_frames_are_sampled_for_what_is_measured_in_the_image(root, monkeypatch) -> None:
+    """Each pixel of the sample is looked up in the whole frame before: fusion need not wait for all of them."""
+    monkeypatch.setattr(image_space, "SIDE", 4)  # of frames of 8x6: every second pixel
+    (task, *_) = make_plan(load_config(overrides=settings(root))).tasks
+    frames = [read_frame(task, index) for index in task.indices]
+    meter = image_space.ImageSpaceMeter()
+    for frame in frames:
+        meter.add(frame, None)
+    pairs = [compensated_flicker(a, b.every(2)).flicker_percent for a, b in itertools.pairwise(frames)]
+    assert meter.result(1.0).compensated_flicker_percent == pytest.approx(np.mean(pairs))
+    assert meter.result(1.0).flicker_percent == 1.0

@@ -45,6 +45,8 @@ class Variation:
 class ImageSpace:
     """Stability in image coordinates, over the sampled frames of a unit; NaN where it is not defined.
 
+    All but flicker_percent are of every n-th pixel of each axis, where the longer side has more than 640.
+
     flicker_percent              pixels valid in both of two consecutive frames whose label differs
     compensated_flicker_percent  the same after the previous map is warped by depth and pose, occluded pixels left out
     compensated_share            co-visible share: pixels that the warped map reaches, of the valid ones, 0 to 1
