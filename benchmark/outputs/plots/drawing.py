@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -22,8 +22,9 @@ class DrawingProcess:
         context = multiprocessing.get_context("spawn")
         listening, self._alive = context.Pipe(duplex=False)
         self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(listening,))
+        self._given: list[Future[None]] = []
         with contextlib.suppress(BrokenProcessPool):
-            self._pool.submit(_load)
+            self._given.append(self._pool.submit(_load))
 
     def draw(self, folder: Path, names: Sequence[str]) -> Callable[[], bool]:
         """Begin to draw the figures of those names from the finished folder.
@@ -34,6 +35,7 @@ class DrawingProcess:
         drawing = None
         with contextlib.suppress(BrokenProcessPool, RuntimeError):
             drawing = self._pool.submit(_draw, folder, names)
+            self._given.append(drawing)
 
         def drawn() -> bool:
             with contextlib.suppress(BrokenProcessPool):
@@ -43,7 +45,9 @@ class DrawingProcess:
         return drawn
 
     def close(self) -> None:
-        """End the process, also where it is at work."""
+        """End the process, also where it is at work; one that is idle ends by itself, without a word."""
+        if all(future.done() for future in self._given):
+            self._pool.shutdown()
         self._alive.close()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
