@@ -8,7 +8,7 @@ import functools
 import logging
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from semstab.engine.observer import Factory, Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned, PlannedUnit
 from semstab.errors import ConfigError
-from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame
 from semstab.model.measures import measures
 from semstab.model.records import Result, Variation
@@ -31,24 +30,16 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import drift_colors, legend, series
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
-    IMAGE_SIDE,
     CameraLog,
-    Overlay,
     label_context,
-    stride_of,
 )
-from semstab.outputs.recording.difference import log_difference
 from semstab.outputs.recording.entities import Clock, path
-from semstab.outputs.recording.flips import FlipLog
-from semstab.outputs.recording.layout import Known, Scenery, blueprint, drawn, is_pointwise
+from semstab.outputs.recording.group import GroupLog
+from semstab.outputs.recording.layout import Known, Scenery, blueprint
 from semstab.outputs.recording.parts import Parts
 from semstab.outputs.recording.target import DEFAULT_URL, Target
-from semstab.outputs.recording.tracker import FrameDrift, Tracker
-from semstab.outputs.recording.voxel_maps import CHUNKS, MapLog, chunks_of
+from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of
 from semstab.task import Task
-
-SAMPLING = 2
-"""In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
 
 FIRST_CHUNKS = 8
 """Chunks of each map that the first layout knows; it is sent again where a map outgrows them."""
@@ -86,7 +77,7 @@ class Recording(Observer):
         self._known = Known()
         self._sent = 0  # layouts
         self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
-        self._group: _Group | None = None  # the backbone on a scene that is being fused
+        self._group: GroupLog | None = None  # the backbone on a scene that is being fused
         self._background: Background | None = None
         self._parts: Parts | None = None
 
@@ -110,7 +101,7 @@ class Recording(Observer):
         origin = self._origin(stream, task, frame.T_wc[:3, 3])
         if self._group is None or self._group.task is not task:
             growing = self._growing.pop((unit.scene, unit.backbone), None)
-            self._group = _Group(task, self._plan.config.voxel_size, origin, growing)
+            self._group = GroupLog(task, self._plan.config.voxel_size, origin, growing)
         if not self.pictures_only:
             values = series.values(row.cells())
             series.log_row(stream, unit, task, values)
@@ -216,7 +207,7 @@ class Recording(Observer):
             stream.disconnect()
 
     @property
-    def _fused(self) -> _Group:
+    def _fused(self) -> GroupLog:
         """The group that is being fused."""
         assert self._group is not None
         return self._group
@@ -232,7 +223,7 @@ class Recording(Observer):
             self._log_kept(stream)
         return self._stream, self._background
 
-    def _lay_out(self, stream: rr.RecordingStream, group: _Group, table: VoxelTable) -> None:
+    def _lay_out(self, stream: rr.RecordingStream, group: GroupLog, table: VoxelTable) -> None:
         """All of a group is fused: send the layout again where there is more to it now. The table is one of its own."""
         known, scene = self._known, group.task.scene.name
         compared = len(group.task.backends) > 1
@@ -246,7 +237,7 @@ class Recording(Observer):
             known.sceneries[scene] = Scenery(points, poses, group.task.scene.up)
         self._show_chunks(stream, scene, group.voxels, anyway=first or compared)
 
-    def _log_numbers(self, stream: rr.RecordingStream, group: _Group, summary: UnitSummary) -> None:
+    def _log_numbers(self, stream: rr.RecordingStream, group: GroupLog, summary: UnitSummary) -> None:
         text = _final(summary) + group.remarks.get(summary.unit.backend, "")
         stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
 
@@ -266,7 +257,7 @@ class Recording(Observer):
     def _log_kept(self, stream: rr.RecordingStream) -> None:
         kept, self._kept = self._kept, []
         for task, summaries in kept:
-            group: _Group | None = None
+            group: GroupLog | None = None
             for summary in summaries:
                 self._clock.set(stream, task.indices[-1])
                 if self._run is None:
@@ -279,7 +270,7 @@ class Recording(Observer):
                 table = VoxelTable.load(self._run / "voxels" / f"{unit.slug}.parquet")
                 if group is None:
                     at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
-                    group = _Group(task, table.voxel_size, self._origin(stream, task, at))
+                    group = GroupLog(task, table.voxel_size, self._origin(stream, task, at))
                 for values in series.send_rows(
                     stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
                 ):
@@ -321,124 +312,6 @@ class PictureRecording(Recording):
             for backend in task.backends
         )
         self.run_started(Plan(config, {}, tuple(units), ()), [])
-
-
-class _Group:
-    """What is recorded of one backbone on a scene."""
-
-    def __init__(
-        self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64], growing: GrowingMap | None = None
-    ) -> None:
-        self.task = task
-        self.origin = origin
-        self._classes = task.mapping.target
-        self._translation = origin * voxel_size
-        self._tracker = Tracker(voxel_size, len(self._classes), growing)
-        self._flips = FlipLog()
-        self._maps: dict[str, MapLog] = {}
-        self.tables: dict[str, VoxelTable] = {}
-        """By backend, as they are finished."""
-        self._previous: Frame | None = None
-        self._entity = path(task.scene.name, "camera", task.backbone)
-        self._overlay = Overlay()
-        self.last: tuple[int, float | None] = (task.indices[-1], None)
-        """Number and timestamp of the last frame."""
-        self.spans: dict[str, tuple[float, float]] = {}
-        """The lowest and highest value of each series in all backends."""
-        self.voxels = 0
-        """Of its largest final map."""
-        self.remarks: dict[str, str] = {}
-        """What there is to say of the final map of a backend."""
-
-    def span(self, values: Mapping[str, float]) -> None:
-        """A unit's series had these values in a frame."""
-        for name, value in values.items():
-            low, high = self.spans.get(name, (value, value))
-            self.spans[name] = min(low, value), max(high, value)
-
-    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, maps: bool) -> None:
-        """All units of the group fused the frame: log what it shows and what it changed, and where wanted the map."""
-        self._tracker.follow(frame)
-        self.last = frame.index, frame.timestamp
-        self._flips.update(self._tracker, frame)
-        drawn_map = self._map(drawn(self.task)) if maps and is_pointwise(drawn(self.task)) else None
-        grown = drawn_map.update(stream, self._tracker.map) if drawn_map is not None else []
-        drift, previous = self._tracker.drift_of(frame), self._previous
-        self._previous = frame
-
-        def job() -> None:
-            self._log_pictures(stream, drift)
-            if previous is not None:
-                self._log_flicker(stream, previous, frame)
-            for log_chunk in grown:
-                log_chunk()
-
-        background.submit(frame.index, frame.timestamp, job)
-
-    @property
-    def grown(self) -> int:
-        """Voxels of the map that is drawn while it grows."""
-        return len(self._tracker.map) if is_pointwise(drawn(self.task)) else 0
-
-    def log_map(self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float) -> None:
-        """Log a unit's final voxels, and where they differ from those of the drawn unit."""
-        first = drawn(self.task)
-        self.tables[unit.backend] = table
-        self.voxels = max(self.voxels, len(table))
-        if first in self.tables:
-            for backend in self.tables if unit.backend == first else [unit.backend]:
-                self._compare(stream, first, backend, tolerance)
-        self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
-
-    def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
-        """Log which frames changed the voxels that drifted most."""
-        suspects = list(self._flips.suspects(self._tracker))
-        self._flips.log(
-            stream, self.task.scene.name, self.task.backbone, suspects, self._classes, self._translation, clock
-        )
-
-    def _compare(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
-        if first == second:
-            return
-        scene, backbone = self.task.scene.name, self.task.backbone
-        entity = path(scene, "difference", backbone, f"{first} and {second}")
-        tables = {name: self.tables[name] for name in (first, second)}
-        found = log_difference(stream, entity, tables, self.origin, tolerance)
-        stream.log(path(scene, "log"), rr.TextLog(f"{backbone}: {found}"))
-        report = rr.TextDocument(f"{found}.", media_type=rr.MediaType.MARKDOWN)
-        stream.log(path(scene, "difference_report", backbone, f"{first} and {second}"), report, static=True)
-
-    def _log_pictures(self, stream: rr.RecordingStream, caused: FrameDrift) -> None:
-        frame = caused.frame
-        stride = stride_of(frame.shape)
-        labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
-        coarse = stride * _sampling(labels.shape)
-        for name, picture, step in (
-            ("labels", labels, stride),
-            ("drift", drift_colors.levels_of(*caused.at(coarse)), coarse),
-        ):
-            entity = f"{self._entity}/{name}"
-            self._overlay.log(stream, entity, frame.shape, picture.shape, step)
-            stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
-
-    def _log_flicker(self, stream: rr.RecordingStream, previous: Frame, frame: Frame) -> None:
-        """Motion-compensated flicker: of a sample of the frame's pixels, looked up in the whole frame before."""
-        stride = stride_of(frame.shape)
-        sample = frame.every(stride)
-        flicker = compensated_flicker(previous, sample.every(_sampling(sample.shape))).flicker_percent
-        if math.isfinite(flicker):
-            stream.log(series.entity("compensated_flicker", self.task.units[0]), rr.Scalars(flicker))
-
-    def _map(self, backend: str) -> MapLog:
-        if backend not in self._maps:
-            entity = path(self.task.scene.name, "map", self.task.backbone, backend)
-            self._maps[backend] = MapLog(entity, self._classes, self.origin, len(self.task.indices))
-        return self._maps[backend]
-
-
-def _sampling(shape: tuple[int, ...]) -> int:
-    """Every how many pixels a picture of that shape is sampled."""
-    return SAMPLING if max(shape) > IMAGE_SIDE // SAMPLING else 1
 
 
 def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
