@@ -41,7 +41,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 
-PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table"}
+PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset"}
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
 
 
