@@ -76,8 +76,15 @@ def predicted_config(
 
 
 def resolve(config: Config) -> Config:
-    """The configuration with every default of its dataset's options filled in, paths absolute."""
-    return config.model_copy(update={"dataset": resolved(config.dataset)})
+    """The configuration with every default of its dataset's options filled in, paths absolute.
+
+    Sequential backbones that predict in a run are shown the frames that it selects.
+    """
+    dataset = config.dataset
+    if dataset.name == PREDICTED:
+        shown = config.model_dump(mode="json", include={"frames", "scene_frames"})
+        dataset = dataset.model_copy(update={"options": {**dataset.options, **shown}})
+    return config.model_copy(update={"dataset": resolved(dataset)})
 
 
 def _of_file(path: str | Path | None) -> dict[str, Any]:
