@@ -52,7 +52,14 @@ def run(
     pixel_stride: Annotated[int | None, typer.Option(help="Use every n-th pixel of each axis.")] = None,
     frames: Frames = None,
     device: Annotated[str | None, typer.Option(help="CPU:0, or CUDA:0 for backends that take a device.")] = None,
-    check: Annotated[str | None, typer.Option(help="Backend to check against, or 'none'.")] = None,
+    check: Annotated[
+        str | None,
+        typer.Option(
+            metavar="sample|BACKEND|none",
+            help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
+            show_default="sample; of the built-in city numpy",
+        ),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.")] = None,
     settings: Annotated[
         list[str] | None,

@@ -11,7 +11,7 @@ from typing import Any
 from semstab.config import BACKENDS, BASE
 from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
-from semstab.model.results import Agreement, Unit, UnitSummary
+from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.json_form import INLINE
@@ -134,6 +134,7 @@ class UnitContent:
     up       the scene's up axis, where it is known or could be estimated
     files    digests of the unit's other files, by their path in the folder
     regions  of a source of regions, instead of a summary
+    checked  how far it agrees with the reference on a sample of its voxels, where it was checked so
     """
 
     input: str
@@ -142,6 +143,7 @@ class UnitContent:
     up: tuple[float, float, float] | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None
+    checked: Agreement | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ class Result:
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
     georeference  by scene, where it lies on Earth, where that is known
     regions    flicker of the label sources that are regions without classes
+    advice     where the voxel size lies, scene by scene, for data of files
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
 
@@ -176,6 +179,7 @@ class Result:
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
     comparisons: tuple[BackboneComparison, ...] = ()
+    advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None

@@ -129,7 +129,7 @@ class UnitSummary:
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
     fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
     the fused ones of which no pixel was valid; statistics is what `semstab.statistics.describe` says of the map, None
-    where nothing was asked for.
+    where nothing was asked for; sizes tells whether half or twice the voxel size would say something else.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -143,6 +143,32 @@ class UnitSummary:
     frames_left_out: int = 0
     frames_empty: int = 0
     statistics: MapStatistics | None = None
+    sizes: tuple[SizeAlpha, ...] = ()
+
+
+@dataclass(frozen=True)
+class VoxelAdvice:
+    """Where a voxel size lies, by the depth of a few frames reprojected into each other.
+
+    voxel_size  metres
+    stays       share of the points that fall into the same voxel when another frame sees them
+    suggested   the smallest size in which half of them do, metres; None where nothing can be told
+    chosen      whether it was chosen for that, and not given
+    """
+
+    voxel_size: float
+    stays: float
+    suggested: float | None
+    chosen: bool
+
+
+@dataclass(frozen=True)
+class SizeAlpha:
+    """Krippendorff's alpha of some frames, evenly spaced, in voxels of one size; NaN where it is not defined."""
+
+    voxel_size: float
+    frames: int
+    alpha: float
 
 
 @dataclass(frozen=True)
@@ -158,6 +184,7 @@ class Agreement:
     """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
 
     differences  of OP, of every measure and of the evidence, by their keys
+    one_in       of so many voxels, drawn at random, one was compared
     """
 
     scene: str
@@ -167,3 +194,4 @@ class Agreement:
     only_in: tuple[int, int]
     differences: Mapping[str, Deviation]
     agrees: bool
+    one_in: int = 1

@@ -15,6 +15,7 @@ from semstab.metrics import macro_mean, pool
 from semstab.model.measures import measures
 from semstab.model.records import Result
 from semstab.model.results import STAGES, Agreement, Means, UnitSummary
+from semstab.outputs.remarks import remarks
 from semstab.outputs.statistics_text import comparison_lines, lines
 
 NOTHING = "-"
@@ -25,11 +26,16 @@ def print_summary(result: Result, console: Console) -> None:
     shown = [record.summary for record in result.select()]
     console.print(_scene_table(shown))
     console.print(_strata_table(shown))
-    if result.agreement:
-        console.print(_agreement_table(result.agreement))
+    drawn = [row for row in result.agreement if row.one_in > 1]
+    if told := [row for row in result.agreement if row not in drawn or not row.agrees]:
+        console.print(_agreement_table(told))
+    if drawn:
+        console.print(f"{_drawn(drawn)}\n", highlight=False, markup=False)
     console.print(_stages_line(shown))
     for text in _statistics(result):
         console.print(text, highlight=False, markup=False)
+    for text in remarks(result):
+        console.print(f"{text}\n", highlight=False, markup=False)
     for run in shown:
         if run.frames_left_out:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
@@ -158,6 +164,17 @@ def _agreement_table(agreement: Sequence[Agreement]) -> Table:
             verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
             table.add_row(escape(f"  {row.scene}, {row.backbone}"), f"{sum(row.only_in):,}", *differences, verdict)
     return table
+
+
+def _drawn(sampled: Sequence[Agreement]) -> str:
+    """How the backends fared that were checked on a sample of the voxels."""
+    backends = _listed([*dict.fromkeys(row.backends[0] for row in sampled)])
+    voxels, bad = sum(row.voxels[1] for row in sampled), sum(not row.agrees for row in sampled)
+    found = f"{bad} of {len(sampled)} maps differ" if bad else "none differs"
+    return (
+        f"check: {backends} against the numpy reference on {voxels:,} voxels drawn at random, one in"
+        f" {sampled[0].one_in}: {found} (--check numpy: on all of them)"
+    )
 
 
 def _listed(words: Sequence[str]) -> str:

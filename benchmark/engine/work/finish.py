@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import FusionBackend
+from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
 from semstab.config import Config
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
@@ -23,10 +24,11 @@ from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
-from semstab.metrics import macro_mean, summarise
+from semstab.metrics import compare, macro_mean, summarise
+from semstab.metrics.matching import rows_of
 from semstab.model.measures import dominant, measures
 from semstab.model.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
-from semstab.model.results import STAGES, UnitSummary, slug
+from semstab.model.results import STAGES, Agreement, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
@@ -55,7 +57,9 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         summary = _summary(one, table, found)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
-    content = UnitContent(task.digest, summary, files=saved)
+    with watch("check"):
+        checked = None if one.sample is None else _checked(one, table, one.sample)
+    content = UnitContent(task.digest, summary, files=saved, checked=checked)
     if one.request.image_space and stream.image_space is not None:
         image_space = stream.image_space.result(summary.flicker_percent)
         content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
@@ -82,6 +86,14 @@ def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
     )
 
 
+def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
+    """How far the map agrees with the reference on the voxels of the sample."""
+    unit, found = one.task.units[0], _table(sample, one.task)
+    drawn = rows_of(table, in_sample(table.index.T.astype(np.int64)))
+    units = (unit, dataclasses.replace(unit, backend="numpy"))
+    return dataclasses.replace(compare(drawn, found, units, tolerance=one.request.config.tolerance), one_in=ONE_IN)
+
+
 def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
     task, config, rows = one.task, one.request.config, one.rows
@@ -98,6 +110,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         frames_left_out=task.left_out,
         frames_empty=sum(row.report.points == 0 for row in rows),
         statistics=None if found is None else found.summary,
+        sizes=() if one.sizes is None else one.sizes.alphas(),
     )
 
 

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.backends import FusionBackend, create, takes_option
+from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.evaluation import truth_task
@@ -19,6 +20,7 @@ from semstab.engine.work.finish import finish
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
 from semstab.engine.work.memory import available_bytes, require_memory
 from semstab.engine.work.regions import measure_regions
+from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, Prepared, Stream, UnitMap, streams_of
 from semstab.errors import DataError
 from semstab.model.frames import Frame
@@ -129,7 +131,9 @@ class Pass:
             (task,) = tasks_of(self._scene, request.config)
             task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
-            return [UnitMap(request, task, _new_map(request.config, task), truth)]
+            sample = NumpySample(request.config.voxel_size, len(task.mapping.target)) if request.sampled else None
+            sizes = SizeMaps(task, request.config.voxel_size) if request.image_space and request.judged else None
+            return [UnitMap(request, task, _new_map(request.config, task), truth, sample, sizes)]
         return []
 
     def _decode(self, index: int) -> Decoded:
@@ -166,6 +170,12 @@ class Pass:
             _warm_up(one, frame)
         with self._watch(f"fuse {one.task.backends[0]}"):
             report = one.backend.integrate(frame)
+        if one.sample is not None:
+            with self._watch("check"):
+                one.sample.integrate(frame)
+        if one.sizes is not None:
+            with self._watch("voxel sizes"):
+                one.sizes.add(fetched.item.index, frame)
         if one.truth is not None and now.truth is not None:
             one.truth.integrate(now.truth)
         return FrameRow(

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from semstab.backends import FusionBackend
+from semstab.backends.numpy_reference import NumpySample
 from semstab.engine.evaluation import truth_task
 from semstab.engine.series import FrameRow
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
+from semstab.engine.work.sizes import SizeMaps
 from semstab.metrics import flicker_percent
 from semstab.model.frames import Frame
 from semstab.runtime.stopwatch import Stopwatch
@@ -26,12 +28,19 @@ SHOWN_WIDTH = 1280
 
 @dataclass(eq=False)
 class UnitMap:
-    """A unit that is being fused; `truth` takes the ground truth of the same frames, for statistics."""
+    """A unit that is being fused.
+
+    truth   takes the ground truth of the same frames, for statistics
+    sample  the reference, on a sample of its voxels, where it is checked so
+    sizes   maps of some frames at other voxel sizes
+    """
 
     request: Request
     task: Task
     backend: FusionBackend
     truth: FusionBackend | None = None
+    sample: NumpySample | None = None
+    sizes: SizeMaps | None = None
     rows: list[FrameRow] = field(default_factory=list)
 
 
