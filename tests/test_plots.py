@@ -21,14 +21,15 @@ from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
 from semstab.model.measures import SBD_MAX, VSS, measures
 from semstab.model.voxels import VoxelTable
+from semstab.outputs import topdown
 from semstab.outputs.averages import ENOUGH, describe, levels
-from semstab.outputs.plots import figures, topdown
+from semstab.outputs.plots import figures
 from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
 from semstab.outputs.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
 from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.outputs.plots.style import COLUMN, DPI, PAGE
 from semstab.outputs.plots.sweeps import draw_sweep
-from semstab.outputs.plots.topdown import EMPTY, level_axes, top_down
+from semstab.outputs.topdown import EMPTY, level_axes, top_down
 from semstab.testing import SEQUENCES, as_frames, checks
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]

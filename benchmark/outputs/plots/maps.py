@@ -18,7 +18,7 @@ from semstab.model.measures import dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
-from semstab.outputs.plots.topdown import EMPTY, Float64, Int64, top_down
+from semstab.outputs.topdown import EMPTY, Float64, Int64, top_down
 from semstab.statistics import decompose, psa
 from semstab.statistics.correctness import STABLE
 
