@@ -110,6 +110,23 @@ class Record:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
 
 
+class Tables:
+    """Voxel tables of records, the last few of them at hand: those that belong together are asked for together."""
+
+    def __init__(self, most: int = 1) -> None:
+        self._most = most
+        self._loaded: dict[str, VoxelTable] = {}
+
+    def of(self, record: Record) -> VoxelTable:
+        """The record's table."""
+        slug = record.unit.slug
+        if slug not in self._loaded:
+            while len(self._loaded) >= self._most:
+                self._loaded.pop(next(iter(self._loaded)))
+            self._loaded[slug] = record.table()
+        return self._loaded[slug]
+
+
 @dataclass(frozen=True)
 class RegionFlicker:
     """Flicker of a label source that holds regions without classes, by matched regions; it is not fused.
