@@ -30,6 +30,8 @@ SCORES_SUFFIX = "-scores"
 """What posed_folder adds to the name of a folder of scores."""
 
 MAX_UINT16 = 65535
+LONGEST_NAME = 200
+"""Bytes of a folder's name."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ class SceneFolder:
 
     def read_as(self, backbone: str) -> str:
         """The name under which the backbone is found in the folder."""
-        return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else slug(backbone)
+        return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else folder_name(backbone)
 
     def _depth_path(self, name: str, form: DepthFormat) -> Path:
         return self.path / "depth" / f"{name}{form.suffix}"
@@ -177,7 +179,7 @@ class SceneFolder:
     def _label_path(self, name: str, backbone: str, soft: bool) -> Path:
         if soft:
             return self.path / "scores" / _bare(backbone) / f"{name}.npz"
-        return self.path / "labels" / slug(backbone) / f"{name}.png"
+        return self.path / "labels" / folder_name(backbone) / f"{name}.png"
 
     def _require_same_camera(self, frame: Frame) -> None:
         """One intrinsics.txt serves all frames."""
@@ -208,6 +210,12 @@ class SceneFolder:
         return DepthFormat(there["depth_scale"])
 
 
+def folder_name(name: str) -> str:
+    """The name itself where a folder can be called so, or else its `slug`."""
+    fits = name.isprintable() and len(name.encode()) <= LONGEST_NAME and not set(name) & set("/\\")
+    return name if fits and name[:1] not in ("", ".", "-") else slug(name)
+
+
 def matrix_text(matrix: npt.NDArray[np.float64]) -> str:
     """A matrix as text, one row a line, that reads back to the same numbers."""
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix)
@@ -215,4 +223,4 @@ def matrix_text(matrix: npt.NDArray[np.float64]) -> str:
 
 def _bare(backbone: str) -> str:
     """The folder below scores/: posed_folder adds the suffix to its name."""
-    return slug(backbone.removesuffix(SCORES_SUFFIX))
+    return folder_name(backbone.removesuffix(SCORES_SUFFIX))

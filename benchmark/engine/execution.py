@@ -17,7 +17,7 @@ from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.config import BACKENDS, BASE, Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.evaluation import comparison
-from semstab.engine.folder import Folder
+from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
@@ -87,6 +87,7 @@ def _execute(
     started, told = time.perf_counter(), Observers(observers)
     config = resolve(config)
     plan = make_plan(config)
+    require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
         found = _compute(plan, folder, executor, told)

@@ -9,7 +9,7 @@ import hashlib
 import logging
 import os
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,21 @@ LEFTOVERS = (
     *(f"{folder}/.*" for folder in (UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW, "tables", "figures")),
 )  # fmt: skip
 """What a start that was killed may have left half-written."""
+
+
+def require_file_names(out: Path, units: Iterable[Unit]) -> None:
+    """Raise ConfigError where two units' files would have one name, or one that the file system does not take."""
+    there = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
+    longest = os.pathconf(there, "PC_NAME_MAX") - len(".-12345678.parquet")  # while it is written
+    named: dict[str, Unit] = {}
+    for unit in units:
+        other = named.setdefault(unit.slug, unit)
+        if other != unit:
+            raise ConfigError(
+                f"{other} and {unit} would be written to one file, {unit.slug}; rename a scene or backbone"
+            )
+        if len(os.fsencode(unit.slug)) > longest:
+            raise ConfigError(f"{there}: its file system takes no name as long as {unit.slug}; choose another --out")
 
 
 class Folder:
