@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,12 +89,13 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     work = _Work(scene, indices, backbones, folder, progress)
     up = _up_axis(scene)
     said = {"pose_convention": "camera_to_world", "camera_axes": "opencv"} | ({"up_axis": up} if up else {})
-    folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
-    try:
-        written = work.write()
-    except DepthFormatError:
-        folder.begin(DepthFormat(None), said)
-        written = work.write()
+    with contextlib.closing(folder):
+        folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
+        try:
+            written = work.write()
+        except DepthFormatError:
+            folder.begin(DepthFormat(None), said)
+            written = work.write()
     return Converted(
         scene=scene.name,
         folder=path,

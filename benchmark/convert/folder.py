@@ -20,7 +20,16 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.results import slug
-from semstab.runtime.files import atomic_path, content_key, read_json, write_json, write_png, write_text
+from semstab.runtime.files import (
+    FolderLock,
+    atomic_path,
+    content_key,
+    read_json,
+    remove_leftovers,
+    write_json,
+    write_png,
+    write_text,
+)
 
 SCHEMA = 1
 """Version of conversion.json."""
@@ -99,19 +108,29 @@ class SceneFolder:
         self._key = content_key(self._settings)
         self.form = self._claim()
         self._intrinsics: Intrinsics | None = None
+        self._lock: FolderLock | None = None
 
     def begin(self, form: DepthFormat, scene_settings: Mapping[str, Any]) -> None:
         """Say how depth is stored, in scene.yaml and for a later start; depth of another format is removed."""
         if self.form is not None and self.form != form:
             for file in (self.path / "depth").glob(f"*{self.form.suffix}"):
                 file.unlink()
+        if self._lock is None:
+            self._lock = FolderLock(self.path)
+            for folder in self.path.glob("**/"):
+                remove_leftovers(folder)
         self.form = form
         said = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
-        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
         write_json(
             self.path / CONVERSION_FILE,
             {"schema": SCHEMA, "key": self._key, "depth_scale": form.scale, "settings": self._settings},
         )
+        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
+
+    def close(self) -> None:
+        """Let another process have it."""
+        if self._lock is not None:
+            self._lock.release()
 
     @property
     def frames(self) -> set[str]:
@@ -197,7 +216,7 @@ class SceneFolder:
         """How an earlier start stored depth; None where there was none."""
         manifest = self.path / CONVERSION_FILE
         if not manifest.is_file():
-            if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            if self.path.exists() and (not self.path.is_dir() or any(self.path.glob("[!.]*"))):
                 raise ConfigError(f"{self.path}: is there already and holds no conversion; choose another --out")
             return None
         there = read_json(manifest)

@@ -163,7 +163,7 @@ def _work_off(
 ) -> None:
     """What is missing, kept as it finishes."""
     units = {each.identity: each for each in missing}
-    factories = told.elsewhere(folder.path) if executor.elsewhere else ()
+    factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
     jobs = split(_jobs(plan.config, folder.path, start, missing, factories), executor.width)
     with contextlib.closing(executor.run(jobs, told)) as finished:
         for outcome in (outcome for _, outcomes in finished for outcome in outcomes):

@@ -7,7 +7,7 @@ import shutil
 import pytest
 import tiny_scene
 import yaml
-from command_line import bench, error_of
+from command_line import bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from posed_config import configure
