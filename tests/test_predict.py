@@ -17,7 +17,7 @@ from command_line import bench, error_of
 from PIL import Image
 from posed_config import configure, dataset_of
 
-from semstab.backbones import Prediction, create
+from semstab.backbones import Backbone, Prediction, create
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
@@ -61,7 +61,7 @@ def manifest(folder: Path) -> dict:
     return json.loads((folder / "predictions.json").read_text())
 
 
-class Shifting:
+class Shifting(Backbone):
     """A backbone with known output: the label is the column modulo 3; scores say so; it counts what it sees."""
 
     label_space = LabelSpace("thirds", ("a", "b", "c"))

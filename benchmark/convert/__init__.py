@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -88,7 +89,8 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     _require_places(scene, backbones)
     work = _Work(scene, indices, backbones, folder, progress)
     up = _up_axis(scene)
-    said = {"pose_convention": "camera_to_world", "camera_axes": "opencv"} | ({"up_axis": up} if up else {})
+    said: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
+    said |= ({"up_axis": up} if up else {}) | _georeference(scene)
     with contextlib.closing(folder):
         folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
         try:
@@ -189,6 +191,12 @@ def _require_places(scene: Scene, backbones: Sequence[str]) -> None:
 def _name(index: int) -> str:
     """The name of a frame's files: frames keep their order, and their number where all are converted."""
     return f"{index:06d}"
+
+
+def _georeference(scene: Scene) -> dict[str, Any]:
+    """The settings that say where the scene lies on Earth, where that is known."""
+    known = scene.georeference
+    return {} if known is None else {"crs": known.crs, "offset": list(known.offset)}
 
 
 def _up_axis(scene: Scene) -> str | None:

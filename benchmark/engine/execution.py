@@ -248,6 +248,7 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
         agreement=agreement,
         comparisons=comparisons,
         up=_up_axes(plan.units, contents),
+        georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(_regions(plan, contents)),
     )
 

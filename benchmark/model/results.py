@@ -148,8 +148,9 @@ class UnitSummary:
     """One entry of 'runs' in summary.json.
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose; statistics is
-    what `semstab.statistics.describe` says of the map, None where nothing was asked for.
+    fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
+    the fused ones of which no pixel was valid; statistics is what `semstab.statistics.describe` says of the map, None
+    where nothing was asked for.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -161,6 +162,7 @@ class UnitSummary:
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     left_out: int = 0
     frames_left_out: int = 0
+    frames_empty: int = 0
     statistics: MapStatistics | None = None
 
 
