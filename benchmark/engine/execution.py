@@ -17,7 +17,7 @@ from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.config import BACKENDS, BASE, Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.evaluation import comparison
-from semstab.engine.folder import Folder
+from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
@@ -87,6 +87,7 @@ def _execute(
     started, told = time.perf_counter(), Observers(observers)
     config = resolve(config)
     plan = make_plan(config)
+    require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
         found = _compute(plan, folder, executor, told)
@@ -162,7 +163,7 @@ def _work_off(
 ) -> None:
     """What is missing, kept as it finishes."""
     units = {each.identity: each for each in missing}
-    factories = told.elsewhere(folder.path) if executor.elsewhere else ()
+    factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
     jobs = split(_jobs(plan.config, folder.path, start, missing, factories), executor.width)
     with contextlib.closing(executor.run(jobs, told)) as finished:
         for outcome in (outcome for _, outcomes in finished for outcome in outcomes):
@@ -247,6 +248,7 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
         agreement=agreement,
         comparisons=comparisons,
         up=_up_axes(plan.units, contents),
+        georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(_regions(plan, contents)),
     )
 

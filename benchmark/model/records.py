@@ -10,6 +10,7 @@ from typing import Any
 
 from semstab.config import BACKENDS, BASE
 from semstab.model.comparison import BackboneComparison
+from semstab.model.georeference import Georeference
 from semstab.model.results import Agreement, Unit, UnitSummary
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
@@ -20,6 +21,9 @@ UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "ev
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
 where the dataset has it, color (H, W, 3)."""
+
+RECORDING_PARTS = "recording"
+"""Folder of a recording that several processes write, until it is one file."""
 
 REGIONS = "region_maps"
 """Not a sweep: the label sources that hold regions without classes."""
@@ -177,6 +181,7 @@ class Result:
     records    in the order of the plan
     agreement  of each pair of backends that must agree, on each scene and backbone that both fused
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
+    georeference  by scene, where it lies on Earth, where that is known
     regions    flicker of the label sources that are regions without classes
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
@@ -187,6 +192,7 @@ class Result:
     failures: tuple[Failure, ...] = ()
     agreement: tuple[Agreement, ...] = ()
     up: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    georeference: Mapping[str, Georeference] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
     comparisons: tuple[BackboneComparison, ...] = ()

@@ -267,7 +267,7 @@ def _unfolded(shown: Sequence[Figure], result: Result) -> tuple[list[Figure], li
     first: dict[tuple[str, str], Figure] = {}
     for figure in shown:
         for backbone in result.backbones:
-            if figure.name.endswith(slug("", backbone)):
+            if figure.name.endswith(f"__{slug(backbone)}"):
                 first.setdefault((figure.name.partition("__")[0], backbone), figure)
     return list(first.values()), [figure for figure in shown if figure not in first.values()]
 
