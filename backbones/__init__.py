@@ -12,6 +12,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.config import validated
+from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
 from semstab.runtime.registry import Entry, Registry
 
@@ -75,14 +76,20 @@ class Prediction:
 class Backbone(Protocol):
     """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
 
-    label_space   the classes of its labels and scores, or None where it predicts regions without classes
-    gives_scores  whether `predict` can give scores
-    fit_frames    how many images `fit` wants, 0 for most
+    label_space     the classes of its labels and scores, or None where it predicts regions without classes
+    gives_scores    whether `predict` can give scores
+    fit_frames      how many images `fit` wants, 0 for most
+    sequential      whether what it says of an image depends on the images before: it then gets the selected frames of a
+                    sequence in order, all of them, from the first one after `reset`
+    wants_geometry  whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and pose at
+                    the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour
     """
 
     label_space: LabelSpace | None = None
     gives_scores: bool = False
     fit_frames: int = 0
+    sequential: bool = False
+    wants_geometry: bool = False
 
     def fit(self, images: Sequence[Image]) -> Backbone:
         """The backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
@@ -90,6 +97,10 @@ class Backbone(Protocol):
         Called once a sequence, before the first `predict`, whatever frames are predicted later.
         """
         return self
+
+    def reset(self) -> None:
+        """Forget all images: the next one is the first of a sequence. Called where it is `sequential`."""
+        return
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """One prediction an image, in order, of the image's size. The images have one size.
@@ -104,6 +115,14 @@ class Backbone(Protocol):
         Predictions are kept and reused under it.
         """
         ...
+
+
+def ask(
+    backbone: Backbone, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+) -> list[Prediction]:
+    """What a backbone says about images; it is told their geometry where it wants it."""
+    more = {"geometry": geometry} if backbone.wants_geometry else {}
+    return backbone.predict(images, scores=scores, **more)
 
 
 def image_digest(image: Image) -> str:

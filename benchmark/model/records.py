@@ -23,6 +23,9 @@ the ground truth of the same frames; logs of observations; time series; and the 
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
 where the dataset has it, color (H, W, 3)."""
 
+RECORDING_PARTS = "recording"
+"""Folder of a recording that several processes write, until it is one file."""
+
 REGIONS = "region_maps"
 """Not a sweep: the label sources that hold regions without classes."""
 
@@ -110,6 +113,23 @@ class Record:
     def events_file(self) -> Path | None:
         """File of its log of observations, which is there where it was asked for and its backend keeps one."""
         return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
+
+
+class Tables:
+    """Voxel tables of records, the last few of them at hand: those that belong together are asked for together."""
+
+    def __init__(self, most: int = 1) -> None:
+        self._most = most
+        self._loaded: dict[str, VoxelTable] = {}
+
+    def of(self, record: Record) -> VoxelTable:
+        """The record's table."""
+        slug = record.unit.slug
+        if slug not in self._loaded:
+            while len(self._loaded) >= self._most:
+                self._loaded.pop(next(iter(self._loaded)))
+            self._loaded[slug] = record.table()
+        return self._loaded[slug]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.outputs.export.voxels import Voxels, crs_name
-from semstab.outputs.topdown import level_axes
+from semstab.outputs.plots.topdown import level_axes
 from semstab.runtime.files import atomic_path
 
 Int64 = npt.NDArray[np.int64]

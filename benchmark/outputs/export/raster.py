@@ -14,7 +14,7 @@ from semstab.metrics import CATEGORIES, categories
 from semstab.model.georeference import INSTALL
 from semstab.model.information import normalise
 from semstab.outputs.export.voxels import Column, Voxels
-from semstab.outputs.topdown import covered, level_axes
+from semstab.outputs.plots.topdown import covered, level_axes
 from semstab.runtime.files import atomic_path
 
 Float64 = npt.NDArray[np.float64]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.metrics.matching import rows_of
 from semstab.model.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
@@ -20,7 +22,7 @@ OUTLIERS = 0.002
 """Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
 
 
-def level_axes(up: Sequence[float]) -> tuple[Float64, Float64, Float64]:
+def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
     """Right-handed unit vectors (right, ahead, up): right is the world's x axis, or y where up is x, laid level."""
     up_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     along = np.eye(3)[0 if abs(up_axis[0]) < 0.9 else 1]
@@ -29,7 +31,7 @@ def level_axes(up: Sequence[float]) -> tuple[Float64, Float64, Float64]:
     return right, np.cross(up_axis, right), up_axis
 
 
-def top_down(table: VoxelTable, up: Sequence[float]) -> tuple[Int64, float]:
+def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
     """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
 
     The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
@@ -62,3 +64,33 @@ def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tupl
     corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
     cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
     return cells, np.tile(np.arange(len(plane)), len(corners))
+
+
+@dataclass(frozen=True, eq=False)
+class FromAbove:
+    """The voxels that are seen from above.
+
+    table  these voxels alone
+    shown  (n,) whether a voxel of the map is one of them
+    rows   (H, W) the row of each cell's voxel in `table`, EMPTY where there is none
+    cell   the edge of a cell in metres
+    """
+
+    table: VoxelTable
+    shown: npt.NDArray[np.bool_]
+    rows: Int64
+    cell: float
+
+    @property
+    def nbytes(self) -> int:
+        """Of memory, about."""
+        return self.table.evidence.nbytes + self.rows.nbytes + self.shown.nbytes
+
+    @classmethod
+    def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
+        """See `top_down`."""
+        rows, cell = top_down(table, up)
+        shown = np.zeros(len(table), dtype=np.bool_)
+        shown[rows[rows != EMPTY]] = True
+        renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
+        return cls(rows_of(table, shown), shown, renumbered, cell)
