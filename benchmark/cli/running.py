@@ -120,12 +120,13 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
+    from semstab.model.results import slug
     from semstab.settings import load_study
 
     config = load_study(file, overrides({"check_geometry": False if trust_geometry else None}, settings or []))
     if only is not None:
         config = config.only(only)
-    _execute(config, out or Path("studies") / config.name, _executor(jobs, scheduler), rerun, report, quiet)
+    _execute(config, out or Path("studies") / slug(config.name), _executor(jobs, scheduler), rerun, report, quiet)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
