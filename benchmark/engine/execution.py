@@ -284,13 +284,6 @@ def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Ite
             yield compare(tables.of(a), tables.of(b), (a.unit, b.unit), tolerance=config.tolerance)
 
 
-<<<<<<< HEAD
-def _comparisons(config: Config, records: Sequence[Record], tables: _Tables) -> Iterator[BackboneComparison]:
-=======
-def _must_agree(name: str, check: bool | None) -> bool:
-    return getattr(REGISTRY.load(name), "pointwise", True) if check is None else check
-
-
 def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
     """The base units of each scene beside each other; accuracy where there is ground truth."""
     base = [record for record in records if record.variation.sweep == BASE]
