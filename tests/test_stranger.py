@@ -45,7 +45,7 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
 
 def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
     folder = tiny_scene.write(tmp_path / "scene", frames=12)
-    config = configure(folder, backends=["numba"], voxel_size=0.05)
+    config = configure(folder, backends=["numba"], check="sample", voxel_size=0.05)
     result = semstab.run(config, out=tmp_path / "run", report=False)
     assert [record.unit.backend for record in result.records] == ["numba", "numba"]
     for row in result.agreement:
@@ -66,7 +66,7 @@ def test_the_sample_finds_a_backend_that_is_wrong(tmp_path, monkeypatch) -> None
 
     monkeypatch.setattr(NumbaHash, "table", wrong)
     folder = tiny_scene.write(tmp_path / "scene", backbones=("a",), frames=40)
-    result = semstab.run(configure(folder, backends=["numba"], voxel_size=0.05))
+    result = semstab.run(configure(folder, backends=["numba"], check="sample", voxel_size=0.05))
     assert not result.agrees
     assert "DISAGREE" in printed(result)
 
