@@ -19,7 +19,7 @@ from semstab.backends import Changes
 from semstab.backends.numba_parts.history import History
 from semstab.backends.numba_parts.loops import SLOT, look_up, record_types, rehash, unchain, update
 from semstab.backends.shared.aggregator import Aggregator, Observed
-from semstab.backends.shared.association import check_frame, check_settings
+from semstab.backends.shared.association import check_depth, check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import index_of_keys
 from semstab.backends.shared.total import Change, MapTotal
@@ -92,6 +92,7 @@ class NumbaHash:
         nb.set_num_threads(self.threads or threads)
         try:
             started = time.perf_counter()
+            check_depth(frame)
             if frame.scores is not None:
                 check_frame(frame, self.num_classes)
             seen = self._pixels.observe(frame)

@@ -11,6 +11,7 @@ from semstab.backends.shared.association import (
     Mask,
     Observations,
     back_project,
+    check_depth,
     check_frame,
     check_settings,
     observe,
@@ -51,6 +52,7 @@ class NumpyReference:
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""
         started = time.perf_counter()
+        check_depth(frame)
         check_frame(frame, self.num_classes)
         seen = observe(frame, self.voxel_size, self.num_classes, self._pixels(frame))
         rows = self._rows(seen)

@@ -17,6 +17,12 @@ from semstab.model.frames import Frame
 INDEX_LIMIT = 2**31
 """Voxel indices are int32."""
 
+LOOKED_AT = 2**12
+"""Pixels of a depth map, about, that are looked at for its unit; of one as large some must be finite."""
+
+FAR, DISTINCT = 100.0, 8
+"""Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
@@ -58,6 +64,27 @@ def check_frame(frame: Frame, num_classes: int) -> None:
             raise DataError(
                 f"{frame.where('labels')}: label id {highest} is outside 0 to {num_classes - 1}; map it or ignore it"
             )
+
+
+def check_depth(frame: Frame) -> None:
+    """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
+    depth = frame.depth
+    step = max(1, int(np.sqrt(depth.size / LOOKED_AT)))
+    some = depth[::step, ::step]
+    if depth.size >= LOOKED_AT and not np.isfinite(some).any() and not np.isfinite(depth).any():
+        raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
+    if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
+        raise DataError(
+            f"{frame.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
+            " divide it by 1000, or set depth_scale"
+        )
+
+
+def _whole_millimetres(depth: npt.NDArray[np.float32]) -> bool:
+    """Whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
+    if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
+        return False
+    return len(np.unique(depth)) >= DISTINCT
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:

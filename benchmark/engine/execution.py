@@ -91,7 +91,7 @@ def _execute(
     folder = Folder(out, config)
     try:
         found = _compute(plan, folder, executor, told)
-        found.advice = {**found.advice, **advice}
+        found.advice = advice or _advice(plan, found.contents)
         result = _result(plan, folder, found)
         found.watch.seconds["all"] = time.perf_counter() - started
         content = manifest(config, found.inputs(plan), found.watch.seconds, command)
@@ -172,9 +172,11 @@ def _work_off(
         for outcome in (outcome for _, outcomes in finished for outcome in outcomes):
             each = units[outcome.identity]
             if outcome.content is not None:
+                content = dataclasses.replace(outcome.content, advice=found.advice.get(each.unit.scene))
+                outcome = dataclasses.replace(outcome, content=content)  # noqa: PLW2901
                 with found.watch("keep"):
                     folder.save(outcome)
-                found.contents[outcome.identity] = outcome.content
+                found.contents[outcome.identity] = content
             else:
                 found.errors[outcome.identity] = outcome.error or ""
                 folder.save_trace(outcome)
@@ -244,6 +246,7 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
     tables = Tables(most=len({record.unit.backend for record in records}))
     with found.watch("agreement"):
         agreement = (*_samples(plan, contents), *_agreement(plan.config, records, tables))
+        compared = tuple(_compared(plan.config, records, tables))
     with found.watch("comparisons"):
         comparisons = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
     return Result(
@@ -260,8 +263,18 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
         up=_up_axes(plan.units, contents),
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(_regions(plan, contents)),
+        compared=compared,
         advice=found.advice,
     )
+
+
+def _advice(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, VoxelAdvice]:
+    """Where the voxel size lies in each scene, as it was looked at when its base units were computed."""
+    return {
+        each.unit.scene: content.advice
+        for each in plan.units
+        if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.advice is not None
+    }
 
 
 def _samples(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[Agreement]:
@@ -275,13 +288,29 @@ def _samples(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[Agreem
 def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
     """Of each pair of backends that must agree, on each scene and backbone that both fused."""
     checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
+    for group in _by_backend(records).values():
+        there = [record for record in group if record.unit.backend in checked]
+        for a, b in itertools.combinations(there, 2):
+            yield compare(tables.of(a), tables.of(b), (a.unit, b.unit), tolerance=config.tolerance)
+
+
+def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
+    """Of the first backend and each other one, where one of the two need not agree."""
+    free = {backend.name for backend in config.fused_by() if not must_agree(backend)}
+    for first, *others in _by_backend(records).values():
+        for other in others:
+            if free & {first.unit.backend, other.unit.backend}:
+                units = (first.unit, other.unit)
+                yield compare(tables.of(first), tables.of(other), units, tolerance=config.tolerance)
+
+
+def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
+    """The records at the base settings of each scene and backbone, those of the first backend first."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
-        if record.variation.sweep in (BASE, BACKENDS) and record.unit.backend in checked:
+        if record.variation.sweep in (BASE, BACKENDS):
             groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
-    for group in groups.values():
-        for a, b in itertools.combinations(group, 2):
-            yield compare(tables.of(a), tables.of(b), (a.unit, b.unit), tolerance=config.tolerance)
+    return groups
 
 
 def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import shared_rows
-from semstab.model.measures import measures
+from semstab.model.measures import dominant, measures
 from semstab.model.results import Agreement, Deviation, Unit
 from semstab.model.voxels import VoxelTable
 
@@ -69,7 +69,13 @@ class _Rows:
 def _differences(a: _Rows, b: _Rows) -> dict[str, tuple[float, float]]:
     """The largest difference of each quantity and the mean over the classes summed over the voxels."""
     found = {measure.key: _difference(measure.of(a), measure.of(b)) for measure in measures()}
-    return {"op": _difference(a.op, b.op), **found, "evidence": _difference(a.evidence, b.evidence)}
+    other = dominant(a) != dominant(b)
+    return {
+        "op": _difference(a.op, b.op),
+        **found,
+        "evidence": _difference(a.evidence, b.evidence),
+        "label": (float(other.max(initial=False)), float(other.sum())),
+    }
 
 
 def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> tuple[float, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +16,12 @@ from semstab.model.voxels import VoxelTable
 
 STRATA = (1, 2, 5)
 """Upper edges of the paper's strata: OP=1, OP=2, 3<=OP<=5, OP>5."""
+
+STEPS = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
+"""Upper edges of OP by which the last stratum is told apart."""
+
+CROWDED, PARTS = 0.5, 3
+"""A last stratum that holds more than this share of the voxels is split into so many about equal parts."""
 
 
 def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
@@ -42,6 +50,11 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
         strata=tuple(means(name, (table.op >= low) & (table.op <= high)) for name, low, high in strata(edges)),
         recurrent=means(f"OP>={RECURRENT}", table.op >= RECURRENT),
         classes=tuple(means(name, label == k) for k, name in enumerate(names)),
+        well_seen=tuple(
+            means(name, (table.op >= low) & (table.op <= high))
+            for name, low, high in strata([edges[-1], *(step for step in STEPS if step > edges[-1])])[1:]
+            if np.any((table.op >= low) & (table.op <= high))
+        ),
     )
 
 
@@ -54,6 +67,40 @@ def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
     lows = [1, *(edge + 1 for edge in edges)]
     rows = [(f"OP={low}" if low == high else f"{low}<=OP<={high}", low, high) for low, high in zip(lows, edges)]  # noqa: B905
     return [*rows, (f"OP>{edges[-1]}", lows[-1], np.iinfo(np.int32).max)]
+
+
+def split_last(tables: Sequence[TableSummary]) -> list[Means]:
+    """The last stratum of several tables together in about equal parts, where most of their voxels are in it.
+
+    Beside the strata, whose edges are the paper's: `well_seen` names the finer ones.
+    """
+    voxels = sum(table.voxels for table in tables)
+    steps: dict[str, list[Means]] = {}
+    for row in (row for table in tables for row in table.well_seen):
+        steps.setdefault(row.name, []).append(row)
+    ordered = [pool(steps[name], voxels) for name in sorted(steps, key=_lowest)]
+    seen = sum(row.voxels for row in ordered)
+    if seen <= CROWDED * voxels or len(ordered) < 2:
+        return []
+    parts: list[list[Means]] = [[]]
+    for row in ordered:
+        if sum(own.voxels for own in parts[-1]) + row.voxels / 2 > seen / PARTS and parts[-1] and len(parts) < PARTS:
+            parts.append([])
+        parts[-1].append(row)
+    if len(parts) < 2:
+        return []
+    return [dataclasses.replace(pool(part, voxels), name=_range(part[0].name, part[-1].name)) for part in parts]
+
+
+def _lowest(name: str) -> int:
+    """The lowest OP of a stratum, by its name."""
+    return int(re.findall(r"\d+", name)[0])
+
+
+def _range(first: str, last: str) -> str:
+    """The name of a stratum from the names of its first and last step."""
+    low, highest = _lowest(first), re.findall(r"\d+", last)[-1]
+    return f"{low}<=OP<={highest}" if "<=" in last else f"OP>={low}"
 
 
 def pool(groups: Sequence[Means], voxels: int) -> Means:

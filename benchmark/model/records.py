@@ -155,6 +155,7 @@ class UnitContent:
     up       the scene's up axis, where it is known or could be estimated
     files    digests of the unit's other files, by their path in the folder
     regions  of a source of regions, instead of a summary
+    advice   where its voxel size lies, where that was looked at
     checked  how far it agrees with the reference on a sample of its voxels, where it was checked so
     """
 
@@ -165,6 +166,7 @@ class UnitContent:
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None
     checked: Agreement | None = None
+    advice: VoxelAdvice | None = None
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,7 @@ class Result:
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
     georeference  by scene, where it lies on Earth, where that is known
     regions    flicker of the label sources that are regions without classes
+    compared   the same of each other backend and the base one, which need not agree
     advice     where the voxel size lies, scene by scene, for data of files
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
@@ -200,6 +203,7 @@ class Result:
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
     comparisons: tuple[BackboneComparison, ...] = ()
+    compared: tuple[Agreement, ...] = ()
     advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
 
     def select(

@@ -125,7 +125,8 @@ class Means:
 class TableSummary:
     """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
 
-    `summary[VSS]` is the mean of a measure over all voxels where it is defined.
+    `summary[VSS]` is the mean of a measure over all voxels where it is defined. `well_seen` is the last stratum in
+    finer steps of OP.
     """
 
     K: int
@@ -138,6 +139,7 @@ class TableSummary:
     strata: tuple[Means, ...]
     recurrent: Means
     classes: tuple[Means, ...]
+    well_seen: tuple[Means, ...] = ()
 
     def __getitem__(self, measure: Measure) -> float:
         return self.means[measure]
@@ -150,7 +152,8 @@ class UnitSummary:
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
     fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
     the fused ones of which no pixel was valid; statistics is what `semstab.statistics.describe` says of the map, None
-    where nothing was asked for; sizes tells whether half or twice the voxel size would say something else.
+    where nothing was asked for; sizes tells whether half or twice the voxel size would say something else;
+    worst_frames are those that moved the map most, the worst first; reduced is there for soft scores.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -165,6 +168,30 @@ class UnitSummary:
     frames_empty: int = 0
     statistics: MapStatistics | None = None
     sizes: tuple[SizeAlpha, ...] = ()
+    worst_frames: tuple[FrameDrift, ...] = ()
+    reduced: ReducedScores | None = None
+
+
+@dataclass(frozen=True)
+class ReducedScores:
+    """What soft scores come to where each pixel is reduced to its likeliest class: what hard labels compare with.
+
+    vss, recurrent_vss  over all voxels, and over those with OP >= 3
+    alpha               Krippendorff's, of the voxels with OP >= 2
+    """
+
+    vss: float
+    recurrent_vss: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class FrameDrift:
+    """A frame that moved the beliefs which it met: mean drift in bits, and of how many voxels."""
+
+    frame: int
+    drift: float
+    voxels: int
 
 
 @dataclass(frozen=True)
@@ -204,7 +231,7 @@ class Deviation:
 class Agreement:
     """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
 
-    differences  of OP, of every measure and of the evidence, by their keys
+    differences  of OP, of every measure, of the evidence and of the label (1 where it is another), by their keys
     one_in       of so many voxels, drawn at random, one was compared
     """
 

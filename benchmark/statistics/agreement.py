@@ -17,7 +17,7 @@ Float64 = npt.NDArray[np.float64]
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
-ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(2, 4))
+ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
 
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""

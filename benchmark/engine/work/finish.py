@@ -19,21 +19,24 @@ from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
-from semstab.engine.series import to_csv
+from semstab.engine.series import FrameRow, to_csv
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import compare, macro_mean, summarise
 from semstab.metrics.matching import rows_of
-from semstab.model.measures import dominant, measures
+from semstab.model.measures import dominant, mean, measures, vss
 from semstab.model.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
-from semstab.model.results import STAGES, Agreement, UnitSummary, slug
+from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
-from semstab.statistics import Analysis
+from semstab.statistics import Analysis, krippendorff_alpha
 from semstab.task import Task, read
+
+WORST = 3
+"""So many frames are named that moved the map most."""
 
 Savers = dict[str, Callable[[Path], None]]
 """What writes each file of a unit, by its path in the folder."""
@@ -57,7 +60,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         summary = _summary(one, table, found)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
-    with watch("check"):
+    with watch("reference"):
         checked = None if one.sample is None else _checked(one, table, one.sample)
     content = UnitContent(task.digest, summary, files=saved, checked=checked)
     if one.request.image_space and stream.image_space is not None:
@@ -110,8 +113,23 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         frames_left_out=task.left_out,
         frames_empty=sum(row.report.points == 0 for row in rows),
         statistics=None if found is None else found.summary,
+        reduced=None if one.hard is None else _reduced(one.hard.table()),
+        worst_frames=tuple(_worst(rows)),
         sizes=() if one.sizes is None else one.sizes.alphas(),
     )
+
+
+def _reduced(table: VoxelTable) -> ReducedScores:
+    values = vss(table)
+    return ReducedScores(mean(values), mean(values[table.op >= RECURRENT]), krippendorff_alpha(table))
+
+
+def _worst(rows: Sequence[FrameRow]) -> list[FrameDrift]:
+    """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
+    found = [FrameDrift(r.frame, r.drift, r.voxels - r.new_voxels) for r in (row.report for row in rows)]
+    usual = np.median([frame.voxels for frame in found]) if found else 0
+    met = [frame for frame in found if frame.voxels >= max(1, usual)]
+    return sorted(met, key=lambda frame: -frame.drift)[:WORST]
 
 
 def _savers(

@@ -132,7 +132,7 @@ class Pass:
             task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
             sample = NumpySample(request.config.voxel_size, len(task.mapping.target)) if request.sampled else None
-            sizes = SizeMaps(task, request.config.voxel_size) if request.image_space and request.judged else None
+            sizes = SizeMaps(task, request.config) if request.image_space and request.judged else None
             return [UnitMap(request, task, _new_map(request.config, task), truth, sample, sizes)]
         return []
 
@@ -171,11 +171,15 @@ class Pass:
         with self._watch(f"fuse {one.task.backends[0]}"):
             report = one.backend.integrate(frame)
         if one.sample is not None:
-            with self._watch("check"):
+            with self._watch("reference"):
                 one.sample.integrate(frame)
         if one.sizes is not None:
             with self._watch("voxel sizes"):
                 one.sizes.add(fetched.item.index, frame)
+        if frame.scores is not None and one.request.image_space:
+            with self._watch("reduced scores"):
+                one.hard = one.hard or _map_without_log(one.request.config, one.task)
+                one.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if one.truth is not None and now.truth is not None:
             one.truth.integrate(now.truth)
         return FrameRow(
@@ -235,8 +239,11 @@ def _new_map(config: Config, task: Task) -> FusionBackend:
 
 def _truth_map(config: Config, task: Task) -> FusionBackend | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
-    without_log = config.model_copy(update={"statistics": False, "events": False})
-    return _new_map(without_log, task) if truth_task(task) else None
+    return _map_without_log(config, task) if truth_task(task) else None
+
+
+def _map_without_log(config: Config, task: Task) -> FusionBackend:
+    return _new_map(config.model_copy(update={"statistics": False, "events": False}), task)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()

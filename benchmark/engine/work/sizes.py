@@ -6,6 +6,7 @@ import math
 
 from semstab.backends import FusionBackend, create
 from semstab.check.views import evenly
+from semstab.config import Config
 from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.results import SizeAlpha
@@ -21,11 +22,12 @@ FRAMES, PIXELS = 16, 2**16
 class SizeMaps:
     """Maps of a task's frames, of some of them and some of their pixels, by voxel size."""
 
-    def __init__(self, task: Task, voxel_size: float) -> None:
+    def __init__(self, task: Task, config: Config) -> None:
         self._frames = frozenset(task.indices[k] for k in evenly(len(task.indices), FRAMES))
-        K = len(task.mapping.target)
+        (backend,), K = config.backends, len(task.mapping.target)
         self._maps: dict[float, FusionBackend] = {
-            voxel_size * factor: create("numba", voxel_size=voxel_size * factor, num_classes=K) for factor in FACTORS
+            size: create(backend.name, voxel_size=size, num_classes=K, **backend.options)
+            for size in (config.voxel_size * factor for factor in FACTORS)
         }
 
     def add(self, index: int, frame: Frame) -> None:

@@ -33,6 +33,7 @@ class UnitMap:
     truth   takes the ground truth of the same frames, for statistics
     sample  the reference, on a sample of its voxels, where it is checked so
     sizes   maps of some frames at other voxel sizes
+    hard    of soft scores, a map of each pixel's likeliest class
     """
 
     request: Request
@@ -41,6 +42,7 @@ class UnitMap:
     truth: FusionBackend | None = None
     sample: NumpySample | None = None
     sizes: SizeMaps | None = None
+    hard: FusionBackend | None = None
     rows: list[FrameRow] = field(default_factory=list)
 
 

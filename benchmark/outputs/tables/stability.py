@@ -52,12 +52,14 @@ def persistence(result: Result) -> list[Table]:
         return []
     columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
     groups = []
-    for name, rows in by_backbone(records).items():
-        together = pooled(rows)
-        groups.append(Group(name, tuple(_means_row(row) for row in together.strata), _means_row(together.recurrent)))
+    for name, own in by_backbone(records).items():
+        together = pooled(own)
+        rows = (*together.strata, *together.well_seen)
+        groups.append(Group(name, tuple(_means_row(row) for row in rows), _means_row(together.recurrent)))
     caption = (
         f"{settings(records)} Pooled: the means run over the voxels of all scenes together. The last row is the"
-        " recurrent voxels. A voxel seen once has no SBD, and where its pixels agree VSS = 1 and no entropy."
+        " recurrent voxels; a last stratum that holds most voxels follows in parts. A voxel seen once has no SBD, and"
+        " where its pixels agree VSS = 1 and no entropy."
     )
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 
