@@ -75,7 +75,7 @@ def trials(
 
 
 def this_map(count: int, seed: int) -> list[Row]:
-    """Floors of 2,000 to 50,000 voxels and a city, errors that reach over half a voxel to twenty, all sorts of alpha."""
+    """Floors of 2,000 to 50,000 voxels and a city, errors reaching half a voxel to twenty, all sorts of alpha."""
     rows: list[Row] = []
     for side in (45, 100, 224):
         for reach in (0.5, 2.0, 5.0, 10.0, 20.0):
