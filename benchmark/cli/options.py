@@ -23,6 +23,10 @@ Scenes = Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; 
 Backbones = Annotated[
     list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
 ]
+Classes = Annotated[
+    str | None,
+    typer.Option(metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them."),
+]
 VoxelSize = Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")]
 Frames = Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")]
 TrustGeometry = Annotated[

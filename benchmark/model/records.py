@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semstab.config import BACKENDS, BASE
+from semstab.config import BACKENDS, BASE, nearest
+from semstab.errors import ConfigError
 from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
 from semstab.model.results import Agreement, Unit, UnitSummary
@@ -208,6 +209,27 @@ class Result:
             and scene in (None, record.unit.scene)
             and backbone in (None, record.unit.backbone)
             and value in (None, record.variation.value)
+        )
+
+    def record(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Record:
+        """The one record at the base settings of that scene, backbone and backend, the base backend where not given.
+
+        Raises ConfigError where there is none, or several, with what there is.
+        """
+        kept = (*self.select(), *self.select(BACKENDS))
+        asked = {"scene": scene, "backbone": backbone, "backend": backend or self.backend}
+        for what, name in asked.items():
+            there = list(dict.fromkeys(getattr(record.unit, what) for record in kept))
+            if name is not None and name not in there:
+                raise ConfigError(f"{self.name}: no {what} '{name}'; {nearest(name, there)}")
+        found = [
+            record for record in kept if all(name in (None, getattr(record.unit, what)) for what, name in asked.items())
+        ]
+        if len(found) == 1:
+            return found[0]
+        units = ", ".join(f"{record.unit.scene} of {record.unit.backbone}" for record in found[:4])
+        raise ConfigError(
+            f"{self.name}: {len(found)} units fit" + (f" ({units}); choose with scene and backbone" if found else "")
         )
 
     @property

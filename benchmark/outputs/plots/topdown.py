@@ -43,11 +43,7 @@ def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
     low, high = np.quantile(plane, [OUTLIERS, 1 - OUTLIERS], axis=0)
     factor = max(1, int(np.ceil((high - low).max() / table.voxel_size / LARGEST)))
     cell = factor * table.voxel_size
-    aligned = np.isclose(np.abs(up_axis).max(), 1.0)
-    reach = 0.0 if aligned or factor > 1 else 0.499 * table.voxel_size
-    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
-    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
-    rows = np.tile(np.arange(len(table)), len(corners))
+    cells, rows = covered(plane, up_axis, table.voxel_size, cell)
     first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
     inside = ((cells >= first) & (cells <= last)).all(axis=1)
     cells, rows = cells[inside] - first, rows[inside]
@@ -55,6 +51,19 @@ def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
     image = np.full(last - first + 1, EMPTY, dtype=np.int64)
     image[tuple(cells[order].T)] = rows[order]
     return image[::-1], cell
+
+
+def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tuple[Int64, Int64]:
+    """The cells (m, 2) of an edge, and the voxel (m,) that covers each, by the voxels' centres (n, 2) in the plane.
+
+    Where up is an axis of the world a cell is a column of voxels; else each voxel covers the cells that a level square
+    of its size touches, where a cell is one voxel.
+    """
+    aligned = np.isclose(np.abs(up).max(), 1.0)
+    reach = 0.0 if aligned or cell > voxel_size else 0.499 * voxel_size
+    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
+    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
+    return cells, np.tile(np.arange(len(plane)), len(corners))
 
 
 @dataclass(frozen=True, eq=False)
