@@ -22,7 +22,7 @@ class MissingDependencyError(SemstabError, ImportError):
     """An optional package that is not installed; the message holds the command that installs it."""
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """What another library's error says, without its line breaks and in bounds; its type where it says nothing."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -9,6 +9,7 @@ import typer
 
 from semstab.cli.options import (
     Backbones,
+    Classes,
     ConfigFile,
     DataFolder,
     DatasetName,
@@ -26,7 +27,9 @@ from semstab.errors import ConfigError, DataError
 
 
 def predict(
-    backbone: Annotated[str, typer.Option("--backbone", "-m", help="Model, as named by `semstab-bench list`.")],
+    backbone: Annotated[
+        str, typer.Option("--backbone", "-m", help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.")
+    ],
     images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
     data: DataFolder = None,
     dataset: DatasetName = None,
@@ -43,6 +46,7 @@ def predict(
     image_size: Annotated[
         str | None, typer.Option(metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")
     ] = None,
+    classes: Classes = None,
     batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
     taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
@@ -60,6 +64,7 @@ def predict(
     from semstab.settings import load_config, resolve
 
     named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
+    named["classes"] = classes
     size = None if image_size is None else _image_size(image_size)
     options = overrides({**named, "image_size": size}, settings or [])
     chosen: dict[str, Any] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
@@ -143,6 +143,25 @@ class Config(Settings):
         True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
     )
 
+    if not TYPE_CHECKING:
+
+        def __init__(self, **settings):
+            """Raises ConfigError in one line, as `build` does."""
+            try:
+                super().__init__(**settings)
+            except ValidationError as error:
+                raise ConfigError(explain(error, type(self))) from error
+
+    @field_validator("dataset", mode="before")
+    @classmethod
+    def _a_name_is_a_dataset(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @field_validator("scenes", "backbones", mode="before")
+    @classmethod
+    def _one_is_a_list(cls, value: Any) -> Any:
+        return [value] if isinstance(value, str) else value
+
     @model_validator(mode="before")
     @classmethod
     def _of_earlier_versions(cls, content: Any) -> Any:
@@ -161,8 +180,8 @@ class Config(Settings):
     @field_validator("backends", mode="before")
     @classmethod
     def _names_are_backends(cls, value: Any) -> Any:
-        if not isinstance(value, list):
-            return value
+        if not isinstance(value, list | tuple):
+            return value if not isinstance(value, str) else [{"name": value}]
         return [{"name": item} if isinstance(item, str) else item for item in value]
 
     @field_validator("backends")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from semstab.model.measures import Measure, MeasureMeans
 from semstab.runtime.json_form import INLINE
@@ -29,6 +30,37 @@ class Estimate:
 
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)
+
+Question = Literal["this map", "the next flight"]
+THIS_MAP: Question = "this map"
+NEXT_FLIGHT: Question = "the next flight"
+
+
+@dataclass(frozen=True)
+class Interval(Estimate):
+    """A value with its interval, and what that answers.
+
+    question    'this map': other places like these, in these very frames; 'the next flight': other frames, too
+    frames      that were sampled, about; 0 where they are not known
+    places      cubes of space that hold something that counts
+    block_size  edge of the blocks in which errors may depend on each other, metres
+    degrees     of freedom of the standard error
+    undecided   why nothing may be claimed, and what to fly; empty where something may
+    p_value     of a difference: that there is none
+    """
+
+    question: Question = THIS_MAP
+    frames: int = 0
+    places: int = 0
+    block_size: float = math.nan
+    degrees: float = math.nan
+    undecided: str = ""
+    p_value: float = math.nan
+
+    @property
+    def decided(self) -> bool:
+        """Whether something may be claimed."""
+        return not self.undecided
 
 
 @dataclass(frozen=True)

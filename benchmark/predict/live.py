@@ -126,6 +126,7 @@ class PredictedScene(Scene):
         self.backbones = tuple(dataset.predictors)
         self.ground_truth = inner.ground_truth
         self.up = inner.up
+        self.georeference = inner.georeference
         self.folder = inner.folder
         self.settings_file = inner.settings_file
         self.skips_incomplete = inner.skips_incomplete

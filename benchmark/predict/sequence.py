@@ -182,7 +182,7 @@ class _Work:
     def close(self) -> None:
         """Say in the manifests what is finished, also after an error or an interruption."""
         for folder in self.folders:
-            folder.save()
+            folder.close()
 
     def report(self, seconds: float, series: RegionSeries | None) -> SequenceReport:
         """What was done."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import math
@@ -21,6 +22,9 @@ import yaml
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.runtime.json_form import to_json
 
+TEMPORARY = ".semstab-"
+"""How names of files begin that are not whole yet."""
+
 MAX_YAML_BYTES = 2**24
 MAX_ALIASED = 10**5
 
@@ -30,7 +34,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` if the block succeeds, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -39,6 +43,35 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+class FolderLock:
+    """A folder that one process owns until `release`, or until it dies. What a killed one left half-written is removed.
+
+    Raises ConfigError where another one has it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.mkdir(parents=True, exist_ok=True)
+        self._handle: int | None = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self.release()
+            raise ConfigError(f"{path}: another process works on it; wait for it, or choose another folder") from error
+        remove_leftovers(path)
+
+    def release(self) -> None:
+        """Let another process have it."""
+        if self._handle is not None:
+            os.close(self._handle)
+        self._handle = None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `atomic_path` left where its process was killed; nobody else may be writing there."""
+    for path in folder.glob(f"{TEMPORARY}*"):
+        path.unlink()
 
 
 def _umask() -> int:

@@ -180,6 +180,8 @@ class FileScene(Scene):
         scale = self.options.depth_scale or source.depth_scale
         read = read_depth_map if source.depth.suffix.lower() == ".bin" else read_depth
         depth = read(source.depth, scale, self._read)
+        if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
+            depth = np.zeros_like(depth)
         for value in self.options.invalid_depth:
             with np.errstate(over="ignore"):
                 depth[depth == np.float32(value) / np.float32(self._scale(source))] = 0

@@ -104,6 +104,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
         frames_left_out=task.left_out,
+        frames_empty=sum(row.report.points == 0 for row in rows),
         statistics=None if found is None else found.summary,
     )
 

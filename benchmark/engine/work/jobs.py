@@ -12,6 +12,7 @@ from semstab.engine.observer import Factory
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import SemstabError, one_line
 from semstab.model.records import UnitContent
+from semstab.runtime.files import TEMPORARY
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def message(error: Exception) -> str:
 
 def shared_marker(folder: Path, start: str) -> Path:
     """The file by which a worker knows that it sees the folder itself, not one of the same name elsewhere."""
-    return folder / f".shared-{start}"
+    return folder / f"{TEMPORARY}{start}"
 
 
 def split(jobs: Sequence[Job], width: int) -> list[Job]:

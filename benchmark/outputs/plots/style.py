@@ -57,8 +57,8 @@ _STYLE: Any = {
 class Figure:
     """A figure of the study: the name of its files, what to write beside it, and what draws it.
 
-    alt    for readers who do not see it
-    dense  whether most of it is an image, so that PNG is the better format on a screen
+    alt   for readers who do not see it
+    unit  whose voxels it shows as a map; empty: it shows none
     """
 
     name: str
@@ -66,7 +66,12 @@ class Figure:
     caption: str
     alt: str
     draw: Callable[[], Canvas]
-    dense: bool = False
+    unit: str = ""
+
+    @property
+    def dense(self) -> bool:
+        """Whether most of it is an image, so that PNG is the better format on a screen."""
+        return bool(self.unit)
 
     def paths(self, folder: Path) -> list[Path]:
         """Its files in a folder: FOLDER/NAME.png and .svg."""
