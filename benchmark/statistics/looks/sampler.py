@@ -91,8 +91,8 @@ class Sampler:
         cell, drawn, pixel = np.empty(H * W, np.int64), np.empty(H * W, np.uint32), np.empty(H * W, np.int64)
         n = draw(
             fixed(frame.depth), fixed(frame.valid), (np.arange(W) - camera.cx) / camera.fx,
-            (np.arange(H) - camera.cy) / camera.fy, fixed(frame.T_wc), self.voxel_size, self._origin, REACH, self._share,
-            cell, drawn, pixel,
+            (np.arange(H) - camera.cy) / camera.fy, fixed(frame.T_wc), self.voxel_size, self._origin, REACH,
+            self._share, cell, drawn, pixel,
         )  # fmt: skip
         entries_of = self._labels if frame.scores is None else self._scores
         key, label, weight, first = entries_of(frame, cell[:n], pixel[:n])
