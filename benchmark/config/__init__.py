@@ -129,6 +129,10 @@ class Config(Settings):
         description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
         " other; keeps every observation, fuses the ground truth too",
     )
+    critical_classes: list[str] = Field(
+        default_factory=list,
+        description="classes that the verdict depends on; all that have enough places where none is named",
+    )
     threads: int | None = Field(
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
     )
