@@ -34,6 +34,11 @@ class ProgressBar(Observer):
         units = plan.distinct()
         if kept:
             self.bar.console.print(f"kept from before: {len(kept)} of {len(units)} units", style="dim")
+        for scene in plan.scenes.values():
+            if scene.depth_from is not None:
+                self.bar.console.print(
+                    f"{scene.name}: depth from {scene.depth_from}", style="dim", soft_wrap=True, markup=False
+                )
         missing = units.keys() - {each.identity for each in kept}
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
         if self.bar.console.is_interactive:
