@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.datasets.views.resampling import Labels, Scores
-from semstab.datasets.views.same_view import fitted
+from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.georeference import Georeference
@@ -152,6 +152,13 @@ class Scene(ABC):
         labels = None if labels is None else fitted(labels, frame.shape, where)
         scores = None if scores is None else fitted(scores, frame.shape, where)
         return dataclasses.replace(frame, labels=labels, scores=scores, color=None)
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame:
+        """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0.
+
+        Raises DataError where image and depth do not show the same view.
+        """
+        return at_image(self.geometry(index), shape, f"{self.name}, {self.image_name(index)}")
 
 
 class Dataset(ABC):

@@ -63,10 +63,10 @@ class VoxelTable:
         _freeze_columns(self, _VOXEL_TYPES, self.ix)
         if self.evidence.ndim != 2 or (self.classes and len(self.classes) != self.K):
             raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
-        before, after = self.index[:-1], self.index[1:]
-        change = after.astype(np.int64) - before
-        first = np.take_along_axis(change, (change != 0).argmax(axis=1)[:, None], axis=1)
-        if (first <= 0).any():
+        ascends = self.iz[1:] > self.iz[:-1]
+        for column in (self.iy, self.ix):  # a column decides where those before it are equal
+            ascends = (column[1:] > column[:-1]) | ((column[1:] == column[:-1]) & ascends)
+        if not ascends.all():
             raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
 
     def __len__(self) -> int:
@@ -130,6 +130,11 @@ class Events:
 
     def __len__(self) -> int:
         return len(self.voxel)
+
+    @property
+    def K(self) -> int:
+        """Number of classes."""
+        return int(self.evidence.shape[1])
 
     @property
     def starts(self) -> Int64:

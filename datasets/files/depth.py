@@ -69,6 +69,8 @@ class StoredDepth:
         """What the file holds, without what marks pixels that have none."""
         scale = self._options.depth_scale or frame.depth_scale
         depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, self._read)
+        if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
+            depth = np.zeros_like(depth)
         for value in self._options.invalid_depth:
             with np.errstate(over="ignore"):
                 depth[depth == np.float32(value) / np.float32(self.scale(frame))] = 0

@@ -38,7 +38,7 @@ from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.lenses import undistorted
 from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
 from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
-from semstab.datasets.views.same_view import fitted
+from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
@@ -180,6 +180,18 @@ class FileScene(Scene):
         labels = None if labels is None else self._fitted(index, labels, depth.shape, where)
         scores = None if scores is None else self._fitted(index, scores, depth.shape, where)
         return self._framed(index, depth, labels, scores, color=False)
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame:
+        """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0."""
+        source = self._frame(index)
+        if source.label_lens is not None:
+            raise DataError(
+                f"{self.folder}: no pinhole has the depth of distorted photographs, which a model wants; set labels_on:"
+                " undistorted"
+            )
+        camera = source.label_camera
+        K = None if camera is None else camera.at(shape, self.options.pixel_centre or 0.0)
+        return at_image(self.geometry(index), shape, str(source.color or source.name), K)
 
     def depth(self, index: int) -> npt.NDArray[np.float32]:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
