@@ -137,9 +137,23 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 
+def backbone_class(name: str) -> Any:
+    """What makes backbones of that name: a registered class, or a user's, as FILE.py:NAME or package.module:NAME.
+
+    It has `Options` and is called with them. Raises ConfigError, DataError, MissingDependencyError.
+    """
+    from semstab.backbones.outside.code import is_code
+
+    if not is_code(name):
+        return REGISTRY.load(name)
+    from semstab.backbones.outside.own import Own
+
+    return Own(name)
+
+
 def options_model(name: str) -> type[BaseModel]:
-    """The pydantic model of a backbone's options. Raises ConfigError, MissingDependencyError."""
-    return cast("type[BaseModel]", REGISTRY.load(name).Options)
+    """The pydantic model of a backbone's options. Raises what `backbone_class` raises."""
+    return cast("type[BaseModel]", backbone_class(name).Options)
 
 
 def create(name: str, **options: Any) -> Backbone:
@@ -148,4 +162,5 @@ def create(name: str, **options: Any) -> Backbone:
     Raises ConfigError for an unknown name or option, DataError for a model that cannot be loaded,
     MissingDependencyError where its packages are not installed.
     """
-    return cast(Backbone, REGISTRY.load(name)(validated(options_model(name), options, f"backbone '{name}': ")))
+    made_by = backbone_class(name)
+    return cast(Backbone, made_by(validated(made_by.Options, options, f"backbone '{name}': ")))

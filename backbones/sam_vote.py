@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from semstab.backbones import Image, Labels, Prediction, create
+from semstab.backbones.outside.border import Checked
 from semstab.backbones.sam_proposals import Proposals, SamOptions, SamProposer
 from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError
@@ -33,7 +34,7 @@ class SamVote(Wrapped):
     Options: type[BaseModel] = SamVoteOptions
 
     def __init__(self, options: SamVoteOptions) -> None:
-        super().__init__(create(options.voter, **options.voter_options))
+        super().__init__(Checked(create(options.voter, **options.voter_options), options.voter))
         self.options = options
         if self.label_space is None:
             raise ConfigError(f"sam-vote: the voter '{options.voter}' has no classes; choose one that has")

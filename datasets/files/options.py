@@ -10,7 +10,7 @@ from pydantic import Field, PositiveInt, model_validator
 from semstab.config import Settings
 from semstab.datasets import GROUND_TRUTH
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e30)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Id = Annotated[int, Field(ge=0, le=65535)]
 
