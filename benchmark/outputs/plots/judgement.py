@@ -79,8 +79,8 @@ def _correlograms(judged: Judged) -> Iterator[Figure]:
             "Alpha between frames of pairs of looks at a place, by how far apart they are in time, angle, range and"
             " baseline, with bands at 95% over blocks of space, for these frames. Dashed: the same of labels that do"
             " not depend on the view; the gap is the model's. Bins with few pairs are left out.",
-            "Four panels, one curve a backbone with its band and a dashed ceiling: agreement against frames apart,"
-            " degrees between the views, ratio of the ranges, and metres between the cameras.",
+            f"Four panels of {scene}, one curve a backbone with its band and a dashed ceiling: agreement against frames"
+            " apart, degrees between the views, ratio of the ranges, and metres between the cameras.",
             partial(draw_correlogram, backbones),
         )
 

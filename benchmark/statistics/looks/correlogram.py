@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student
 
 from semstab.metrics.matching import shared_observations
 from semstab.model.statistics import UNDEFINED, Correlogram, Estimate, LagBin
@@ -137,6 +136,8 @@ class _Bins:
 
 def band(sums: Float64, statistic: Statistic, level: float = LEVEL) -> Estimate:
     """A statistic of block sums (B, C) with its interval by the delta method, t(B - 1), on the scale log(1 - value)."""
+    from scipy.stats import t as student
+
     total, B = sums.sum(axis=0), len(sums)
     value = float(statistic(total))
     steps = np.diag(1e-5 * np.maximum(np.abs(total), 1e-12))
