@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -70,6 +71,8 @@ def predict(
     chosen: dict[str, Any] = {}
     select_dataset(chosen, dataset, data, None)
     of_dataset = options.pop("dataset", {})
+    if not isinstance(of_dataset, dict):
+        raise ConfigError("--set dataset: write dataset.KEY=VALUE, or --dataset NAME")
     if chosen:
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
     said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
@@ -140,7 +143,7 @@ def convert(
     from semstab.convert.display import frame_bar, print_converted
 
     chosen = selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames)
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, markup=False)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         for converted in convert(chosen, out, depth_error=depth_error, progress=bar):
             print_converted(converted, console)
@@ -149,6 +152,6 @@ def convert(
 def _image_size(text: str) -> int | list[int]:
     """'512' as a number, '512x896' as height and width."""
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(side.isdigit() for side in sides):
+    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in sides):
         raise ConfigError(f"--image-size {text}: write the shorter side, for example 512, or HEIGHTxWIDTH")
     return int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]

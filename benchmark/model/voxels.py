@@ -132,6 +132,11 @@ class Events:
         return len(self.voxel)
 
     @property
+    def K(self) -> int:
+        """Number of classes."""
+        return int(self.evidence.shape[1])
+
+    @property
     def starts(self) -> Int64:
         """(n,) first row of each voxel."""
         return np.searchsorted(self.voxel, np.arange(len(self.ix))).astype(np.int64)

@@ -10,7 +10,7 @@ from pathlib import Path
 from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.errors import SemstabError, one_line
+from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.model.records import UnitContent
 from semstab.runtime.files import TEMPORARY
 
@@ -97,6 +97,8 @@ def failed(requests: Iterable[Request], error: str | Exception) -> list[Outcome]
 
 def message(error: Exception) -> str:
     """One line; an error that is not semstab's own says its type."""
+    if isinstance(error, MemoryError):
+        return OUT_OF_MEMORY
     return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
 
 
