@@ -40,6 +40,8 @@ def _heading(checked: SceneCheck) -> str:
     )
     if depth.valid:
         text += f", {depth.p5:.3g} to {depth.p95:.3g} m (5% to 95%)"
+    if checked.depth_from is not None:
+        text += f"; from {escape(checked.depth_from)}"
     if checked.motion is None:
         return text
     (least, most), (from_, to) = checked.motion.shift, checked.motion.turn

@@ -77,6 +77,7 @@ class SceneCheck:
     """All that is known about a scene from its sample; `verdict` alone is about geometry.
 
     `remarks` are what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
+    `depth_from` says where depth comes from, where that is not a file a frame.
     Where the geometry is unsound nothing is said about overlap, noise and voxels.
     """
 
@@ -95,6 +96,7 @@ class SceneCheck:
     persistence: tuple[Persistence, ...] = ()
     suggestion: Suggestion | None = None
     remarks: tuple[str, ...] = ()
+    depth_from: str | None = None
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -138,6 +140,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         depth=look.depth(),
         motion=_motion(sample),
         verdict=verdict,
+        depth_from=scene.depth_from,
         labels=tuple(_labels(scene, name, indices, config, look) for name in backbones),
         remarks=tuple(remarks(scene, [look.views[at] for at in sorted(look.views)], how, look.tally.backbone)),
     )
