@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
     from semstab.outputs.export import export
+    from semstab.outputs.loaded import load
     from semstab.outputs.relabel import relabel
     from semstab.settings import load_config, load_study
 
@@ -36,6 +37,7 @@ __all__ = [
     "datasets",
     "engine",
     "export",
+    "load",
     "load_config",
     "load_result",
     "load_study",
@@ -58,6 +60,7 @@ _HOMES = {
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
     "export": "outputs.export",
+    "load": "outputs.loaded",
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",
