@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from typing import Annotated, Any
 
 import typer
@@ -9,11 +11,12 @@ from typer.core import TyperGroup
 
 from semstab import __version__
 from semstab.cli.data import check, convert, predict
-from semstab.cli.exporting import export
+from semstab.cli.exporting import export, relabel
+from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
 from semstab.cli.running import run, study, view
-from semstab.errors import SemstabError
+from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
 
 INTERRUPTED = 130
@@ -41,7 +44,8 @@ class Group(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """The one place that catches: bad input is one line and exit code 2."""
         try:
-            return super().invoke(ctx)
+            with interruptible():
+                return super().invoke(ctx)
         except SemstabError as error:
             say(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
@@ -50,6 +54,13 @@ class Group(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
+            raise typer.Exit(2) from error
+        except ImportError as error:
+            what = f"{error.name or 'a package'} cannot be loaded ({one_line(error)})"
+            say(f"error: {what}; install semstab again, or give the process more memory (ulimit -v)")
+            raise typer.Exit(2) from error
+        except MemoryError as error:
+            say(f"error: {OUT_OF_MEMORY}")
             raise typer.Exit(2) from error
 
 
@@ -82,6 +93,7 @@ def root(
 for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
     app.command(name)(command)
 app.command("export")(export)
+app.command("relabel")(relabel)
 app.command("view")(view)
 app.command("list")(list_)
 
@@ -89,4 +101,7 @@ app.command("list")(list_)
 def main() -> None:
     """Entry point of the console script."""
     settle()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names may hold what the terminal's encoding does not
     app()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -86,7 +87,10 @@ def predict(
     of_model = overrides({**named, "image_size": size}, with_options(settings, options))
     chosen: dict[str, Any] = {}
     select_dataset(chosen, dataset, data, None)
-    of_dataset = of_model.pop("dataset", {}).get("options", {})
+    of_dataset = of_model.pop("dataset", {})
+    of_dataset = of_dataset.get("options") if isinstance(of_dataset, dict) else None
+    if not isinstance(of_dataset, dict | None):
+        raise ConfigError("--set dataset: write dataset.options.KEY=VALUE, or --dataset NAME")
     if chosen:
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
     elif of_dataset:
@@ -163,7 +167,7 @@ def convert(
     chosen = selection(
         config, {"scenes": scene, "backbones": backbone}, with_options(settings, options), dataset, data, frames
     )
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, markup=False)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         for converted in convert(chosen, out, depth_error=depth_error, progress=bar):
             print_converted(converted, console)
@@ -172,6 +176,6 @@ def convert(
 def _image_size(text: str) -> int | list[int]:
     """'512' as a number, '512x896' as height and width."""
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(side.isdigit() for side in sides):
+    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in sides):
         raise ConfigError(f"--image-size {text}: write the shorter side, for example 512, or HEIGHTxWIDTH")
     return int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]

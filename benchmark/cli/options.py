@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semstab.cli import completion
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, told
 
 if TYPE_CHECKING:
     from semstab.config import Config
@@ -143,6 +143,8 @@ def select_dataset(overrides: dict[str, Any], name: str | None, data: Path | Non
     if name is None and not options:
         return
     group = overrides.setdefault("dataset", {})
+    if not isinstance(group, dict) or not isinstance(group.get("options", {}), dict):
+        raise ConfigError("--set dataset: is given by other options too; write dataset.options.KEY=VALUE")
     if name is not None:
         group["name"] = name
     group["options"] = group.get("options", {}) | options
@@ -160,4 +162,4 @@ def slice_of(text: str) -> dict[str, int]:
 
 def say(text: str) -> None:
     """A line beside the results: on standard error."""
-    typer.echo(text, err=True)
+    typer.echo(told(text), err=True)

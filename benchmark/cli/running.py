@@ -180,7 +180,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     from semstab.outputs.recording.target import viewer_command
 
     recording = run / "recording.rrd" if run.is_dir() else run
-    if not recording.exists():
+    if not recording.is_file():
         raise ConfigError(_why_no_recording(run))
     raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
 

@@ -119,8 +119,8 @@ class Config(Settings):
     shared_taxonomy: str | None = Field(None, description="label space in which backbones are compared; null: none")
     voxel_size: float = Field(
         0.2,
-        gt=0,
-        allow_inf_nan=False,
+        ge=1e-9,
+        le=1e9,
         description="edge of a voxel, metres; where it is not given, what `check` suggests for data of files",
     )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
@@ -139,11 +139,19 @@ class Config(Settings):
         description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
         " other; keeps every observation, fuses the ground truth too",
     )
+    critical_classes: list[str] = Field(
+        default_factory=list,
+        description="classes that the verdict depends on; all that have enough places where none is named",
+    )
     threads: int | None = Field(
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
     )
     memory_gb: float | None = Field(
-        None, gt=0, exclude=True, description="memory that maps may take, GB; what is free where not given; not kept"
+        None,
+        gt=0,
+        le=1e9,
+        exclude=True,
+        description="memory that maps may take, GB; what is free where not given; not kept",
     )
     check_geometry: bool = Field(
         True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"

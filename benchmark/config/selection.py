@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -19,11 +20,11 @@ Indices = list[int]
 def slice_of(text: str) -> dict[str, int]:
     """'START:STOP:STRIDE' as settings; each part may be empty. Raises ConfigError for anything else."""
     parts = text.split(":")
-    if len(parts) > 3 or not all(part.strip().isdigit() for part in parts if part):
+    if len(parts) > 3 or not all(re.fullmatch(r"\s*[0-9]{0,18}\s*", part) for part in parts):
         raise ConfigError(f"write START:STOP:STRIDE, for example 0:80:4 or ::4, not {text}")
     if len(parts) == 1:
         raise ConfigError(f"write {text}:{int(text or 0) + 1} for one frame, :{text} for the first {text}")
-    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part}
+    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part.strip()}
 
 
 def in_full(selection: Any) -> Any:

@@ -54,7 +54,7 @@ def run(
     finally:
         bar.close()
     for report in reports:
-        print_report(report, Console(quiet=quiet))
+        print_report(report, Console(quiet=quiet, markup=False))
     if dataset is not None and backbone.label_space is not None:
         hint = _next_command(config, dataset, scenes, selection, out, several=len(jobs) > 1)
         Console(quiet=quiet).print(hint, soft_wrap=True, highlight=False, markup=False)

@@ -91,6 +91,11 @@ def write_json(path: str | Path, value: Any) -> None:
     write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
 
 
+def csv_text(text: str) -> str:
+    """A name for a cell of a CSV file, in which a spreadsheet sees no formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
 def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
     """Write a grey or BGR image atomically."""
     import cv2
@@ -133,6 +138,8 @@ def read_limited(path: str | Path, limit: int) -> bytes:
 
 def open_file(path: str | Path) -> BufferedReader:
     """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "no file can be called so")
     file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  an opener; the caller closes it
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()

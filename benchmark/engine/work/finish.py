@@ -32,7 +32,7 @@ from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, Redu
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
-from semstab.statistics import Analysis, krippendorff_alpha
+from semstab.statistics import Analysis, Sample, krippendorff_alpha
 from semstab.task import Task, read
 
 WORST = 3
@@ -55,13 +55,13 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("statistics"):
         truth = None if one.truth is None else _table(one.truth, task)
         events = one.backend.events() if config.statistics else None
-        found = analyse_map(task, config, table, events, truth) if one.request.judged else None
+        found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
     with watch("measure"):
         summary = _summary(one, table, found)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
     with watch("reference"):
-        checked = None if one.sample is None else _checked(one, table, one.sample)
+        checked = None if one.reference is None else _checked(one, table, one.reference)
     content = UnitContent(task.digest, summary, files=saved, checked=checked)
     if one.request.image_space and stream.image_space is not None:
         image_space = stream.image_space.result(summary.flicker_percent)
@@ -74,6 +74,14 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
 
 def _table(backend: FusionBackend, task: Task) -> VoxelTable:
     return dataclasses.replace(backend.table(), classes=task.mapping.target.classes)
+
+
+def sample_of(one: UnitMap) -> Sample | None:
+    """What was sampled of a unit's frames; its limit is the ground truth's where that was fused as well."""
+    if one.sampler is None:
+        return None
+    sample = one.sampler.sample()
+    return sample if one.truth_sampler is None else sample.against(one.truth_sampler.sample())
 
 
 def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:

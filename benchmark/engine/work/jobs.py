@@ -10,7 +10,7 @@ from pathlib import Path
 from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.errors import SemstabError, one_line
+from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.model.records import UnitContent
 from semstab.runtime.files import TEMPORARY
 
@@ -53,6 +53,7 @@ class Job:
     threads       that decode frames ahead
     memory_bytes  that maps may take before some are put off to another pass over the frames; None: half of what is free
     observers     made where the job is done, and told of what is fused there
+    width         how many jobs share the machine's memory
     """
 
     scene: str
@@ -63,6 +64,7 @@ class Job:
     threads: int | None = None
     memory_bytes: float | None = None
     observers: tuple[Factory, ...] = ()
+    width: int = 1
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,8 @@ def failed(requests: Iterable[Request], error: str | Exception) -> list[Outcome]
 
 def message(error: Exception) -> str:
     """One line; an error that is not semstab's own says its type."""
+    if isinstance(error, MemoryError):
+        return OUT_OF_MEMORY
     return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
 
 

@@ -18,14 +18,17 @@ from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow
 from semstab.engine.work.finish import finish
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
-from semstab.engine.work.memory import available_bytes, require_memory
+from semstab.engine.work.memory import require_memory
 from semstab.engine.work.regions import measure_regions
+from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, Prepared, Stream, UnitMap, streams_of
-from semstab.errors import DataError
+from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
+from semstab.runtime.memory import available_bytes, resident_bytes
 from semstab.runtime.prefetch import Fetched, prefetch
 from semstab.runtime.stopwatch import Stopwatch
+from semstab.statistics import Sampler
 from semstab.task import Task, tasks_of
 
 logger = logging.getLogger("semstab")
@@ -100,6 +103,7 @@ class Pass:
         self._watch = Stopwatch()
         self._streams = streams_of([one for request in requests for one in self._created(request)])
         self._memory_before = resident_bytes()
+        self._room = Room(requests[0].config.memory_gb, job.width)
         self._bound = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
 
     def run(self) -> list[Outcome]:
@@ -119,6 +123,9 @@ class Pass:
                     if stream.maps and index in stream.indices:
                         self._feed(stream, fetched)
                 self._make_room()
+                self._require_room()
+                if not any(stream.maps for stream in self._streams):
+                    break  # all of them failed
         for stream in self._streams:
             self._finish(stream)
         if self._outcomes:
@@ -131,9 +138,13 @@ class Pass:
             (task,) = tasks_of(self._scene, request.config)
             task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
-            sample = NumpySample(request.config.voxel_size, len(task.mapping.target)) if request.sampled else None
-            sizes = SizeMaps(task, request.config) if request.image_space and request.judged else None
-            return [UnitMap(request, task, _new_map(request.config, task), truth, sample, sizes)]
+            sampler, of_truth = (_sampler(request, task) if wanted else None for wanted in (request.judged, truth))
+            made = UnitMap(request, task, _new_map(request.config, task), truth, sampler, of_truth)
+            if request.sampled:
+                made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target))
+            if request.image_space and request.judged:
+                made.sizes = SizeMaps(task, request.config)
+            return [made]
         return []
 
     def _decode(self, index: int) -> Decoded:
@@ -157,6 +168,7 @@ class Pass:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
                     one.rows.append(self._told(one, now.frame, row))
+                    one.observations += row.report.voxels
             if watched:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
         lost = {outcome.identity for outcome in self._outcomes}
@@ -170,9 +182,12 @@ class Pass:
             _warm_up(one, frame)
         with self._watch(f"fuse {one.task.backends[0]}"):
             report = one.backend.integrate(frame)
-        if one.sample is not None:
+        with self._watch("sample"):
+            if one.sampler is not None:
+                one.sampler.add(frame)
+        if one.reference is not None:
             with self._watch("reference"):
-                one.sample.integrate(frame)
+                one.reference.integrate(frame)
         if one.sizes is not None:
             with self._watch("voxel sizes"):
                 one.sizes.add(fetched.item.index, frame)
@@ -182,6 +197,8 @@ class Pass:
                 one.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if one.truth is not None and now.truth is not None:
             one.truth.integrate(now.truth)
+            if one.truth_sampler is not None:
+                one.truth_sampler.add(now.truth)
         return FrameRow(
             report, frame.timestamp, now.flicker, fetched.seconds, fetched.waited, now.seconds,
             left_out=frame.left_out_pixels,
@@ -219,6 +236,17 @@ class Pass:
         for stream in self._streams:
             stream.maps = [one for one in stream.maps if one.request.identity not in off]
 
+    def _require_room(self) -> None:
+        """Fail the largest map where the memory left would not do for its end, before the system ends the process."""
+        maps = [one for stream in self._streams for one in stream.maps if one.rows]
+        largest = self._room.lacking(maps) if maps else None
+        if largest is None:
+            return
+        with self._failing([largest.request]):
+            raise ConfigError(self._room.text(largest))
+        for stream in self._streams:
+            stream.maps = [one for one in stream.maps if one is not largest]
+
     @contextlib.contextmanager
     def _failing(self, requests: Sequence[Request]) -> Iterator[None]:
         """What is raised in the block becomes the outcome of these units, but of those that failed before."""
@@ -246,6 +274,10 @@ def _map_without_log(config: Config, task: Task) -> FusionBackend:
     return _new_map(config.model_copy(update={"statistics": False, "events": False}), task)
 
 
+def _sampler(request: Request, task: Task) -> Sampler:
+    return Sampler(request.config.voxel_size, len(task.mapping.target))
+
+
 _warm: set[tuple[str, str, int, bool]] = set()
 
 
@@ -265,10 +297,3 @@ def _ground_truth(scene: Scene, index: int) -> Frame | None:
         return scene.frame(index, GROUND_TRUTH, color=False)
     except DataError:
         return None
-
-
-def resident_bytes() -> int:
-    """Memory that this process takes."""
-    import psutil
-
-    return int(psutil.Process().memory_info().rss)

@@ -20,6 +20,7 @@ from semstab.engine.work.sizes import SizeMaps
 from semstab.metrics import flicker_percent
 from semstab.model.frames import Frame
 from semstab.runtime.stopwatch import Stopwatch
+from semstab.statistics import Sampler
 from semstab.task import Task, prepare
 
 SHOWN_WIDTH = 1280
@@ -28,22 +29,24 @@ SHOWN_WIDTH = 1280
 
 @dataclass(eq=False)
 class UnitMap:
-    """A unit that is being fused.
+    """A unit that is being fused; `truth` takes the ground truth of the same frames, samplers what statistics need.
 
-    truth   takes the ground truth of the same frames, for statistics
-    sample  the reference, on a sample of its voxels, where it is checked so
-    sizes   maps of some frames at other voxel sizes
-    hard    of soft scores, a map of each pixel's likeliest class
+    reference  follows a sample of its voxels, where it is checked so
+    sizes      maps of some frames at other voxel sizes
+    hard       of soft scores, a map of each pixel's likeliest class
     """
 
     request: Request
     task: Task
     backend: FusionBackend
     truth: FusionBackend | None = None
-    sample: NumpySample | None = None
+    sampler: Sampler | None = None
+    truth_sampler: Sampler | None = None
+    reference: NumpySample | None = None
     sizes: SizeMaps | None = None
     hard: FusionBackend | None = None
     rows: list[FrameRow] = field(default_factory=list)
+    observations: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,5 +2,6 @@
 
 from semstab.statistics.sampling.collect import influence_sums
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
+from semstab.statistics.sampling.intervals import difference, estimate
 
-__all__ = ["InfluenceSums", "aligned", "influence_sums", "merged", "value"]
+__all__ = ["InfluenceSums", "aligned", "difference", "estimate", "influence_sums", "merged", "value"]
