@@ -110,7 +110,7 @@ def test_the_default_run_folder_is_new_each_time(wall, tmp_path) -> None:
         (("--data", "wall", "--backend", "numpy", "--device", "CPU:0"), "none of numpy runs on a device"),
         (("--data", "wall", "--seed", "1"), "unknown setting 'seed'"),
         (("--data", "wall", "--out", "wall"), "is not empty and holds no run"),
-        (("view", "wall"), "there is no recording"),
+        (("view", "wall"), "holds no finished run"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) -> None:

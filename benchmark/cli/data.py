@@ -87,10 +87,10 @@ def predict(
     of_model = overrides({**named, "image_size": size}, with_options(settings, options))
     chosen: dict[str, Any] = {}
     select_dataset(chosen, dataset, data, None)
-    of_dataset = of_model.pop("dataset", {})
-    of_dataset = of_dataset.get("options") if isinstance(of_dataset, dict) else None
-    if not isinstance(of_dataset, dict | None):
-        raise ConfigError("--set dataset: write dataset.options.KEY=VALUE, or --dataset NAME")
+    given = of_model.pop("dataset", {"options": {}})
+    of_dataset = given.get("options") if isinstance(given, dict) and len(given) == 1 else None
+    if not isinstance(of_dataset, dict):
+        raise ConfigError("--set dataset: write --option KEY=VALUE (dataset.options.KEY), or --dataset NAME")
     if chosen:
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
     elif of_dataset:
