@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,7 @@ from semstab.statistics.agreement import alpha_of, ratio_of
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
 Statistic = Callable[[Float64], Float64]
+Scale = Literal["share", "agreement", "plain"]
 
 SCHEMA = 1
 MOST_CELLS, MOST_GROUPS = 256, 64
@@ -186,14 +188,18 @@ class Functional:
     names      of the sums
     of         the number (...,) from these sums (..., C)
     low, high  its range
-    agreement  the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
+    scale      of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'
+    pairs      the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
+
+    The second sum counts what the first is a sum of.
     """
 
     names: tuple[str, ...]
     of: Statistic
     low: float = 0.0
     high: float = 1.0
-    agreement: bool = False
+    scale: Scale = "share"
+    pairs: bool = False
 
     def value(self, sums: InfluenceSums) -> float:
         """The number; NaN where undefined."""
@@ -210,8 +216,8 @@ def class_alpha_of(sums: Float64) -> Float64:
 
 
 FUNCTIONALS: Mapping[str, Functional] = {
-    "psa": Functional(("psa", "voxels"), ratio_of, agreement=True),
-    "alpha": Functional(("agreeing", "observations", "own", "evidence"), alpha_of, low=-1.0, agreement=True),
+    "psa": Functional(("psa", "voxels"), ratio_of, pairs=True),
+    "alpha": Functional(("agreeing", "observations", "own", "evidence"), alpha_of, -1.0, 1.0, "agreement", pairs=True),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
@@ -234,7 +240,9 @@ def functional(key: str, k: int | None = None) -> Functional:
     """
     if k is None:
         return FUNCTIONALS[key]
-    return Functional(BY_CLASS[key], class_alpha_of if key == "alpha" else ratio_of, -1.0 if key == "alpha" else 0.0)
+    if key == "alpha":
+        return Functional(BY_CLASS[key], class_alpha_of, -1.0, 1.0, "agreement")
+    return Functional(BY_CLASS[key], ratio_of)
 
 
 def columns_of(sums: InfluenceSums, key: str, k: int | None = None) -> Float64:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +81,7 @@ class Arrangement:
             return Spread(math.nan, 0.0, 1.0)
         if not influence.any():
             return Spread(0.0, self.count - 1.0, 1.0)
-        with _blas().limit(limits=1, user_api="blas"):
+        with one_thread():
             return self._spread(influence, size)
 
     def _spread(self, influence: Float64, size: Float64) -> Spread:
@@ -129,8 +130,13 @@ def arrangement(at: npt.NDArray[np.integer]) -> Arrangement:
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    """Matrices are so small that a second thread only waits, the longer the busier the machine is."""
     return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Matrices are so small that a second thread only waits, the longer the busier the machine is."""
+    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
+    return limited
 
 
 def carriers(influence: Float64) -> float:
