@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
     from semstab.outputs.export import export
+    from semstab.outputs.relabel import relabel
     from semstab.settings import load_config, load_study
 
 __version__ = "0.2.0"
@@ -39,6 +40,7 @@ __all__ = [
     "load_result",
     "load_study",
     "metrics",
+    "relabel",
     "run",
     "run_study",
     "statistics",
@@ -59,6 +61,7 @@ _HOMES = {
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",
+    "relabel": "outputs.relabel",
     "run": "api",
     "run_study": "api",
 }
