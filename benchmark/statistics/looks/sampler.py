@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.metrics.matching import shared_observations
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.model.voxels import Events, index_columns
@@ -58,6 +59,11 @@ class Sample:
     views: tuple[View, ...]
     soft: bool
     by: str = OWN
+
+    def shared(self) -> tuple[Events, Events]:
+        """The observations that both logs have."""
+        seen, limit = shared_observations(self.seen, self.limit)
+        return seen, limit
 
     def against(self, truth: Sample) -> Sample:
         """The same with the ground truth's labels as the limit, of a sample of the same frames."""

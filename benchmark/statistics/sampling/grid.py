@@ -85,8 +85,8 @@ def influences(
     gradient = _gradient(of, total)
     places, row = np.unique(cell.astype(np.int64), axis=0, return_inverse=True)
     row = row.ravel()
-    everything = _sums(row, np.abs(columns[:, 1]), len(places))
-    some = everything > 0
+    everything = np.abs(_sums(row, columns[:, 1], len(places)))
+    some = everything > TINY * everything.sum()
     if some.sum() < 2 or not np.isfinite(gradient).all():
         return None
     own: Float64 = columns @ gradient

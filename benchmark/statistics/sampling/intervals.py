@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Judged, Question
 from semstab.statistics.blocks import LEVEL
 from semstab.statistics.sampling.grid import TINY, Grid, TwoWay, apart, influences, two_way
 from semstab.statistics.sampling.influence import (
@@ -18,8 +18,8 @@ from semstab.statistics.sampling.influence import (
     Statistic,
     aligned,
     columns_of,
-    defined,
     functional,
+    parts_of,
     value,
 )
 
@@ -29,7 +29,7 @@ LEAST_FRAMES = 40
 """Of fewer frames nothing is said about the next flight: bad ones may all have been missed, and a quality that lasts
 looks constant."""
 
-LEAST_DEGREES = 4.0
+LEAST_DEGREES = 3.0
 """Of fewer places that err independently of each other nothing is said: errors reach as far as the scene."""
 
 AS_FAR = "errors reach as far as the scene: fly more of it"
@@ -46,7 +46,7 @@ def estimate(
     these would give, too; where the frames are not known the interval is for this map, and says so.
     """
     grid, number = grid_of(sums, key, k), functional(key, k)
-    return _judged(value(sums, key, k), grid, question, number.scale, (number.low, number.high), level)
+    return _with_interval(value(sums, key, k), grid, question, number.scale, (number.low, number.high), level)
 
 
 def difference(
@@ -97,15 +97,27 @@ def of_places(
     """
     found = float(statistic(columns.sum(axis=0)))
     grid = influences(cell, np.full(len(cell), -1), columns, statistic, edge, 0)
-    return _judged(found, grid, THIS_MAP, scale, bounds, level)
+    return _with_interval(found, grid, THIS_MAP, scale, bounds, level)
 
 
-def _judged(
+def question_of(sums: InfluenceSums) -> Question:
+    """What verdicts on a map answer: for the next flight, if there are enough frames to tell."""
+    return NEXT_FLIGHT if sums.frames * sums.step >= LEAST_FRAMES else THIS_MAP
+
+
+def judged_of(sums: InfluenceSums) -> Judged:
+    """The numbers that a verdict on a map rests on."""
+    question = question_of(sums)
+    keys = [field.name for field in dataclasses.fields(Judged)]
+    return Judged(**{key: estimate(sums, key, question=question) for key in keys})
+
+
+def _with_interval(
     found: float, grid: Grid | None, question: Question, scale: Scale, bounds: tuple[float, float], level: float
 ) -> Interval:
     if grid is None:
         return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
-    question = question if grid.step else THIS_MAP
+    question = question if grid.step and len(grid.frames) > 1 else THIS_MAP
     spread = two_way(grid, question)
     if math.isnan(found) or not spread.degrees > 0:
         low, high = math.nan, math.nan
@@ -116,15 +128,14 @@ def _judged(
     return _interval(found, max(low, bounds[0]), min(high, bounds[1]), grid, spread, question)
 
 
-def grid_of(sums: InfluenceSums, key: str, k: int | None) -> Grid | None:
+def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
     """The influences on a number; None where it is not defined, or all is in one cube."""
-    if not defined(sums, key, k):
-        return None
     number, columns = functional(key, k), columns_of(sums, key, k)
-    halves = (
-        sums.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs and k is None else None
-    )
-    return influences(sums.cell, sums.frame, columns, number.of, sums.edge, sums.step, halves)
+    if not columns.size:
+        return None
+    rows = parts_of(sums, number)[0]
+    halves = rows.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
+    return influences(rows.cell, rows.frame, columns, number.of, rows.edge, rows.step, halves)
 
 
 # --- Ends -------------------------------------------------------------------------------------------------------------
@@ -156,7 +167,8 @@ def _ends(found: float, spread: TwoWay, unseen: float, scale: Scale, level: floa
 
 def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay, question: Question) -> Interval:
     frames = len(grid.frames) * grid.step
-    reasons = [AS_FAR] if not spread.places.degrees >= LEAST_DEGREES else []
+    far = spread.total > TINY and not spread.places.degrees >= LEAST_DEGREES
+    reasons = [AS_FAR] if far else []
     if question == NEXT_FLIGHT and frames < LEAST_FRAMES:
         reasons.append(TOO_FEW.format(least=LEAST_FRAMES))
     return Interval(

@@ -17,11 +17,14 @@ from threadpoolctl import ThreadpoolController
 
 Float64 = npt.NDArray[np.float64]
 
-REACHES = (0.5, 0.8, 1.3, 2.0, 3.2, 5.0, 8.0)
+REACHES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """How far errors may reach, in cells, besides not at all."""
 
 ALONE = (0.0, 0.5)
 """Shares of a cell's variance that it may have for itself."""
+
+ROUNDING = 1e-13
+"""Influences below are rounding's."""
 
 BLOCK = 4.0
 """The edge of a block, in reaches."""
@@ -79,7 +82,7 @@ class Arrangement:
         """Of the sum over cells of influences (G,), which are centred; size (G,) is how much is in each cell."""
         if self.count < 2:
             return Spread(math.nan, 0.0, 1.0)
-        if not influence.any():
+        if np.abs(influence).max() < ROUNDING:
             return Spread(0.0, self.count - 1.0, 1.0)
         with one_thread():
             return self._spread(influence, size)
