@@ -11,7 +11,6 @@ import cv2
 import looking_down as down
 import numpy as np
 import pytest
-from command_line import error_of
 from dataset_writers import save, shot, write_reconstruction
 from posed_scene import fails
 
@@ -328,8 +327,8 @@ def test_what_a_lens_folds_over_has_no_label(tmp_path) -> None:
 
 def test_a_project_without_reconstruction_says_so(tmp_path) -> None:
     (tmp_path / "field/opensfm").mkdir(parents=True)
-    line = error_of("--data", tmp_path / "field", "--dataset", "odm", cwd=tmp_path)
-    assert "field: no scene here, nor 3 folders deep; one holds opensfm/undistorted/reconstruction.json or" in line
+    match = "field: no scene here, nor 3 folders deep; one holds opensfm/undistorted/reconstruction.json or opensfm/rec"
+    fails(DataError, match, opened, tmp_path / "field")
 
 
 def test_several_reconstructions_are_named_and_one_can_be_chosen(tmp_path) -> None:

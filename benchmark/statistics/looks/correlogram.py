@@ -17,7 +17,7 @@ from semstab.model.statistics import UNDEFINED, Correlogram, Estimate, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
 from semstab.statistics.blocks import LEVEL, Statistic, spatial_blocks
-from semstab.statistics.looks.sampler import Sample
+from semstab.statistics.looks.entries import Sample
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
