@@ -23,28 +23,33 @@ REGISTRY = Registry(
             "semstab.backbones.colour_clusters:ColourClusters",
             "k-means of colour and texture, one codebook a sequence: a baseline without weights",
         ),
+        "transformers": Entry(
+            "semstab.backbones.pretrained.segmenter:Segmenter",
+            "any transformers checkpoint that segments: SegFormer, UPerNet, Mask2Former, OneFormer, EoMT, CLIPSeg, ...",
+            install="pip install 'semstab[segformer]'",
+        ),
         "segformer": Entry(
-            "semstab.backbones.segformer:Segformer",
-            "any transformers checkpoint for semantic segmentation: SegFormer, BEiT, DPT, UPerNet, ...",
+            "semstab.backbones.pretrained.segmenter:Segmenter",
+            "the same by its first name",
             install="pip install 'semstab[segformer]'",
         ),
         "sam-raw": Entry(
-            "semstab.backbones.sam_raw:SamRaw",
+            "semstab.backbones.sam.raw:SamRaw",
             "Segment Anything's proposals as regions without classes",
             install="pip install 'semstab[sam]'",
         ),
         "sam-heuristic": Entry(
-            "semstab.backbones.sam_heuristic:SamHeuristic",
+            "semstab.backbones.sam.heuristic:SamHeuristic",
             "Segment Anything's proposals with classes from rules on colour, size and shape",
             install="pip install 'semstab[sam]'",
         ),
         "sam-vote": Entry(
-            "semstab.backbones.sam_vote:SamVote",
+            "semstab.backbones.sam.vote:SamVote",
             "another backbone's labels, by majority inside Segment Anything's proposals",
             install="pip install 'semstab[sam]'",
         ),
         "segearth-ov": Entry(
-            "semstab.backbones.segearth_ov:SegEarthOV",
+            "semstab.backbones.segearth.segearth_ov:SegEarthOV",
             "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
             install="pip install 'semstab[segearth]'",
         ),
@@ -138,17 +143,18 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
 
 
 def backbone_class(name: str) -> Any:
-    """What makes backbones of that name: a registered class, or a user's, as FILE.py:NAME or package.module:NAME.
+    """What makes backbones of that name: a registered class, a user's (FILE.py:NAME, package.module:NAME), a network's
+    file (net.onnx).
 
     It has `Options` and is called with them. Raises ConfigError, DataError, MissingDependencyError.
     """
     from semstab.backbones.outside.code import is_code
-
-    if not is_code(name):
-        return REGISTRY.load(name)
+    from semstab.backbones.outside.network import NetworkMaker, is_network
     from semstab.backbones.outside.own import Own
 
-    return Own(name)
+    if is_network(name):
+        return NetworkMaker(name)
+    return Own(name) if is_code(name) else REGISTRY.load(name)
 
 
 def options_model(name: str) -> type[BaseModel]:

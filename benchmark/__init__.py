@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
     from semstab.outputs.export import export
-    from semstab.outputs.relabel import relabel
+    from semstab.outputs.loaded import load
+    from semstab.outputs.relabel import Belief, relabel
     from semstab.settings import load_config, load_study
 
 __version__ = "0.2.0"
 
 __all__ = [
+    "Belief",
     "Config",
     "ConfigError",
     "DataError",
@@ -36,6 +38,7 @@ __all__ = [
     "datasets",
     "engine",
     "export",
+    "load",
     "load_config",
     "load_result",
     "load_study",
@@ -47,6 +50,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Belief": "outputs.relabel",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
@@ -58,6 +62,7 @@ _HOMES = {
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
     "export": "outputs.export",
+    "load": "outputs.loaded",
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,6 +59,12 @@ def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events]:
     return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name)
 
 
+def of_map(statistics: dict[str, Any], *without: str) -> dict[str, Any]:
+    """What is said of the map itself, not of the voxels sampled as it was fused."""
+    sampled = {"reach", "correlogram", "verdict", *without}
+    return {key: content for key, content in statistics.items() if key not in sampled}
+
+
 def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
     run, _, summary = ran
     truth = saved(run, "gt")[0]
@@ -66,7 +73,7 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
         table, events = saved(run, name)
         true = None if name == "gt" else truth
         expected = analyse(table, events, true, limit=true, name=name, edges=(1, 3))
-        assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
+        assert of_map(entry["statistics"]) == of_map(json.loads(json.dumps(to_json(expected.summary))))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
         for column, values in expected.maps.items():
             np.testing.assert_array_equal(columns.column(column).to_numpy(), values)
@@ -101,7 +108,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    assert to_json(entry.statistics) == to_json(describe(table, name="a"))
+    assert of_map(to_json(entry.statistics), "judged") == of_map(to_json(describe(table, name="a")), "judged")
+    assert entry.statistics.judged.alpha.frames == 3  # known of sampled voxels
     assert entry.statistics.drift.tests is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept

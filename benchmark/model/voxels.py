@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError
+from semstab.model import parquet, tabular
 from semstab.model.information import entropy_bits, js_divergence, normalise
-from semstab.runtime.files import atomic_path
+from semstab.model.measures import MeasureMeans, dominant, measures
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
 
-SCHEMA = 1
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -87,15 +86,46 @@ class VoxelTable:
         """(n, 3) world coordinates of the voxel centres, metres."""
         return (self.index.astype(np.float64) + 0.5) * self.voxel_size
 
+    def to_arrow(self) -> pa.Table:
+        """Columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
+        return tabular.to_arrow(self._columns())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The same as a data frame. Raises MissingDependencyError without pandas."""
+        return tabular.to_pandas(self._columns())
+
+    def _columns(self) -> dict[str, Any]:
+        names = self.classes or tuple(str(k) for k in range(self.K))
+        x, y, z = self.centers.T
+        return {
+            "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
+            "class": tabular.named(dominant(self), names),
+            **{measure.key: measure.of(self) for measure in measures()},
+            "pixels": self.pixels, "first_frame": self.first_frame, "last_frame": self.last_frame,
+            **{f"evidence_{name}": self.evidence[:, k] for k, name in enumerate(names)},
+        }  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        """The means of all voxels and of the recurrent ones, in a notebook."""
+        values = {measure: measure.of(self) for measure in measures()}
+        rows: list[list[tabular.Cell]] = []
+        for name, where in (("all", self.op > 0), ("OP >= 3", self.op >= 3)):
+            means = MeasureMeans.over(values, self.op, where)
+            numbers = (tabular.number(means[measure], measure.digits[0]) for measure in measures())
+            rows.append([name, int(np.count_nonzero(where)), *numbers])
+        title = f"{len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes"
+        return tabular.as_html(title, ["", "voxels", *(measure.title for measure in measures())], rows)
+
     def save(self, path: str | Path, extra: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
         """Write Parquet, atomically; `extra` columns (n,) go along for other programs and are not read back."""
-        _write_parquet(self, _VOXEL_TYPES, path, extra or {})
+        columns = {name: getattr(self, name) for name in _VOXEL_TYPES}
+        parquet.write(path, columns | dict(extra or {}), type(self).__name__, self.voxel_size, self.classes)
 
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
-        with _reading(path):
-            return cls(**_read_parquet(path, _VOXEL_TYPES))
+        with parquet.reading(path):
+            return cls(**parquet.read(path, _VOXEL_TYPES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,13 +234,15 @@ class Events:
 
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
-        _write_parquet(self, _EVENT_TYPES, path, {n: getattr(self, n)[self.voxel] for n in _INDEX_TYPES})
+        columns = {name: getattr(self, name) for name in _EVENT_TYPES}
+        columns |= {name: getattr(self, name)[self.voxel] for name in _INDEX_TYPES}
+        parquet.write(path, columns, type(self).__name__, self.voxel_size, self.classes)
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
-        with _reading(path):
-            content = _read_parquet(path, _EVENT_TYPES | _INDEX_TYPES)
+        with parquet.reading(path):
+            content = parquet.read(path, _EVENT_TYPES | _INDEX_TYPES)
             first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
             return cls(**content | {name: content[name][first] for name in _INDEX_TYPES})
 
@@ -239,62 +271,3 @@ def _freeze_columns(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
             raise DataError(f"{type(table).__name__}: column '{name}' has {len(column)} rows, expected {len(like)}")
         column.setflags(write=False)
         object.__setattr__(table, name, column)
-
-
-def _write_parquet(
-    table: VoxelTable | Events,
-    types: Types,
-    path: str | Path,
-    extra: Mapping[str, npt.NDArray[Any]],
-) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    columns = {name: getattr(table, name) for name in types} | dict(extra)
-    about = {"schema": SCHEMA, "kind": type(table).__name__, "voxel_size": table.voxel_size, "classes": table.classes}
-    content = pa.table({name: _to_arrow(values) for name, values in columns.items()})
-    content = content.replace_schema_metadata({"semstab": json.dumps(about)})
-    with atomic_path(path) as temporary:
-        pq.write_table(content, temporary, compression="zstd")
-
-
-def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
-    import pyarrow as pa
-
-    if values.ndim == 1:
-        return pa.array(values)
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-
-
-@contextmanager
-def _reading(path: str | Path) -> Iterator[None]:
-    """Whatever is wrong with a file's content is a DataError of one line that names the file."""
-    import pyarrow as pa
-
-    try:
-        yield
-    except (OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
-
-
-def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
-    import pyarrow.parquet as pq
-
-    content = pq.read_table(path)
-    about = json.loads((content.schema.metadata or {})[b"semstab"])
-    if about["schema"] != SCHEMA:
-        raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
-    columns: dict[str, Any] = {name: _to_numpy(content.column(name)) for name in types}
-    return columns | {"voxel_size": float(about["voxel_size"]), "classes": tuple(about["classes"])}
-
-
-def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any]:
-    import pyarrow as pa
-
-    if column.null_count:
-        raise DataError("a column has missing values")
-    if not pa.types.is_fixed_size_list(column.type):
-        values: npt.NDArray[Any] = column.to_numpy()
-    else:
-        values = column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
-    return values

@@ -62,7 +62,7 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
-from semstab.statistics.looks import Sample, reach_of
+from semstab.statistics.looks import Sample, correlogram, reach_of
 from semstab.statistics.sampling import InfluenceSums, Places, influence_sums, judged_of
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
@@ -174,6 +174,7 @@ def analyse(
         agreement=agreement,
         judged=judged,
         reach=reach,
+        correlogram=None if sample is None else correlogram(sample),
         drift=drift,
         uncertainty=uncertainty,
         geometry=None if limit is None else losses(table, limit, seed=seed),

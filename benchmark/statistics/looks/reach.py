@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from semstab.model.statistics import ClassReach, Reach
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.looks.sampler import Sample
+from semstab.statistics.looks.entries import Sample
 from semstab.statistics.sampling import InfluenceSums, estimate, influence_sums, question_of, value
 
 SUPPORT = 100.0
