@@ -105,4 +105,5 @@ def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: 
         )
     stored = np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape)
     with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
-        return np.multiply(stored, unit, dtype=np.float32, casting="same_kind")
+        metres: Depth = np.multiply(stored, unit, dtype=np.float32, casting="same_kind")
+    return metres
