@@ -18,10 +18,11 @@ import numpy.typing as npt
 from semstab.backends import Changes
 from semstab.backends.numba_parts.history import History
 from semstab.backends.numba_parts.loops import SLOT, look_up, record_types, rehash, unchain, update
-from semstab.backends.shared.aggregator import Aggregator, Observed
+from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import index_of_keys
+from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics

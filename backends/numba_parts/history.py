@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.aggregator import Observed
 from semstab.backends.shared.keys import index_of_keys
+from semstab.backends.shared.observed import Observed
 from semstab.model.voxels import Events, index_columns
 
 Int64 = npt.NDArray[np.int64]

@@ -94,6 +94,7 @@ class FileScene(Scene):
         self._depth: DepthSource = (
             StoredDepth(options, self._read) if surface is None else CastDepth(surface, options, self._views)
         )
+        self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
         self.on_photographs = any(frame.label_lens is not None for frame in frames)
 
