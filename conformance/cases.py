@@ -57,7 +57,7 @@ def _read_frame(folder: Path, classes: int, index: str, width: str, height: str,
     H, W = int(height), int(width)
     suffix, dtype = KINDS[kind]
     values = np.fromfile(folder / f"{index}.{suffix}", dtype)
-    given = {suffix: values.reshape((H, W) if suffix == "labels" else (H, W, classes))}
+    given: dict[str, Any] = {suffix: values.reshape((H, W) if suffix == "labels" else (H, W, classes))}
     depth = np.fromfile(folder / f"{index}.depth", "<f4").reshape(H, W)
     T_wc = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
     return Frame(int(index), depth, Intrinsics(fx, fy, cx, cy), T_wc, **given)
