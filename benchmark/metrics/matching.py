@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from functools import reduce
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -49,10 +47,7 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
 
 def rows_of(table: VoxelTable, where: npt.NDArray[np.bool_]) -> VoxelTable:
     """The voxels of a table for which `where` (n,) holds."""
-    columns: dict[str, Any] = {
-        name: value[where] for name, value in vars(table).items() if isinstance(value, np.ndarray)
-    }
-    return dataclasses.replace(table, **columns)
+    return table.rows(where)
 
 
 def require_same_grid(*tables: VoxelTable) -> None:

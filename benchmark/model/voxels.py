@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
+from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.runtime.files import atomic_path
 
@@ -32,7 +34,7 @@ class VoxelTable:
 
     ix, iy, iz         (n,) int32 voxel index, floor(x_w / r)
     op                 (n,) int32 observation persistence: the number of frames that saw the voxel
-    evidence           (n, K) float64 accumulated evidence e(q), the sum over frames of s_bar
+    evidence           (n, K) accumulated evidence e(q), the sum over frames of s_bar; kept sparse
     drift_sum          (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits
     pixels             (n,) int64 pixels that fell into the voxel, all frames
     first_frame        (n,) int32 lowest frame index that saw it
@@ -49,7 +51,7 @@ class VoxelTable:
     iy: Int32
     iz: Int32
     op: Int32
-    evidence: Float64
+    evidence: Evidence
     drift_sum: Float64
     pixels: Int64
     first_frame: Int32
@@ -61,13 +63,14 @@ class VoxelTable:
 
     def __post_init__(self) -> None:
         _freeze_columns(self, _VOXEL_TYPES, self.ix)
-        if self.evidence.ndim != 2 or (self.classes and len(self.classes) != self.K):
+        if self.classes and len(self.classes) != self.K:
             raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
-        before, after = self.index[:-1], self.index[1:]
-        change = after.astype(np.int64) - before
-        first = np.take_along_axis(change, (change != 0).argmax(axis=1)[:, None], axis=1)
-        if (first <= 0).any():
-            raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
+        for some in row_chunks(len(self), 8):
+            x, y, z = (
+                np.diff(column[some.start : some.stop + 1].astype(np.int64)) for column in (self.ix, self.iy, self.iz)
+            )
+            if not ((x > 0) | (x == 0) & ((y > 0) | (y == 0) & (z > 0))).all():
+                raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
 
     def __len__(self) -> int:
         return len(self.ix)
@@ -75,7 +78,7 @@ class VoxelTable:
     @property
     def K(self) -> int:
         """Number of classes."""
-        return int(self.evidence.shape[1])
+        return self.evidence.K
 
     @property
     def index(self) -> Int32:
@@ -87,9 +90,14 @@ class VoxelTable:
         """(n, 3) world coordinates of the voxel centres, metres."""
         return (self.index.astype(np.float64) + 0.5) * self.voxel_size
 
+    def rows(self, rows: Any) -> VoxelTable:
+        """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
+        return replace(self, **columns, evidence=self.evidence.take(rows))
+
     def save(self, path: str | Path, extra: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
         """Write Parquet, atomically; `extra` columns (n,) go along for other programs and are not read back."""
-        _write_parquet(self, _VOXEL_TYPES, path, extra or {})
+        _write_parquet(self, _VOXEL_TYPES, path, self.evidence.chunks(), extra or {})
 
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
@@ -105,7 +113,7 @@ class Events:
     ix, iy, iz  (n,) int32 the voxels, sorted
     voxel       (m,) int64 row into them, ascending
     frame       (m,) int32 frame index
-    evidence    (m, K) float64 s_bar, the mean of the frame's evidence in the voxel
+    evidence    (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse
     pixels      (m,) int64 pixels behind it
     voxel_size  r, metres
     classes     the K class names, where they are known
@@ -116,7 +124,7 @@ class Events:
     iz: Int32
     voxel: Int64
     frame: Int32
-    evidence: Float64
+    evidence: Evidence
     pixels: Int64
     voxel_size: float
     classes: tuple[str, ...] = ()
@@ -131,21 +139,21 @@ class Events:
     def __len__(self) -> int:
         return len(self.voxel)
 
-    @property
+    @cached_property
     def starts(self) -> Int64:
         """(n,) first row of each voxel."""
-        return np.searchsorted(self.voxel, np.arange(len(self.ix))).astype(np.int64)
+        return np.flatnonzero(np.diff(self.voxel, prepend=-1))
 
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
-        starts, s_bar = self.starts, self.evidence
+        starts, s_bar = self.starts, self.evidence[:]
         op = np.diff(np.append(starts, len(self)))
         return VoxelTable(
             self.ix,
             self.iy,
             self.iz,
             op=op.astype(np.int32),
-            evidence=_sum_by_voxel(s_bar, starts),
+            evidence=Evidence.of(_sum_by_voxel(s_bar, starts)),
             drift_sum=_sum_by_voxel(self.drift(), starts),
             pixels=_sum_by_voxel(self.pixels, starts),
             first_frame=np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
@@ -158,7 +166,7 @@ class Events:
 
     def beliefs(self) -> Float64:
         """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
-        accumulated = self.evidence.copy()
+        accumulated = self.evidence[:]
         age = np.arange(len(self)) - self.starts[self.voxel]
         by_age = np.argsort(age, kind="stable")
         ends = np.cumsum(np.bincount(age, minlength=1))
@@ -184,14 +192,14 @@ class Events:
         pairs = np.stack([parent.ravel()[self.voxel], self.frame], axis=1)
         pairs, rows = np.unique(pairs, axis=0, return_inverse=True)
         pixels = np.zeros(len(pairs), dtype=np.int64)
-        evidence = np.zeros((len(pairs), self.evidence.shape[1]))
+        evidence = np.zeros((len(pairs), self.evidence.K))
         np.add.at(pixels, rows.ravel(), self.pixels)
-        np.add.at(evidence, rows.ravel(), self.evidence * self.pixels[:, None])
+        np.add.at(evidence, rows.ravel(), self.evidence[:] * self.pixels[:, None])
         return Events(
             **index_columns(coarse),
             voxel=pairs[:, 0].astype(np.int64),
             frame=pairs[:, 1].astype(np.int32),
-            evidence=evidence / pixels[:, None],
+            evidence=Evidence.of(evidence / pixels[:, None]),
             pixels=pixels,
             voxel_size=self.voxel_size * factor,
             classes=self.classes,
@@ -199,7 +207,8 @@ class Events:
 
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
-        _write_parquet(self, _EVENT_TYPES, path, {n: getattr(self, n)[self.voxel] for n in _INDEX_TYPES})
+        index = {name: getattr(self, name)[self.voxel] for name in _INDEX_TYPES}
+        _write_parquet(self, _EVENT_TYPES, path, self.evidence.chunks(), index)
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
@@ -229,28 +238,45 @@ def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:
 
 def _freeze_columns(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
     for name, dtype in types.items():
-        column: npt.NDArray[Any] = np.ascontiguousarray(getattr(table, name), dtype=dtype).view()
-        if len(column) != len(like):
-            raise DataError(f"{type(table).__name__}: column '{name}' has {len(column)} rows, expected {len(like)}")
-        column.setflags(write=False)
-        object.__setattr__(table, name, column)
+        given = getattr(table, name)
+        if len(given) != len(like):
+            raise DataError(f"{type(table).__name__}: column '{name}' has {len(given)} rows, expected {len(like)}")
+        object.__setattr__(table, name, _evidence(table, given) if name == "evidence" else _frozen(given, dtype))
+
+
+def _frozen(given: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    column: npt.NDArray[Any] = np.ascontiguousarray(given, dtype=dtype).view()
+    column.setflags(write=False)
+    return column
+
+
+def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
+    shape = np.shape(given)
+    if len(shape) != 2:
+        raise DataError(f"{type(table).__name__}: evidence of shape {shape}, expected one row of K classes each")
+    return Evidence.of(given)
 
 
 def _write_parquet(
     table: VoxelTable | Events,
     types: Types,
     path: str | Path,
+    chunks: Iterable[slice],
     extra: Mapping[str, npt.NDArray[Any]],
 ) -> None:
+    """Write row group by row group: no dense column is longer."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     columns = {name: getattr(table, name) for name in types} | dict(extra)
     about = {"schema": SCHEMA, "kind": type(table).__name__, "voxel_size": table.voxel_size, "classes": table.classes}
-    content = pa.table({name: _to_arrow(values) for name, values in columns.items()})
-    content = content.replace_schema_metadata({"semstab": json.dumps(about)})
-    with atomic_path(path) as temporary:
-        pq.write_table(content, temporary, compression="zstd")
+    with atomic_path(path) as temporary, contextlib.ExitStack() as open_files:
+        writer = None
+        for some in chunks:
+            part = pa.table({name: _to_arrow(values[some]) for name, values in columns.items()})
+            part = part.replace_schema_metadata({"semstab": json.dumps(about)})
+            writer = writer or open_files.enter_context(pq.ParquetWriter(temporary, part.schema, compression="zstd"))
+            writer.write_table(part)
 
 
 def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
@@ -261,7 +287,7 @@ def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
 
 
-@contextmanager
+@contextlib.contextmanager
 def _reading(path: str | Path) -> Iterator[None]:
     """Whatever is wrong with a file's content is a DataError of one line that names the file."""
     import pyarrow as pa
@@ -275,21 +301,29 @@ def _reading(path: str | Path) -> Iterator[None]:
 def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
     import pyarrow.parquet as pq
 
-    content = pq.read_table(path)
-    about = json.loads((content.schema.metadata or {})[b"semstab"])
-    if about["schema"] != SCHEMA:
-        raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
-    columns: dict[str, Any] = {name: _to_numpy(content.column(name)) for name in types}
+    with pq.ParquetFile(path) as content:
+        about = json.loads((content.schema_arrow.metadata or {})[b"semstab"])
+        if about["schema"] != SCHEMA:
+            raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
+        parts: dict[str, list[Any]] = {name: [] for name in types}
+        for group in range(content.num_row_groups):
+            rows = content.read_row_group(group, columns=list(types))
+            for name, values in parts.items():
+                values.append(_to_numpy(rows.column(name)))
+    columns = {name: _joined(values) for name, values in parts.items()}
     return columns | {"voxel_size": float(about["voxel_size"]), "classes": tuple(about["classes"])}
 
 
-def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any]:
+def _joined(parts: list[Any]) -> Any:
+    return Evidence.joined(parts) if isinstance(parts[0], Evidence) else np.concatenate(parts)
+
+
+def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:
     import pyarrow as pa
 
     if column.null_count:
         raise DataError("a column has missing values")
-    if not pa.types.is_fixed_size_list(column.type):
-        values: npt.NDArray[Any] = column.to_numpy()
-    else:
-        values = column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
+    if pa.types.is_fixed_size_list(column.type):
+        return Evidence.of(column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size))
+    values: npt.NDArray[Any] = column.to_numpy()
     return values
