@@ -12,6 +12,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.config import validated
+from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
 from semstab.runtime.registry import Entry, Registry
 
@@ -75,14 +76,20 @@ class Prediction:
 class Backbone(Protocol):
     """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
 
-    label_space   the classes of its labels and scores, or None where it predicts regions without classes
-    gives_scores  whether `predict` can give scores
-    fit_frames    how many images `fit` wants, 0 for most
+    label_space     the classes of its labels and scores, or None where it predicts regions without classes
+    gives_scores    whether `predict` can give scores
+    fit_frames      how many images `fit` wants, 0 for most
+    sequential      whether what it says of an image depends on the images before: it then gets the selected frames of a
+                    sequence in order, all of them, from the first one after `reset`
+    wants_geometry  whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and pose at
+                    the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour
     """
 
     label_space: LabelSpace | None = None
     gives_scores: bool = False
     fit_frames: int = 0
+    sequential: bool = False
+    wants_geometry: bool = False
 
     def fit(self, images: Sequence[Image]) -> Backbone:
         """The backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
@@ -90,6 +97,10 @@ class Backbone(Protocol):
         Called once a sequence, before the first `predict`, whatever frames are predicted later.
         """
         return self
+
+    def reset(self) -> None:
+        """Forget all images: the next one is the first of a sequence. Called where it is `sequential`."""
+        return
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """One prediction an image, in order, of the image's size. The images have one size.
@@ -106,6 +117,14 @@ class Backbone(Protocol):
         ...
 
 
+def ask(
+    backbone: Backbone, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+) -> list[Prediction]:
+    """What a backbone says about images; it is told their geometry where it wants it."""
+    more = {"geometry": geometry} if backbone.wants_geometry else {}
+    return backbone.predict(images, scores=scores, **more)
+
+
 def image_digest(image: Image) -> str:
     """A hash of an image's size and colours."""
     content = hashlib.blake2b(repr(image.shape).encode(), digest_size=16)
@@ -118,9 +137,23 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 
+def backbone_class(name: str) -> Any:
+    """What makes backbones of that name: a registered class, or a user's, as FILE.py:NAME or package.module:NAME.
+
+    It has `Options` and is called with them. Raises ConfigError, DataError, MissingDependencyError.
+    """
+    from semstab.backbones.outside.code import is_code
+
+    if not is_code(name):
+        return REGISTRY.load(name)
+    from semstab.backbones.outside.own import Own
+
+    return Own(name)
+
+
 def options_model(name: str) -> type[BaseModel]:
-    """The pydantic model of a backbone's options. Raises ConfigError, MissingDependencyError."""
-    return cast("type[BaseModel]", REGISTRY.load(name).Options)
+    """The pydantic model of a backbone's options. Raises what `backbone_class` raises."""
+    return cast("type[BaseModel]", backbone_class(name).Options)
 
 
 def create(name: str, **options: Any) -> Backbone:
@@ -129,4 +162,5 @@ def create(name: str, **options: Any) -> Backbone:
     Raises ConfigError for an unknown name or option, DataError for a model that cannot be loaded,
     MissingDependencyError where its packages are not installed.
     """
-    return cast(Backbone, REGISTRY.load(name)(validated(options_model(name), options, f"backbone '{name}': ")))
+    made_by = backbone_class(name)
+    return cast(Backbone, made_by(validated(made_by.Options, options, f"backbone '{name}': ")))

@@ -13,7 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from semstab.backbones import Backbone, Image, Prediction
+from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError
+from semstab.model.frames import Frame
 from semstab.model.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 from semstab.runtime.files import parse_yaml
 
@@ -85,7 +87,7 @@ def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) ->
     return [*own, vocabulary.rest] if said is None else [said, *own]
 
 
-class InTaxonomy(Backbone):
+class InTaxonomy(Wrapped):
     """A backbone whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
 
     Labels are the mapped classes of the model's own decision; scores of classes that fall together are added up.
@@ -95,25 +97,20 @@ class InTaxonomy(Backbone):
     def __init__(self, backbone: Backbone, target: LabelSpace, leniency: Leniency) -> None:
         if backbone.label_space is None:
             raise ConfigError("regions without classes cannot be brought into a taxonomy; leave it out")
-        self._backbone = backbone
-        self._leniency: Leniency = leniency
+        super().__init__(backbone)
         self._mapping = class_mapping(backbone.label_space, target, leniency)
         self.label_space = dataclasses.replace(target, ids=tuple(range(len(target))))
-        self.gives_scores = backbone.gives_scores
-        self.fit_frames = backbone.fit_frames
 
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """The inner backbone, fitted."""
-        return InTaxonomy(self._backbone.fit(images), self._mapping.target, self._leniency)
-
-    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
         """See `Backbone`."""
-        return [self._mapped(prediction) for prediction in self._backbone.predict(images, scores=scores)]
+        return [self._mapped(prediction) for prediction in self.ask(images, scores, geometry)]
 
     def identity(self) -> dict[str, Any]:
         """That of the inner backbone, and where each class goes."""
         rows = list(self._mapping.rows)
-        return {**self._backbone.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
+        return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
 
     def _mapped(self, prediction: Prediction) -> Prediction:
         labels = self._mapping.labels(prediction.labels, "prediction")

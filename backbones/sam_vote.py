@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from semstab.backbones import Backbone, Image, Labels, Prediction, create
+from semstab.backbones import Image, Labels, Prediction, create
+from semstab.backbones.outside.border import Checked
 from semstab.backbones.sam_proposals import Proposals, SamOptions, SamProposer
+from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError
+from semstab.model.frames import Frame
 from semstab.model.labels import ignore_id
 
 
@@ -21,7 +24,7 @@ class SamVoteOptions(SamOptions):
     voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {model: FOLDER}")
 
 
-class SamVote(Backbone):
+class SamVote(Wrapped):
     """Masks painted by area, the largest first, each in the label that most of its pixels have (ties: the lowest id).
 
     Pixels that the voter ignores do not vote; outside the masks its labels stay.
@@ -30,33 +33,27 @@ class SamVote(Backbone):
 
     Options: type[BaseModel] = SamVoteOptions
 
-    def __init__(
-        self, options: SamVoteOptions, proposer: SamProposer | None = None, voter: Backbone | None = None
-    ) -> None:
+    def __init__(self, options: SamVoteOptions) -> None:
+        super().__init__(Checked(create(options.voter, **options.voter_options), options.voter))
         self.options = options
-        self._voter = voter or create(options.voter, **options.voter_options)
-        if self._voter.label_space is None:
+        if self.label_space is None:
             raise ConfigError(f"sam-vote: the voter '{options.voter}' has no classes; choose one that has")
-        self.proposer = proposer or SamProposer(options)
-        self.label_space = self._voter.label_space
-        self.fit_frames = self._voter.fit_frames
+        self.gives_scores = False
+        self.proposer = SamProposer(options)
 
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """With the fitted voter."""
-        return SamVote(self.options, self.proposer, self._voter.fit(images))
-
-    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
         """See `Backbone`; there are no scores."""
         min_area = self.proposer.options.min_area
-        votes = self._voter.predict(images)
         return [
             Prediction(majority(vote.labels, self.proposer.propose(image), min_area))
-            for image, vote in zip(images, votes, strict=True)
+            for image, vote in zip(images, self.ask(images, False, geometry), strict=True)
         ]
 
     def identity(self) -> dict[str, Any]:
         """Those of the proposals and of the voter."""
-        return self.proposer.identity() | {"voter": self.options.voter, "voter_options": self._voter.identity()}
+        return self.proposer.identity() | {"voter": self.options.voter, "voter_options": self.inner.identity()}
 
 
 def majority(labels: Labels, proposals: Proposals, min_area: int) -> Labels:

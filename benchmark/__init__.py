@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from semstab.model.frames import Frame, Intrinsics
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
+    from semstab.outputs.export import export
     from semstab.settings import load_config, load_study
 
 __version__ = "0.2.0"
@@ -33,6 +34,7 @@ __all__ = [
     "backends",
     "datasets",
     "engine",
+    "export",
     "load_config",
     "load_result",
     "load_study",
@@ -53,6 +55,7 @@ _HOMES = {
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
+    "export": "outputs.export",
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",
@@ -70,3 +73,8 @@ def __getattr__(name: str) -> Any:
         globals()[name] = value
         return value
     raise AttributeError(f"module 'semstab' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return sorted([*__all__, "__version__"])

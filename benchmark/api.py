@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from semstab.config import Config
 from semstab.engine import Executor, Observer
@@ -11,10 +12,11 @@ from semstab.engine.execution import run as execute
 from semstab.engine.execution import run_study as execute_study
 from semstab.model.records import Result
 from semstab.outputs.report import Reporting
+from semstab.settings import as_config
 
 
 def run(
-    config: Config,
+    config: Config | Mapping[str, Any] | str | Path,
     *,
     out: str | Path | None = None,
     executor: Executor | None = None,
@@ -22,18 +24,18 @@ def run(
     command: Sequence[str] = (),
     report: bool = True,
 ) -> Result:
-    """Fuse, measure and compare what the configuration selects, without printing.
+    """Fuse, measure and compare what the configuration selects, without printing; it may be a dict or a YAML file.
 
     A folder `out`, in which the finished units of an earlier start are kept, gets the summary, voxels, time series and,
     unless `report` is False, tables, figures and report.html. An executor says where the work is done.
     Raises ConfigError or DataError; what was finished before stays in the folder.
     """
     reporting = [Reporting(out)] if report and out is not None else []
-    return execute(config, out=out, executor=executor, observers=[*observers, *reporting], command=command)
+    return execute(as_config(config), out=out, executor=executor, observers=[*observers, *reporting], command=command)
 
 
 def run_study(
-    config: Config,
+    config: Config | Mapping[str, Any] | str | Path,
     out: str | Path,
     *,
     executor: Executor | None = None,
@@ -48,7 +50,9 @@ def run_study(
     """
     reporting = [Reporting(out, processes=processes)] if report else []
     try:
-        return execute_study(config, out, executor=executor, observers=[*observers, *reporting], command=command)
+        return execute_study(
+            as_config(config), out, executor=executor, observers=[*observers, *reporting], command=command
+        )
     finally:
         for observer in reporting:
             observer.close()

@@ -8,16 +8,29 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config, merge, nearest, read_yaml
+from semstab.config.selection import in_full
 from semstab.datasets import resolved
 from semstab.errors import ConfigError
 from semstab.predict.live import NAME as PREDICTED
 from semstab.predict.predictor import PredictorConfig
 
 
-def load_config(path: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
-    """The configuration of a file with overrides on top, over what ships for its dataset in configs/datasets/."""
-    content = merge(read_yaml(path) if path is not None else {}, overrides or {})
-    return Config.build(merge(dataset_defaults(content), content), str(path or "configuration"))
+def load_config(
+    settings: str | Path | Mapping[str, Any] | None = None, overrides: Mapping[str, Any] | None = None
+) -> Config:
+    """The configuration of a file, or of settings by name, over what ships for its dataset in configs/datasets/.
+
+    Overrides go on top. Raises ConfigError.
+    """
+    base = settings if isinstance(settings, Mapping) else _of_file(settings)
+    content = merge(_in_full(base), _in_full(overrides or {}))
+    where = "configuration" if settings is None or isinstance(settings, Mapping) else str(settings)
+    return Config.build(merge(dataset_defaults(content), content), where)
+
+
+def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
+    """A configuration, or what `load_config` makes of a file or a dict."""
+    return settings if isinstance(settings, Config) else load_config(settings)
 
 
 def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
@@ -27,7 +40,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
     such study.
     """
     path = _find(str(study))
-    content = merge(read_yaml(path), overrides or {})
+    content = merge(_in_full(read_yaml(path)), _in_full(overrides or {}))
     own = {"name": path.stem, "check": None}
     return Config.build(merge(own, merge(dataset_defaults(content), content)), str(path))
 
@@ -52,7 +65,7 @@ def predicted_config(
 
     Without a list of backbones in `overrides` all predictors are used.
     """
-    content = merge(read_yaml(path) if path is not None else {}, overrides)
+    content = merge(_in_full(_of_file(path)), _in_full(overrides))
     inner = content.pop("dataset", {"name": "city"})
     content["backbones"] = overrides.get("backbones")
     content["dataset"] = {
@@ -63,8 +76,29 @@ def predicted_config(
 
 
 def resolve(config: Config) -> Config:
-    """The configuration with every default of its dataset's options filled in, paths absolute."""
-    return config.model_copy(update={"dataset": resolved(config.dataset)})
+    """The configuration with every default of its dataset's options filled in, paths absolute.
+
+    Sequential backbones that predict in a run are shown the frames that it selects.
+    """
+    dataset = config.dataset
+    if dataset.name == PREDICTED:
+        shown = config.model_dump(mode="json", include={"frames", "scene_frames"})
+        dataset = dataset.model_copy(update={"options": {**dataset.options, **shown}})
+    return config.model_copy(update={"dataset": resolved(dataset)})
+
+
+def _of_file(path: str | Path | None) -> dict[str, Any]:
+    return {} if path is None else read_yaml(path)
+
+
+def _in_full(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings whose short forms are written out, so that others go on top of them group by group."""
+    long = dict(content)
+    if isinstance(dataset := long.get("dataset"), str):
+        long["dataset"] = {"name": dataset}
+    if "frames" in long:
+        long["frames"] = in_full(long["frames"])
+    return long
 
 
 def _find(study: str) -> Path:

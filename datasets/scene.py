@@ -13,9 +13,10 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.datasets.views.resampling import Labels, Scores
-from semstab.datasets.views.same_view import fitted
+from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
+from semstab.model.georeference import Georeference
 from semstab.model.labels import LabelSpace
 
 GROUND_TRUTH = "gt"
@@ -33,6 +34,7 @@ class Scene(ABC):
     ground_truth       whether `frame(i, "gt")` works too
     regions            maps of regions without classes, which `frame` reads by name and nothing fuses
     up                 (3,) unit vector of the world's up axis, or None where it is not known
+    georeference       where it lies on Earth, or None where that is not known
     folder             where its files lie and label maps of it are looked for, or None where it has none
     label_paths        where label maps are looked for, of the first frame, with BACKBONE for any name
     settings_file      the file that says what no option says, or None where there is no such file
@@ -45,6 +47,7 @@ class Scene(ABC):
     ground_truth: bool = False
     regions: tuple[str, ...] = ()
     up: npt.NDArray[np.float64] | None = None
+    georeference: Georeference | None = None
     folder: Path | None = None
     label_paths: tuple[str, ...] = ()
     settings_file: Path | None = None
@@ -145,6 +148,13 @@ class Scene(ABC):
         labels = None if labels is None else fitted(labels, frame.shape, where)
         scores = None if scores is None else fitted(scores, frame.shape, where)
         return dataclasses.replace(frame, labels=labels, scores=scores, color=None)
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame:
+        """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0.
+
+        Raises DataError where image and depth do not show the same view.
+        """
+        return at_image(self.geometry(index), shape, f"{self.name}, {self.image_name(index)}")
 
 
 class Dataset(ABC):

@@ -31,6 +31,7 @@ def write_posed(
         for source, frame in zip(sources, frames, strict=True):
             if source:
                 written.write_labels(name, frame, source)
+    written.close()
     (folder / CONVERSION_FILE).unlink()  # it is nobody's conversion
     (folder / "scene.yaml").write_text(
         yaml.safe_dump(settings | ({} if scale in (None, 1000) else {"depth_scale": scale}))

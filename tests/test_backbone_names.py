@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import tiny_models
 
-from semstab.backbones import Prediction
+from semstab.backbones import Backbone, Prediction
 from semstab.backbones.class_names import InTaxonomy, class_mapping, vocabularies
 from semstab.errors import ConfigError
 from semstab.model.labels import LabelSpace
@@ -88,7 +88,7 @@ def test_vocabularies_name_classes_of_uavid_once():
         assert len(names) == len(set(names))
 
 
-class FourPixels:
+class FourPixels(Backbone):
     """A backbone with known labels and scores."""
 
     label_space = LabelSpace("model", ("tree", "grass", "road"))

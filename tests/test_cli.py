@@ -93,7 +93,7 @@ def test_the_default_run_folder_is_new_each_time(wall, tmp_path) -> None:
         (("--data", "empty"), "empty"),
         (("--config", "nowhere.yaml"), "nowhere.yaml: cannot be read"),
         (("--config", "bad.yaml"), "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
-        (("--data", "wall", "--voxel-size", "0"), "voxel_size: input should be greater than 0"),
+        (("--data", "wall", "--voxel-size", "0"), "voxel_size: input should be greater than"),
         (("--data", "wall", "--backend", "opn3d"), "did you mean 'open3d'?"),
         (("--data", "wall", "--backbone", "c"), "no backbone 'c'; there is a, b, gt"),
         (("--data", "wall", "--frames", "3"), "--frames 3"),

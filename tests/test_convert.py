@@ -311,9 +311,14 @@ def test_two_sources_of_one_folder_are_refused(tmp_path):
     room.backbones = ("net", "net-scores")
     with pytest.raises(ConfigError, match="net and net-scores would get one folder; choose with --backbone"):
         of_memory(room, tmp_path)
-    room.backbones = ("a b", "a-b")
-    with pytest.raises(ConfigError, match="room: a b and a-b would get one folder"):
-        of_memory(room, tmp_path / "other")
+
+
+def test_sources_keep_their_names_where_a_folder_can_be_called_so(tmp_path):
+    room = Room(walk(2), soft=False)
+    room.backbones = ("a b", "a-b", "../x")
+    assert list(of_memory(room, tmp_path).renamed) == ["../x"]
+    assert {"a b", "a-b"} < {path.name for path in (tmp_path / "out" / "labels").iterdir()}
+    assert not (tmp_path / "out" / "x").exists()
 
 
 def test_an_oblique_up_direction_and_unknown_classes_are_said_to_be_lost(tmp_path):

@@ -10,7 +10,7 @@ from semstab.model.frames import Frame, Intrinsics
 from semstab.testing import checks
 
 CAMERA = Intrinsics(fx=2, fy=3, cx=1, cy=0.5)
-PATHS = {name: f"scene3/{name}/0012.png" for name in ("depth", "pose", "labels", "scores", "color")}
+PATHS = {name: f"scene3/{name}/0012.png" for name in ("depth", "pose", "labels", "scores", "color", "intrinsics")}
 
 
 def a_frame(**changes):
@@ -45,7 +45,14 @@ REFUSED = {
     "rotation scales": ("pose", {"T_wc": np.diag([2.0, 2, 2, 1])}, "scale?"),
     "rotation shears": ("pose", {"T_wc": pose(T01=0.5)}, "not orthonormal"),
     "labels of another size": ("labels", {"labels": np.zeros((3, 2), np.uint8)}, "labels are 2x3 but depth is 3x2"),
-    "labels are signed": ("labels", {"labels": np.zeros((2, 3), np.int64)}, "labels are int64"),
+    "depth is nowhere": ("depth", {"depth": np.full((64, 64), np.nan)}, "finite nowhere"),
+    "depth is in millimetres": ("depth", {"depth": np.arange(500.0, 1700.0).reshape(-1, 3)}, "looks like millimetres"),
+    "camera is four numbers": ("intrinsics", {"intrinsics": (2, 3, 1, 0.5)}, "3x3 matrix, got shape (4,)"),
+    "camera is transposed": ("intrinsics", {"intrinsics": CAMERA.matrix.T}, "transposed?"),
+    "camera is a word": ("intrinsics", {"intrinsics": "pinhole"}, "not a 3x3 matrix"),
+    "labels are float": ("labels", {"labels": np.zeros((2, 3))}, "labels are float64"),
+    "labels are negative": ("labels", {"labels": np.full((2, 3), -1)}, "from -1 to 0; write 255"),
+    "labels are too large": ("labels", {"labels": np.full((2, 3), 70_000)}, "from 0 to 70000"),
     "labels and scores": ("labels", {"scores": np.ones((2, 3, 4))}, "one of the two"),
     "neither labels nor scores": ("labels", {"labels": None}, "one of the two"),
     "scores of another size": (
@@ -53,6 +60,7 @@ REFUSED = {
         {"labels": None, "scores": np.ones((4, 3, 2))},
         "scores are 3x4 but depth is 3x2",
     ),
+    "scores begin with K": ("scores", {"labels": None, "scores": np.ones((4, 2, 3))}, "(K, H, W) = (4, 2, 3); turn"),
     "scores are flat": ("scores", {"labels": None, "scores": np.ones((2, 3))}, "(H, W, K)"),
     "scores are whole numbers": ("scores", {"labels": None, "scores": np.ones((2, 3, 4), int)}, "must be float"),
     "scores of one class": ("scores", {"labels": None, "scores": np.ones((2, 3, 1))}, "at least 2"),
@@ -73,6 +81,16 @@ def test_a_frame_that_contradicts_itself_is_refused(field, changes, message):
     for error in (in_memory, from_files):
         assert message in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def test_what_has_one_meaning_is_taken() -> None:
+    matrix = [[2, 0, 1], [0, 3, 0.5], [0, 0, 1]]
+    assert a_frame(intrinsics=matrix).intrinsics == CAMERA
+    for values, kept in (([0, 2, 255], np.uint8), ([0, 2, 256], np.uint16), ([True, False, True], np.uint8)):
+        labels = a_frame(labels=np.array([values, values])).labels
+        assert labels.dtype == kept
+        np.testing.assert_array_equal(labels, [values, values])
+    assert a_frame(depth=np.full((2, 3), 400.0)).valid.all()  # one whole number of metres is a depth
 
 
 @pytest.mark.parametrize("off", [0.0005, -0.0005])

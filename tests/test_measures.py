@@ -25,6 +25,8 @@ from semstab.outputs.plots.histograms import histograms
 from semstab.outputs.plots.judgement import statistics_figures
 from semstab.outputs.plots.maps import draw_stability
 from semstab.outputs.plots.sweeps import draw_sweep
+from semstab.outputs.plots.topdown import FromAbove
+from semstab.outputs.plots.views import Views
 from semstab.outputs.recording import Recording, looks
 from semstab.outputs.recording.voxel_maps import defaults
 from semstab.outputs.tables import tables, to_csv
@@ -132,8 +134,8 @@ def test_figures_show_it(study) -> None:
         draw_ecdf(found, informative(found.values())),
         draw_persistence(found),
         draw_sweep(describe("voxel_size"), swept),
-        draw_stability(table, (0, -1, 0)),
-        next(figure for figure in statistics_figures(result, []) if figure.name == "comparison").draw(),
+        draw_stability(FromAbove.of(table, (0, -1, 0))),
+        next(figure for figure in statistics_figures(result, [], Views()) if figure.name == "comparison").draw(),
     )
     for figure in panels:
         assert any("rival" in title.lower() for title in titles(figure)), titles(figure)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ from semstab.engine import LocalProcesses, load_result
 from semstab.engine.units import make_plan
 from semstab.engine.work import image_space
 from semstab.metrics import compare, compensated_flicker
-from semstab.outputs.plots import write_figures
+from semstab.model.records import Result
+from semstab.outputs.plots import Views, write_figures
 from semstab.outputs.plots.drawing import DrawingProcess
 from semstab.outputs.recording import Recording, Target
 from semstab.settings import load_config, load_study
@@ -183,16 +185,21 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
 def test_two_processes_draw_the_figures_that_one_draws(root, tmp_path) -> None:
     out = tmp_path / "run"
     result = semstab.engine.run(load_config(overrides=settings(root, backends=["numpy"])), out=out)
-    drawn = []
-    for beside in (None, DrawingProcess()):
-        write_figures(result, out, beside)
-        drawn.append({file.name: file.read_bytes() for file in (out / "figures").iterdir()})
-        if beside is not None:
-            beside.close()
-            write_figures(result, out, beside)  # it is gone: all are drawn here
-            drawn.append({file.name: file.read_bytes() for file in (out / "figures").iterdir()})
-    assert len(drawn[0]) >= 8
-    assert drawn[0] == drawn[1] == drawn[2]
+    from_files = figure_files(result, out, Views(), None)
+    assert len(from_files) >= 8
+    seen = Views()
+    for record in result.select():
+        seen.see(record.unit, record.table(), result.up.get(record.unit.scene))
+    beside = DrawingProcess()
+    assert figure_files(result, out, seen, beside) == from_files
+    beside.close()
+    assert figure_files(result, out, seen, beside) == from_files  # it is gone: all are drawn here
+
+
+def figure_files(result: Result, out: Path, views: Views, beside: DrawingProcess | None) -> dict[str, bytes]:
+    """Write the figures; their files' contents."""
+    write_figures(result, out, views, beside)
+    return {file.name: file.read_bytes() for file in (out / "figures").iterdir()}
 
 
 def test_large_frames_are_sampled_for_what_is_measured_in_the_image(root, monkeypatch) -> None:

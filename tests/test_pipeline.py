@@ -205,7 +205,7 @@ def test_a_folder_of_an_earlier_version_is_refused_and_not_touched(root, tmp_pat
 def test_a_folder_that_a_killed_start_only_began_is_taken_over(root, tmp_path) -> None:
     out = tmp_path / "run"
     (out / "units").mkdir(parents=True)
-    (out / ".config-ab12.yaml").write_text("half")
+    (out / ".semstab-ab12cd34.yaml").write_text("half")
     semstab.engine.run(configure(root, backbones=["a"]), out=out)
     assert not list(out.rglob(".*"))
 

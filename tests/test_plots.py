@@ -28,7 +28,7 @@ from semstab.outputs.plots.histograms import BINS, OP_BOUNDS, histograms, op_pos
 from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.outputs.plots.style import COLUMN, DPI, PAGE
 from semstab.outputs.plots.sweeps import draw_sweep
-from semstab.outputs.plots.topdown import EMPTY, level_axes, top_down
+from semstab.outputs.plots.topdown import EMPTY, FromAbove, level_axes, top_down
 from semstab.testing import SEQUENCES, as_frames, checks
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
@@ -205,7 +205,7 @@ def pixels(axes):
 def test_a_map_has_the_colours_of_its_categories():
     columns = {"op": [1, 4, 4], "evidence": [SURE, [2, 2, 0], [4, 0, 0]], "drift_sum": [0, 0.6, 0]}
     table = at([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **columns)
-    kind, drift, doubt, *_ = draw_stability(table, (0, 0, 1)).axes
+    kind, drift, doubt, *_ = draw_stability(FromAbove.of(table, (0, 0, 1))).axes
     assert pixels(kind)[0].tolist() == [list(CATEGORY_COLORS[k]) for k in categories(table)]
     grey = [204, 204, 204]
     assert pixels(drift)[0, 0, :3].tolist() == grey
@@ -215,14 +215,14 @@ def test_a_map_has_the_colours_of_its_categories():
 
 def test_nothing_is_white():
     table = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
-    for axes in draw_stability(table, (0, 0, 1)).axes[: 1 + sum(measure.panel for measure in measures())]:
+    for axes in draw_stability(FromAbove.of(table, (0, 0, 1))).axes[: 1 + sum(measure.panel for measure in measures())]:
         assert pixels(axes)[0, 1, :3].tolist() == [255, 255, 255]
 
 
 def test_the_overview_is_in_one_palette():
     table = at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]])
     overview = Overview(7, np.array([[0, 1], [2, 255]]), np.zeros((2, 2, 3), np.uint8), PALETTE)
-    image, prediction, fused_map = draw_overview(table, (0, 0, 1), overview).axes
+    image, prediction, fused_map = draw_overview(FromAbove.of(table, (0, 0, 1)), overview).axes
     assert [axes.get_title(loc="left")[:3] for axes in (image, prediction, fused_map)] == ["(a)", "(b)", "(c)"]
     white = [255, 255, 255]
     assert pixels(prediction).tolist() == [[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], white]]
@@ -231,7 +231,7 @@ def test_the_overview_is_in_one_palette():
 
 def test_without_an_image_the_overview_has_two_panels():
     overview = Overview(0, np.zeros((2, 2), int), None, PALETTE)
-    assert len(draw_overview(at([(0, 0, 0)]), (0, 0, 1), overview).axes) == 2
+    assert len(draw_overview(FromAbove.of(at([(0, 0, 0)]), (0, 0, 1)), overview).axes) == 2
 
 
 def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):

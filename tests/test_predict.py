@@ -17,7 +17,7 @@ from command_line import bench, error_of
 from PIL import Image
 from posed_config import configure, dataset_of
 
-from semstab.backbones import Prediction, create
+from semstab.backbones import Backbone, Prediction, create
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
@@ -32,6 +32,7 @@ from semstab.predict.jobs import file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
 from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
 from semstab.predict.sources import ImageFiles
+from semstab.runtime.files import FolderLock
 from semstab.settings import predicted_config
 
 CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}
@@ -60,7 +61,7 @@ def manifest(folder: Path) -> dict:
     return json.loads((folder / "predictions.json").read_text())
 
 
-class Shifting:
+class Shifting(Backbone):
     """A backbone with known output: the label is the column modulo 3; scores say so; it counts what it sees."""
 
     label_space = LabelSpace("thirds", ("a", "b", "c"))
@@ -171,6 +172,30 @@ def test_what_was_finished_before_an_error_is_kept(scene):
         predict(scene, Shifting(fails_at=3))
     assert sorted(manifest(scene / "labels/clusters")["frames"]) == ["000", "001", "002"]
     assert (predict(scene, Shifting()).predicted, len(list((scene / "labels/clusters").glob("*.png")))) == (3, 6)
+
+
+def test_predictions_killed_at_their_birth_go_on(scene, monkeypatch):
+    class KilledError(BaseException):
+        pass
+
+    def killed(*_):
+        raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("semstab.predict.folder.write_json", killed)
+        with pytest.raises(KilledError):
+            predict(scene, Shifting())
+    (scene / "labels/clusters/.semstab-ab12cd34.png").write_bytes(b"half")
+    assert predict(scene, Shifting()).predicted == 6
+    assert not list(scene.rglob(".*"))
+
+
+def test_predictions_belong_to_one_process(scene):
+    held = FolderLock(scene / "labels/x")
+    with pytest.raises(ConfigError, match="labels/x: another process works on it"):
+        predict(scene, Shifting(), name="x")
+    held.release()
+    assert predict(scene, Shifting(), name="x").predicted == 6
 
 
 def test_an_image_that_changed_is_predicted_again(scene):

@@ -12,7 +12,7 @@ from simulated_events import grid, log_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.comparison import BackboneComparison
-from semstab.model.statistics import UNDEFINED, MapStatistics
+from semstab.model.statistics import UNDEFINED, ClassReach, FrameAgreement, MapStatistics, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.statistics_text import comparison_lines, lines
 from semstab.runtime.files import read_json, write_json
@@ -140,11 +140,24 @@ def test_one_backbone_cannot_be_compared():
 # --- The verdict ------------------------------------------------------------------------------------------------------
 
 
-def judged(low, high, wrong=UNDEFINED, voxels=5000, blocks=40):
-    middle = Estimate((low + high) / 2, low, high)
+def between(low, high):
+    return Estimate((low + high) / 2, low, high)
+
+
+def judged(low, high, wrong=UNDEFINED, voxels=5000, blocks=40, ceiling=None, classes=()):
+    """By alpha between frames as it is, or where there is a ceiling by the share of it that is reached."""
+    middle = between(low, high)
+    agreement = FrameAgreement(*[middle] * 8, classes=())
+    reach = (
+        None if ceiling is None else Reach("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
+    )
     return verdict(
-        "net", alpha=middle, psa=middle, voxels=voxels, share=0.5, blocks=blocks, wrong_of_stable=wrong
+        "net", agreement=agreement, reach=reach, voxels=voxels, share=0.5, blocks=blocks, wrong_of_stable=wrong
     )  # fmt: skip
+
+
+def of_class(name, low, high, *, matters=True):
+    return ClassReach(name, 200.0, matters, 0.5, 0.9, between(low, high))
 
 
 @pytest.mark.parametrize(
@@ -173,8 +186,29 @@ def test_there_is_no_verdict_from_few_places():
 def test_the_line_says_what_to_do_and_why():
     assert judged(0.5, 0.6).line == (
         "net: unstable, do not act on its labels: two frames agree on 55% of the places (50% to 60%),"
-        " alpha 0.55 (0.50 to 0.60); 5000 places seen twice or more, 50% of the map"
+        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 places seen twice or more, 50% of"
+        " the map"
     )
+
+
+def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
+    found = judged(0.82, 0.9, ceiling=0.7)
+    assert found.level == "stable"
+    assert "alpha between frames 0.86 is 86% (82% to 90%) of the 0.70 that the ground truth allow" in found.line
+    assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
+    assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
+
+
+def test_the_worst_class_that_matters_is_named_and_keeps_a_map_from_being_stable():
+    good, bad = of_class("road", 0.9, 1.0), of_class("person", 0.1, 0.7)
+    found = judged(0.9, 1.0, ceiling=0.9, classes=(good, bad))
+    assert found.level == "partly stable"
+    assert "worst class person 40% (10% to 70%)" in found.line
+    rare = of_class("person", 0.1, 0.7, matters=False)
+    found = judged(0.9, 1.0, ceiling=0.9, classes=(good, rare))
+    assert (found.level, "worst class road" in found.line) == ("stable", True)
+    unknown = of_class("person", math.nan, math.nan)
+    assert judged(0.9, 1.0, ceiling=0.9, classes=(good, unknown)).level == "partly stable"
 
 
 def test_voxels_seen_once_change_no_verdict():

@@ -72,7 +72,7 @@ def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> No
         ({"voxelsize": 1}, "unknown setting 'voxelsize'; did you mean 'voxel_size'"),
         ({"sweeps": {"voxel": [1]}}, r"unknown setting 'sweeps\.voxel'; did you mean 'voxel_size'"),
         ({"sweeps": {"depth_noise": {"values": [1], "repeat": 2}}}, "depth_noise.repeat'; did you mean 'repeats'"),
-        ({"sweeps": {"voxel_size": [0]}}, r"sweeps\.voxel_size\.values\.0: input should be greater than 0"),
+        ({"sweeps": {"voxel_size": [0]}}, r"sweeps\.voxel_size\.values\.0: input should be greater than"),
         ({"sweeps": {"voxel_size": []}}, r"sweeps\.voxel_size\.values: list should have at least 1 item"),
         ({"sweeps": {"depth_noise": [-0.1]}}, r"sweeps\.depth_noise\.values\.0: input should be greater than or equal"),
         ({"sweeps": {"frame_count": [2.5]}}, r"sweeps\.frame_count\.values\.0: input should be a valid integer"),

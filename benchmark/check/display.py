@@ -99,7 +99,7 @@ def _persistence_table(checked: SceneCheck) -> Table:
 
 
 def _label_table(checked: SceneCheck) -> Table:
-    table = _table(("class",), [labels.backbone for labels in checked.labels])
+    table = _table(("class",), [escape(labels.backbone) for labels in checked.labels])
     names = dict.fromkeys(name for labels in checked.labels for name in labels.classes)
     for name in names:
         table.add_row(escape(name), *(_percent(labels.classes.get(name, math.nan), 2) for labels in checked.labels))

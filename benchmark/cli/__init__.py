@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from typing import Annotated, Any
 
 import typer
@@ -9,10 +11,12 @@ from typer.core import TyperGroup
 
 from semstab import __version__
 from semstab.cli.data import check, convert, predict
+from semstab.cli.exporting import export
+from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
 from semstab.cli.running import run, study, view
-from semstab.errors import SemstabError
+from semstab.errors import OUT_OF_MEMORY, SemstabError
 from semstab.runtime.process import settle
 
 INTERRUPTED = 130
@@ -40,7 +44,8 @@ class Group(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """The one place that catches: bad input is one line and exit code 2."""
         try:
-            return super().invoke(ctx)
+            with interruptible():
+                return super().invoke(ctx)
         except SemstabError as error:
             say(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
@@ -49,6 +54,9 @@ class Group(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
+            raise typer.Exit(2) from error
+        except MemoryError as error:
+            say(f"error: {OUT_OF_MEMORY}")
             raise typer.Exit(2) from error
 
 
@@ -80,6 +88,7 @@ def root(
 
 for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
     app.command(name)(command)
+app.command("export")(export)
 app.command("view")(view)
 app.command("list")(list_)
 
@@ -87,4 +96,7 @@ app.command("list")(list_)
 def main() -> None:
     """Entry point of the console script."""
     settle()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names may hold what the terminal's encoding does not
     app()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +10,7 @@ import typer
 
 from semstab.cli.options import (
     Backbones,
+    Classes,
     ConfigFile,
     DataFolder,
     DatasetName,
@@ -26,7 +28,9 @@ from semstab.errors import ConfigError, DataError
 
 
 def predict(
-    backbone: Annotated[str, typer.Option("--backbone", "-m", help="Model, as named by `semstab-bench list`.")],
+    backbone: Annotated[
+        str, typer.Option("--backbone", "-m", help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.")
+    ],
     images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
     data: DataFolder = None,
     dataset: DatasetName = None,
@@ -43,6 +47,7 @@ def predict(
     image_size: Annotated[
         str | None, typer.Option(metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")
     ] = None,
+    classes: Classes = None,
     batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
     taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
@@ -60,11 +65,14 @@ def predict(
     from semstab.settings import load_config, resolve
 
     named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
+    named["classes"] = classes
     size = None if image_size is None else _image_size(image_size)
     options = overrides({**named, "image_size": size}, settings or [])
     chosen: dict[str, Any] = {}
     select_dataset(chosen, dataset, data, None)
     of_dataset = options.pop("dataset", {})
+    if not isinstance(of_dataset, dict):
+        raise ConfigError("--set dataset: write dataset.KEY=VALUE, or --dataset NAME")
     if chosen:
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
     said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
@@ -135,7 +143,7 @@ def convert(
     from semstab.convert.display import frame_bar, print_converted
 
     chosen = selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames)
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, markup=False)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         for converted in convert(chosen, out, depth_error=depth_error, progress=bar):
             print_converted(converted, console)
@@ -144,6 +152,6 @@ def convert(
 def _image_size(text: str) -> int | list[int]:
     """'512' as a number, '512x896' as height and width."""
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(side.isdigit() for side in sides):
+    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in sides):
         raise ConfigError(f"--image-size {text}: write the shorter side, for example 512, or HEIGHTxWIDTH")
     return int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]

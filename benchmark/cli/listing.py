@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 def list_() -> None:
     """Backends, datasets, backbones, taxonomies and studies, each with 'ready' or what to install."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from semstab import backbones, backends, datasets
@@ -22,7 +23,7 @@ def list_() -> None:
         table.add_column(name)
     for registry in (backends.REGISTRY, datasets.REGISTRY, backbones.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
-            table.add_row(registry.kind, name, _ready(registry, name), entry.summary)
+            table.add_row(registry.kind, name, _ready(registry, name), escape(entry.summary))
     for name in shipped_taxonomies():
         space = LabelSpace.load(name)
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
@@ -33,10 +34,12 @@ def list_() -> None:
 
 def _ready(registry: Registry, name: str) -> str:
     """'ready', where what is behind the name really imports, or what to install."""
+    from rich.markup import escape
+
     from semstab.errors import MissingDependencyError
 
     try:
         registry.load(name)
     except MissingDependencyError as error:
-        return f"[yellow]{error}"
+        return f"[yellow]{escape(str(error))}"
     return "[green]ready"

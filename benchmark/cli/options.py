@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, told
 
 if TYPE_CHECKING:
     from semstab.config import Config
@@ -22,6 +22,10 @@ DatasetName = Annotated[str | None, typer.Option(help="Dataset, as named by `sem
 Scenes = Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")]
 Backbones = Annotated[
     list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
+]
+Classes = Annotated[
+    str | None,
+    typer.Option(metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them."),
 ]
 VoxelSize = Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")]
 Frames = Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")]
@@ -98,6 +102,8 @@ def select_dataset(overrides: dict[str, Any], name: str | None, data: Path | Non
     if name is None and not options:
         return
     group = overrides.setdefault("dataset", {})
+    if not isinstance(group, dict) or not isinstance(group.get("options", {}), dict):
+        raise ConfigError("--set dataset: is given by other options too; write dataset.options.KEY=VALUE")
     if name is not None:
         group["name"] = name
     group["options"] = group.get("options", {}) | options
@@ -105,16 +111,14 @@ def select_dataset(overrides: dict[str, Any], name: str | None, data: Path | Non
 
 def slice_of(text: str) -> dict[str, int]:
     """'START:STOP:STRIDE' as settings; each part may be empty."""
-    parts = text.split(":")
-    if len(parts) > 3 or not all(part.strip().isdigit() for part in parts if part):
-        raise ConfigError(f"--frames {text}: write START:STOP:STRIDE, for example 0:80:4 or ::4")
-    if len(parts) == 1:
-        raise ConfigError(
-            f"--frames {text}: write {text}:{int(text or 0) + 1} for one frame, :{text} for the first {text}"
-        )
-    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part}
+    from semstab.config.selection import slice_of
+
+    try:
+        return slice_of(text)
+    except ConfigError as error:
+        raise ConfigError(f"--frames {text}: {error}") from error
 
 
 def say(text: str) -> None:
     """A line beside the results: on standard error."""
-    typer.echo(text, err=True)
+    typer.echo(told(text), err=True)

@@ -12,6 +12,7 @@ import typer
 
 from semstab.cli.options import (
     Backbones,
+    Classes,
     ConfigFile,
     DataFolder,
     DatasetName,
@@ -71,8 +72,12 @@ def run(
     scheduler: Scheduler = None,
     predict: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[,KEY=VALUE...]", help="Model that makes the labels, nothing on disk; repeatable."),
+        typer.Option(
+            metavar="NAME[,KEY=VALUE...]",
+            help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
+        ),
     ] = None,
+    classes: Classes = None,
     quiet: Quiet = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
@@ -91,7 +96,7 @@ def run(
     content = chosen(named, settings, dataset, data, frames, seed)
     if check in ("none", "off"):
         content["check"] = None
-    resolved = _load(config, content, predict or [])
+    resolved = _load(config, content, predict or [], classes)
     if device is not None:
         resolved = _on_device(resolved, device)
     _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)
@@ -115,12 +120,13 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
+    from semstab.model.results import slug
     from semstab.settings import load_study
 
     config = load_study(file, overrides({"check_geometry": False if trust_geometry else None}, settings or []))
     if only is not None:
         config = config.only(only)
-    _execute(config, out or Path("studies") / config.name, _executor(jobs, scheduler), rerun, report, quiet)
+    _execute(config, out or Path("studies") / slug(config.name), _executor(jobs, scheduler), rerun, report, quiet)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
@@ -130,7 +136,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     from semstab.outputs.recording.target import viewer_command
 
     recording = run / "recording.rrd" if run.is_dir() else run
-    if not recording.exists():
+    if not recording.is_file():
         raise ConfigError(f"{recording}: there is no recording; run again without --rerun off")
     raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
 
@@ -203,16 +209,19 @@ def _executor(jobs: int, scheduler: str | None) -> Executor:
     return cluster
 
 
-def _load(path: Path | None, overrides: dict[str, Any], predict: list[str]) -> Config:
+def _load(path: Path | None, overrides: dict[str, Any], predict: list[str], classes: str | None) -> Config:
     """The configuration; with models whose predictions take the place of the dataset's labels."""
     if not predict:
+        if classes is not None:
+            raise ConfigError("--classes names what a model predicts; say which one with --predict")
         from semstab.settings import load_config
 
         return load_config(path, overrides)
     from semstab.predict.predictor import parse_predictor
     from semstab.settings import predicted_config
 
-    return predicted_config([parse_predictor(text) for text in predict], path, overrides)
+    options = {} if classes is None else {"classes": classes}
+    return predicted_config([parse_predictor(text, options) for text in predict], path, overrides)
 
 
 def _on_device(config: Config, device: str) -> Config:

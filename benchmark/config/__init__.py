@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
@@ -112,7 +112,7 @@ class Config(Settings):
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
     taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
     shared_taxonomy: str | None = Field(None, description="label space in which backbones are compared; null: none")
-    voxel_size: float = Field(0.2, gt=0, allow_inf_nan=False, description="edge of a voxel, metres")
+    voxel_size: float = Field(0.2, ge=1e-9, le=1e9, description="edge of a voxel, metres")
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
     frames: FrameSelection = FrameSelection()
     scene_frames: dict[str, FrameSelection] = Field(
@@ -129,15 +129,42 @@ class Config(Settings):
         description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
         " other; keeps every observation, fuses the ground truth too",
     )
+    critical_classes: list[str] = Field(
+        default_factory=list,
+        description="classes that the verdict depends on; all that have enough places where none is named",
+    )
     threads: int | None = Field(
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
     )
     memory_gb: float | None = Field(
-        None, gt=0, exclude=True, description="memory that maps may take, GB; what is free where not given; not kept"
+        None,
+        gt=0,
+        le=1e9,
+        exclude=True,
+        description="memory that maps may take, GB; what is free where not given; not kept",
     )
     check_geometry: bool = Field(
         True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
     )
+
+    if not TYPE_CHECKING:
+
+        def __init__(self, **settings):
+            """Raises ConfigError in one line, as `build` does."""
+            try:
+                super().__init__(**settings)
+            except ValidationError as error:
+                raise ConfigError(explain(error, type(self))) from error
+
+    @field_validator("dataset", mode="before")
+    @classmethod
+    def _a_name_is_a_dataset(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @field_validator("scenes", "backbones", mode="before")
+    @classmethod
+    def _one_is_a_list(cls, value: Any) -> Any:
+        return [value] if isinstance(value, str) else value
 
     @model_validator(mode="before")
     @classmethod
@@ -157,8 +184,8 @@ class Config(Settings):
     @field_validator("backends", mode="before")
     @classmethod
     def _names_are_backends(cls, value: Any) -> Any:
-        if not isinstance(value, list):
-            return value
+        if not isinstance(value, list | tuple):
+            return value if not isinstance(value, str) else [{"name": value}]
         return [{"name": item} if isinstance(item, str) else item for item in value]
 
     @field_validator("backends")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -14,6 +15,23 @@ from semstab.errors import ConfigError
 
 Indices = list[int]
 """Frames of a sequence, counted from 0, in ascending order."""
+
+
+def slice_of(text: str) -> dict[str, int]:
+    """'START:STOP:STRIDE' as settings; each part may be empty. Raises ConfigError for anything else."""
+    parts = text.split(":")
+    if len(parts) > 3 or not all(re.fullmatch(r"\s*[0-9]{0,18}\s*", part) for part in parts):
+        raise ConfigError(f"write START:STOP:STRIDE, for example 0:80:4 or ::4, not {text}")
+    if len(parts) == 1:
+        raise ConfigError(f"write {text}:{int(text or 0) + 1} for one frame, :{text} for the first {text}")
+    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part.strip()}
+
+
+def in_full(selection: Any) -> Any:
+    """A selection of frames as settings, where it is 'START:STOP:STRIDE' or a bare list of frames."""
+    if isinstance(selection, str | int):
+        return slice_of(str(selection))
+    return {"list": selection} if isinstance(selection, Sequence) else selection
 
 
 class FrameSelection(Settings):
@@ -34,6 +52,12 @@ class FrameSelection(Settings):
     )
     from_time: float | None = Field(None, allow_inf_nan=False, description="seconds on the scene's own clock")
     to_time: float | None = Field(None, allow_inf_nan=False, description="seconds on the scene's own clock, included")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_slice_or_a_list(cls, content: Any) -> Any:
+        """'START:STOP:STRIDE' and a bare list of frames are settings, too."""
+        return in_full(content)
 
     @model_validator(mode="after")
     def _one_way_to_say_it(self) -> Self:

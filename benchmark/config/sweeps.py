@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from semstab.config.settings import Settings
 
-Deviation = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Deviation = Annotated[float, Field(ge=0, le=1e9)]
 
 
 class Part(Settings):
@@ -39,7 +39,7 @@ class Values(Part):
 class Lengths(Values):
     """Values in metres."""
 
-    values: list[Annotated[float, Field(gt=0, allow_inf_nan=False)]] = Field(min_length=1)
+    values: list[Annotated[float, Field(ge=1e-9, le=1e9)]] = Field(min_length=1)
 
 
 class Counts(Values):

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.check.views import evenly, reader
 from semstab.config import Config
-from semstab.convert.folder import SCORES_SUFFIX, DepthFormat, DepthFormatError, SceneFolder, depth_format
+from semstab.convert.folder import (
+    SCORES_SUFFIX,
+    DepthFormat,
+    DepthFormatError,
+    SceneFolder,
+    depth_format,
+    folder_name,
+)
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.datasets.files.label_source import LABEL_SPACE_FILE
 from semstab.datasets.views.poses import UP_AXES
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
-from semstab.model.results import slug
 from semstab.runtime.prefetch import prefetch
 from semstab.task import frame_indices, selected
 
@@ -62,7 +70,7 @@ def convert(
     """
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
-        yield convert_scene(dataset.scene(name), config, Path(out) / slug(name), depth_error, progress)
+        yield convert_scene(dataset.scene(name), config, Path(out) / folder_name(name), depth_error, progress)
 
 
 def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Progress) -> Converted:
@@ -81,13 +89,15 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     _require_places(scene, backbones)
     work = _Work(scene, indices, backbones, folder, progress)
     up = _up_axis(scene)
-    said = {"pose_convention": "camera_to_world", "camera_axes": "opencv"} | ({"up_axis": up} if up else {})
-    folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
-    try:
-        written = work.write()
-    except DepthFormatError:
-        folder.begin(DepthFormat(None), said)
-        written = work.write()
+    said: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
+    said |= ({"up_axis": up} if up else {}) | _georeference(scene)
+    with contextlib.closing(folder):
+        folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
+        try:
+            written = work.write()
+        except DepthFormatError:
+            folder.begin(DepthFormat(None), said)
+            written = work.write()
     return Converted(
         scene=scene.name,
         folder=path,
@@ -173,14 +183,20 @@ class _Work:
 
 def _require_places(scene: Scene, backbones: Sequence[str]) -> None:
     """Each label source needs a folder of its own."""
-    slugs = [slug(name) for name in backbones]
-    if repeated := [name for name in backbones if slugs.count(slug(name)) > 1]:
+    folders = [folder_name(name) for name in backbones]
+    if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
         raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
 
 
 def _name(index: int) -> str:
     """The name of a frame's files: frames keep their order, and their number where all are converted."""
     return f"{index:06d}"
+
+
+def _georeference(scene: Scene) -> dict[str, Any]:
+    """The settings that say where the scene lies on Earth, where that is known."""
+    known = scene.georeference
+    return {} if known is None else {"crs": known.crs, "offset": list(known.offset)}
 
 
 def _up_axis(scene: Scene) -> str | None:

@@ -14,7 +14,7 @@ from semstab.convert import Converted
 @contextmanager
 def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     """Frames written of one label source; to be called with what, how many are done, of how many."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
     with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
         work = bar.add_task("starting", total=None)
         yield lambda what, done, total: bar.update(work, description=what, completed=done, total=total)

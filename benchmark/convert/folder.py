@@ -20,7 +20,16 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.results import slug
-from semstab.runtime.files import atomic_path, content_key, read_json, write_json, write_png, write_text
+from semstab.runtime.files import (
+    FolderLock,
+    atomic_path,
+    content_key,
+    read_json,
+    remove_leftovers,
+    write_json,
+    write_png,
+    write_text,
+)
 
 SCHEMA = 1
 """Version of conversion.json."""
@@ -30,6 +39,8 @@ SCORES_SUFFIX = "-scores"
 """What posed_folder adds to the name of a folder of scores."""
 
 MAX_UINT16 = 65535
+LONGEST_NAME = 200
+"""Bytes of a folder's name."""
 
 
 @dataclass(frozen=True)
@@ -97,19 +108,29 @@ class SceneFolder:
         self._key = content_key(self._settings)
         self.form = self._claim()
         self._intrinsics: Intrinsics | None = None
+        self._lock: FolderLock | None = None
 
     def begin(self, form: DepthFormat, scene_settings: Mapping[str, Any]) -> None:
         """Say how depth is stored, in scene.yaml and for a later start; depth of another format is removed."""
         if self.form is not None and self.form != form:
             for file in (self.path / "depth").glob(f"*{self.form.suffix}"):
                 file.unlink()
+        if self._lock is None:
+            self._lock = FolderLock(self.path)
+            for folder in self.path.glob("**/"):
+                remove_leftovers(folder)
         self.form = form
         said = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
-        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
         write_json(
             self.path / CONVERSION_FILE,
             {"schema": SCHEMA, "key": self._key, "depth_scale": form.scale, "settings": self._settings},
         )
+        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
+
+    def close(self) -> None:
+        """Let another process have it."""
+        if self._lock is not None:
+            self._lock.release()
 
     @property
     def frames(self) -> set[str]:
@@ -169,7 +190,7 @@ class SceneFolder:
 
     def read_as(self, backbone: str) -> str:
         """The name under which the backbone is found in the folder."""
-        return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else slug(backbone)
+        return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else folder_name(backbone)
 
     def _depth_path(self, name: str, form: DepthFormat) -> Path:
         return self.path / "depth" / f"{name}{form.suffix}"
@@ -177,7 +198,7 @@ class SceneFolder:
     def _label_path(self, name: str, backbone: str, soft: bool) -> Path:
         if soft:
             return self.path / "scores" / _bare(backbone) / f"{name}.npz"
-        return self.path / "labels" / slug(backbone) / f"{name}.png"
+        return self.path / "labels" / folder_name(backbone) / f"{name}.png"
 
     def _require_same_camera(self, frame: Frame) -> None:
         """One intrinsics.txt serves all frames."""
@@ -195,7 +216,7 @@ class SceneFolder:
         """How an earlier start stored depth; None where there was none."""
         manifest = self.path / CONVERSION_FILE
         if not manifest.is_file():
-            if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            if self.path.exists() and (not self.path.is_dir() or any(self.path.glob("[!.]*"))):
                 raise ConfigError(f"{self.path}: is there already and holds no conversion; choose another --out")
             return None
         there = read_json(manifest)
@@ -208,6 +229,12 @@ class SceneFolder:
         return DepthFormat(there["depth_scale"])
 
 
+def folder_name(name: str) -> str:
+    """The name itself where a folder can be called so, or else its `slug`."""
+    fits = name.isprintable() and len(name.encode()) <= LONGEST_NAME and not set(name) & set("/\\")
+    return name if fits and name[:1] not in ("", ".", "-") else slug(name)
+
+
 def matrix_text(matrix: npt.NDArray[np.float64]) -> str:
     """A matrix as text, one row a line, that reads back to the same numbers."""
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix)
@@ -215,4 +242,4 @@ def matrix_text(matrix: npt.NDArray[np.float64]) -> str:
 
 def _bare(backbone: str) -> str:
     """The folder below scores/: posed_folder adds the suffix to its name."""
-    return slug(backbone.removesuffix(SCORES_SUFFIX))
+    return folder_name(backbone.removesuffix(SCORES_SUFFIX))

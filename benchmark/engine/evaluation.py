@@ -9,7 +9,7 @@ from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import Analysis, BackboneComparison, analyse, compare_backbones
+from semstab.statistics import Analysis, BackboneComparison, Sample, analyse, compare_backbones
 from semstab.task import Task
 
 
@@ -25,10 +25,18 @@ def truth_task(task: Task) -> Task | None:
 
 
 def analyse_map(
-    task: Task, config: Config, table: VoxelTable, events: Events | None = None, truth: VoxelTable | None = None
+    task: Task,
+    config: Config,
+    table: VoxelTable,
+    events: Events | None = None,
+    truth: VoxelTable | None = None,
+    sample: Sample | None = None,
 ) -> Analysis:
     """What the statistics say of one map; `truth` is what is right, and how far geometry lets labels agree."""
-    return analyse(table, events, truth, limit=truth, name=task.backbone, edges=config.strata)
+    critical = config.critical_classes
+    return analyse(
+        table, events, truth, limit=truth, sample=sample, name=task.backbone, edges=config.strata, critical=critical
+    )
 
 
 def comparison(

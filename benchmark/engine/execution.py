@@ -17,7 +17,7 @@ from semstab.check import Verdict, quick_check, refuse_unsound
 from semstab.config import BACKENDS, BASE, Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.evaluation import comparison
-from semstab.engine.folder import Folder
+from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
@@ -26,7 +26,7 @@ from semstab.engine.work.jobs import Job, Request, split
 from semstab.engine.work.passes import lend
 from semstab.errors import DataError
 from semstab.metrics import compare
-from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, UnitContent
+from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
 from semstab.model.results import Agreement
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
@@ -87,6 +87,7 @@ def _execute(
     started, told = time.perf_counter(), Observers(observers)
     config = resolve(config)
     plan = make_plan(config)
+    require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
         found = _compute(plan, folder, executor, told)
@@ -162,7 +163,7 @@ def _work_off(
 ) -> None:
     """What is missing, kept as it finishes."""
     units = {each.identity: each for each in missing}
-    factories = told.elsewhere(folder.path) if executor.elsewhere else ()
+    factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
     jobs = split(_jobs(plan.config, folder.path, start, missing, factories), executor.width)
     with contextlib.closing(executor.run(jobs, told)) as finished:
         for outcome in (outcome for _, outcomes in finished for outcome in outcomes):
@@ -230,7 +231,7 @@ def _jobs(
 def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
     contents, errors = found.contents, found.errors
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
-    tables = _Tables(records)
+    tables = Tables(most=len({record.unit.backend for record in records}))
     with found.watch("agreement"):
         agreement = tuple(_agreement(plan.config, records, tables))
     with found.watch("comparisons"):
@@ -247,28 +248,12 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
         agreement=agreement,
         comparisons=comparisons,
         up=_up_axes(plan.units, contents),
+        georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(_regions(plan, contents)),
     )
 
 
-class _Tables:
-    """Voxel tables of records, the last few of them at hand: those of one scene and backbone are asked for together."""
-
-    def __init__(self, records: Sequence[Record]) -> None:
-        self._most = len({record.unit.backend for record in records})
-        self._loaded: dict[str, VoxelTable] = {}
-
-    def of(self, record: Record) -> VoxelTable:
-        """The record's table."""
-        slug = record.unit.slug
-        if slug not in self._loaded:
-            while len(self._loaded) >= self._most:
-                self._loaded.pop(next(iter(self._loaded)))
-            self._loaded[slug] = record.table()
-        return self._loaded[slug]
-
-
-def _agreement(config: Config, records: Sequence[Record], tables: _Tables) -> Iterator[Agreement]:
+def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
     """Of each pair of backends that must agree, on each scene and backbone that both fused."""
     checked = {backend.name for backend in config.fused_by() if _must_agree(backend.name, backend.check)}
     groups: dict[tuple[str, str], list[Record]] = {}
@@ -284,7 +269,7 @@ def _must_agree(name: str, check: bool | None) -> bool:
     return getattr(REGISTRY.load(name), "pointwise", True) if check is None else check
 
 
-def _comparisons(config: Config, records: Sequence[Record], tables: _Tables) -> Iterator[BackboneComparison]:
+def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
     """The base units of each scene beside each other; accuracy where there is ground truth."""
     base = [record for record in records if record.variation.sweep == BASE]
     for scene in dict.fromkeys(record.unit.scene for record in base):

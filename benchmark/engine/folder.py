@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import hashlib
 import logging
 import os
+import shutil
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from semstab.model.records import (
     EVENTS,
     FRAMES,
     OVERVIEW,
+    RECORDING_PARTS,
     TRUTH,
     UNITS,
     VOXELS,
@@ -33,7 +34,15 @@ from semstab.model.records import (
     UnitContent,
 )
 from semstab.model.results import SCHEMA, Unit, slug
-from semstab.runtime.files import atomic_path, read_json, write_json, write_text
+from semstab.runtime.files import (
+    TEMPORARY,
+    FolderLock,
+    atomic_path,
+    read_json,
+    remove_leftovers,
+    write_json,
+    write_text,
+)
 from semstab.runtime.json_form import from_json, to_json
 
 logger = logging.getLogger("semstab")
@@ -43,11 +52,23 @@ LAYOUT = "# semstab, folder layout 2"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-LEFTOVERS = (
-    ".shared-*", ".config-*.yaml", ".summary-*.json", ".manifest-*.json",
-    *(f"{folder}/.*" for folder in (UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW, "tables", "figures")),
-)  # fmt: skip
-"""What a start that was killed may have left half-written."""
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW, "tables", "figures")
+"""Folders into which files are written."""
+
+
+def require_file_names(out: Path, units: Iterable[Unit]) -> None:
+    """Raise ConfigError where two units' files would have one name, or one that the file system does not take."""
+    there = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
+    longest = os.pathconf(there, "PC_NAME_MAX") - len(".parquet")
+    named: dict[str, Unit] = {}
+    for unit in units:
+        other = named.setdefault(unit.slug, unit)
+        if other != unit:
+            raise ConfigError(
+                f"{other} and {unit} would be written to one file, {unit.slug}; rename a scene or backbone"
+            )
+        if len(os.fsencode(unit.slug)) > longest:
+            raise ConfigError(f"{there}: its file system takes no name as long as {unit.slug}; choose another --out")
 
 
 class Folder:
@@ -60,8 +81,8 @@ class Folder:
     def __init__(self, path: str | Path, config: Config) -> None:
         self.path = Path(path).absolute()
         earlier = _claimed(self.path)
-        (self.path / UNITS).mkdir(parents=True, exist_ok=True)
-        self._lock: int | None = _locked(self.path)
+        self._lock = FolderLock(self.path)
+        (self.path / UNITS).mkdir(exist_ok=True)
         if earlier is not None and (change := _first_change(earlier, yaml.safe_load(config.to_yaml()))):
             logger.warning("%s: earlier results of other settings (%s) are replaced", path, change)
         write_text(self.path / SETTINGS, f"{LAYOUT}\n{config.to_yaml()}")
@@ -69,9 +90,7 @@ class Folder:
 
     def close(self) -> None:
         """Let another process have it."""
-        if self._lock is not None:
-            os.close(self._lock)
-        self._lock = None
+        self._lock.release()
 
     def kept(self, planned: Planned) -> UnitContent | None:
         """What an earlier start left of a unit, if its input is the same and nothing that is wanted is missing.
@@ -127,8 +146,9 @@ class Folder:
     def started(self) -> Iterator[str]:
         """A name for this start, by which workers know the folder while the block lasts."""
         start = uuid.uuid4().hex
-        for leftover in (name for pattern in LEFTOVERS for name in self.path.glob(pattern)):
-            leftover.unlink()
+        for name in WRITTEN:
+            remove_leftovers(self.path / name)
+        shutil.rmtree(self.path / RECORDING_PARTS, ignore_errors=True)
         (self.path / FAILURES).unlink(missing_ok=True)
         marker = shared_marker(self.path, start)
         marker.touch()
@@ -215,8 +235,8 @@ def _claimed(path: Path) -> dict[str, Any] | None:
         raise ConfigError(f"{path}: holds results of an earlier version of semstab; choose another folder")
     if settings.exists():
         return read_yaml(settings)
-    beginnings = {UNITS} | {file.name for pattern in LEFTOVERS[:2] for file in path.glob(pattern)}
-    if any(entry.name not in beginnings for entry in path.iterdir()) or any(path.glob(f"{UNITS}/*")):
+    entries = [*path.iterdir(), *path.glob(f"{UNITS}/*")]
+    if any(entry.name != UNITS and not entry.name.startswith(TEMPORARY) for entry in entries):  # a birth's beginnings
         raise ConfigError(f"{path}: is not empty and holds no run or study; choose another folder")
     return None
 
@@ -224,17 +244,6 @@ def _claimed(path: Path) -> dict[str, Any] | None:
 def _first_line(path: Path) -> str:
     with path.open(encoding="utf-8", errors="replace") as lines:
         return lines.readline(200).rstrip("\n")
-
-
-def _locked(path: Path) -> int:
-    """A lock on the folder, which ends with this process."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(handle)
-        raise ConfigError(f"{path}: another process works on it; wait for it, or choose another folder") from error
-    return handle
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:

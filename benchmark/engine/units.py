@@ -30,10 +30,10 @@ from semstab.model.records import REGIONS, Variation
 from semstab.model.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
 
-FORMAT = 2
+FORMAT = 3
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
-IN_KEYS = ("voxel_size", "pixel_stride", "exclude", "perturbation", "strata", "statistics")
+IN_KEYS = ("voxel_size", "pixel_stride", "exclude", "perturbation", "strata", "statistics", "critical_classes")
 """Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
 the input, frames, classes, the backend."""
 
@@ -205,8 +205,17 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
             fused = [backbone for backbone in scene.backbones if backbone not in config.region_maps]
         settings = _base_settings(config, name, fused)
         for task in tasks_of(scene, settings):
+            _check_classes(config.critical_classes, task)
             one = settings.model_copy(update={"backbones": [task.backbone]})
             yield PlannedUnit(Variation(BASE), one, task, identity(one, task), image_space=True, kept=True)
+
+
+def _check_classes(critical: Sequence[str], task: Task) -> None:
+    """Raise ConfigError for a critical class that the unit's taxonomy has not."""
+    space = task.mapping.target
+    for name in critical:
+        if name not in space.classes:
+            raise ConfigError(f"critical_classes: '{name}' is no class of {space.name}: {', '.join(space.classes)}")
 
 
 def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedRegions]:
@@ -214,7 +223,7 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Pl
         for backbone in selected(config.region_maps, scene.backbones, scene.regions, "region map", name):
             settings = _base_settings(config, name, [backbone])
             unit, frames = [name, backbone], frame_indices(scene, settings, [backbone])
-            fused_only = {"voxel_size", "strata", "statistics"}
+            fused_only = {"voxel_size", "strata", "statistics", "critical_classes"}
             key = _hash(settings, {"regions": unit, "frames": frames}, fused_only)
             yield PlannedRegions(settings, scene, backbone, key)
 

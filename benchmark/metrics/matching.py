@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from functools import reduce
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,9 +43,40 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
     Raises DataError where the tables differ in K or voxel size.
     """
     require_same_grid(*tables)
+    first = tables[0].index
+    if all(np.array_equal(first, other.index) for other in tables[1:]):
+        return [np.arange(len(first)) for _ in tables]
     keys = voxel_keys(*(table.index for table in tables))
     common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
     return [np.searchsorted(own, common).astype(np.int64) for own in keys]
+
+
+def shared_observations(*logs: Events) -> list[Events]:
+    """The observations (voxel, frame) that all logs have, of each log, in the same order.
+
+    Raises DataError where the logs differ in K or voxel size.
+    """
+    require_same_grid(*logs)
+    index = [np.stack([log.ix, log.iy, log.iz], axis=1) for log in logs]
+    frames = 1 + max((int(log.frame.max()) for log in logs if len(log)), default=0)
+    keys = [key[log.voxel] * frames + log.frame for key, log in zip(_dense(index), logs, strict=True)]
+    common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
+    return [observations(log, np.flatnonzero(np.isin(own, common))) for log, own in zip(logs, keys, strict=True)]
+
+
+def observations(log: Events, rows: Int64) -> Events:
+    """These rows of a log, ascending, with the voxels that they are of."""
+    voxels, of = np.unique(log.voxel[rows], return_inverse=True)
+    own: dict[str, Any] = {name: getattr(log, name)[voxels] for name in ("ix", "iy", "iz")}
+    own |= {"frame": log.frame[rows], "evidence": log.evidence.take(rows), "pixels": log.pixels[rows]}
+    return dataclasses.replace(log, **own, voxel=of)
+
+
+def _dense(indices: Sequence[npt.NDArray[np.integer]]) -> list[Int64]:
+    """A number for each voxel of the index arrays (n, 3), the same in all, from 0 on without gaps."""
+    keys = voxel_keys(*indices)
+    distinct = np.unique(np.concatenate(keys))
+    return [np.searchsorted(distinct, key) for key in keys]
 
 
 def rows_of(table: VoxelTable, where: npt.NDArray[np.bool_]) -> VoxelTable:
@@ -50,7 +84,7 @@ def rows_of(table: VoxelTable, where: npt.NDArray[np.bool_]) -> VoxelTable:
     return table.rows(where)
 
 
-def require_same_grid(*tables: VoxelTable) -> None:
+def require_same_grid(*tables: VoxelTable | Events) -> None:
     """Raise DataError where tables differ in K or voxel size."""
     first, *others = tables
     for other in others:

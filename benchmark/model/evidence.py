@@ -71,6 +71,11 @@ class Evidence(NDArrayOperatorsMixin):
         return len(self), self.K
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of its entries."""
+        return self.starts.nbytes + self.label.nbytes + self.weight.nbytes
+
+    @property
     def entries(self) -> tuple[Int64, npt.NDArray[np.uint16], Float64]:
         """starts, label and weight, as compiled loops take them."""
         return self.starts, self.label, self.weight

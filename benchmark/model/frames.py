@@ -16,6 +16,12 @@ from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 
 RIGID_TOLERANCE = 1e-3
 
+LOOKED_AT = 2**12
+"""Pixels of a depth map, about, that are looked at for its unit; of one as large some must be finite."""
+
+FAR, DISTINCT = 100.0, 8
+"""Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -39,6 +45,8 @@ class Intrinsics:
         K = np.asarray(K, dtype=np.float64)
         if K.shape not in ((3, 3), (4, 4)):
             raise DataError(f"intrinsics: expected a 3x3 matrix, got shape {K.shape}")
+        if np.abs(K[2] - [0, 0, 1, 0][: len(K)]).max() > 1e-9:
+            raise DataError(f"intrinsics: the third row is {K[2].tolist()}, not 0 0 1; is the matrix transposed?")
         if abs(K[0, 1]) > 1e-9 * abs(K[0, 0]):
             raise DataError(f"intrinsics: skew {K[0, 1]:g} is not supported; undistort the images")
         return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
@@ -64,9 +72,9 @@ class Frame:
 
     index       number in the sequence
     depth       (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid
-    intrinsics  of the depth image
+    intrinsics  of the depth image; or its 3x3 camera matrix
     T_wc        (4, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV)
-    labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; or
+    labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one; or
     scores      (H, W, K) float, non-negative; normalised per pixel where they are used
     color       (H, W, 3) uint8 RGB, optional
     mask        (H, W) bool, True where a thing moves that is not to be fused, optional; see `semstab.pixels.exclusion`
@@ -91,6 +99,7 @@ class Frame:
 
     def __post_init__(self) -> None:
         self._set("depth", self._checked_depth())
+        object.__setattr__(self, "intrinsics", _intrinsics(self.intrinsics, self.where("intrinsics")))
         self._set("T_wc", self._checked_pose())
         if (self.labels is None) == (self.scores is None):
             raise DataError(f"{self.where('labels')}: give labels or scores, one of the two")
@@ -183,6 +192,15 @@ class Frame:
             raise DataError(
                 f"{self.where('depth')}: depth is {depth.dtype}; convert it to metres (float32) with its depth scale"
             )
+        step = max(1, int(np.sqrt(depth.size / LOOKED_AT)))
+        some = depth[::step, ::step]
+        if depth.size >= LOOKED_AT and not np.isfinite(some).any() and not np.isfinite(depth).any():
+            raise DataError(f"{self.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
+        if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
+            raise DataError(
+                f"{self.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
+                " divide it by 1000, or set depth_scale"
+            )
         return depth.astype(np.float32, copy=False)
 
     def _checked_pose(self) -> npt.NDArray[np.float64]:
@@ -211,16 +229,26 @@ class Frame:
 
     def _checked_labels(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if labels.dtype not in (np.uint8, np.uint16):
-            raise DataError(
-                f"{self.where('labels')}: labels are {labels.dtype}; use uint8 or uint16 (ignore 255 or 65535)"
-            )
+            labels = self._narrowed(labels)
         self._same_size("labels", labels.shape)
         return labels
+
+    def _narrowed(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Integers of another type as uint8, or as uint16 where there is one above 255."""
+        where = self.where("labels")
+        if not (np.issubdtype(labels.dtype, np.integer) or labels.dtype == np.bool_):
+            raise DataError(f"{where}: labels are {labels.dtype}; use uint8 or uint16 (ignore 255 or 65535)")
+        low, high = int(labels.min(initial=0)), int(labels.max(initial=0))
+        if low < 0 or high > IGNORE_16BIT:
+            raise DataError(f"{where}: labels go from {low} to {high}; write 255 (65535 of uint16) where there is none")
+        return labels.astype(np.uint8 if high <= IGNORE_8BIT else np.uint16)
 
     def _checked_scores(self, scores: npt.NDArray[Any]) -> npt.NDArray[Any]:
         where = self.where("scores")
         if scores.ndim != 3 or not np.issubdtype(scores.dtype, np.floating):
             raise DataError(f"{where}: scores must be float (H, W, K), got {scores.dtype} of shape {scores.shape}")
+        if scores.shape[:2] != self.shape and scores.shape[1:] == self.shape:
+            raise DataError(f"{where}: scores are (K, H, W) = {scores.shape}; turn them by np.moveaxis(scores, 0, -1)")
         self._same_size("scores", scores.shape[:2])
         if scores.shape[2] < 2:
             raise DataError(f"{where}: scores hold {scores.shape[2]} class; at least 2 are needed")
@@ -240,6 +268,24 @@ class Frame:
         if shape != (H, W):
             size = "x".join(str(n) for n in shape[::-1])
             raise DataError(f"{self.where(name)}: {name} are {size} but depth is {W}x{H}; bring them to one size")
+
+
+def _intrinsics(given: Any, where: str) -> Intrinsics:
+    """Intrinsics, or a camera matrix as such."""
+    if isinstance(given, Intrinsics):
+        return given
+    try:
+        return Intrinsics.from_matrix(given)
+    except (TypeError, ValueError) as error:
+        reason = error if isinstance(error, DataError) else "not a 3x3 matrix"
+        raise DataError(f"{where}: {reason}; give Intrinsics(fx, fy, cx, cy) or a camera matrix") from error
+
+
+def _whole_millimetres(depth: npt.NDArray[Any]) -> bool:
+    """Whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
+    if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
+        return False
+    return len(np.unique(depth)) >= DISTINCT
 
 
 def _in_line(matrix: npt.NDArray[np.float64]) -> str:

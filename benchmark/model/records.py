@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semstab.config import BACKENDS, BASE
+from semstab.config import BACKENDS, BASE, nearest
+from semstab.errors import ConfigError
 from semstab.model.comparison import BackboneComparison
+from semstab.model.georeference import Georeference
 from semstab.model.results import Agreement, Unit, UnitSummary
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
@@ -20,6 +22,9 @@ UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "ev
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
 where the dataset has it, color (H, W, 3)."""
+
+RECORDING_PARTS = "recording"
+"""Folder of a recording that several processes write, until it is one file."""
 
 REGIONS = "region_maps"
 """Not a sweep: the label sources that hold regions without classes."""
@@ -110,6 +115,23 @@ class Record:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
 
 
+class Tables:
+    """Voxel tables of records, the last few of them at hand: those that belong together are asked for together."""
+
+    def __init__(self, most: int = 1) -> None:
+        self._most = most
+        self._loaded: dict[str, VoxelTable] = {}
+
+    def of(self, record: Record) -> VoxelTable:
+        """The record's table."""
+        slug = record.unit.slug
+        if slug not in self._loaded:
+            while len(self._loaded) >= self._most:
+                self._loaded.pop(next(iter(self._loaded)))
+            self._loaded[slug] = record.table()
+        return self._loaded[slug]
+
+
 @dataclass(frozen=True)
 class RegionFlicker:
     """Flicker of a label source that holds regions without classes, by matched regions; it is not fused.
@@ -160,6 +182,7 @@ class Result:
     records    in the order of the plan
     agreement  of each pair of backends that must agree, on each scene and backbone that both fused
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
+    georeference  by scene, where it lies on Earth, where that is known
     regions    flicker of the label sources that are regions without classes
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
@@ -170,6 +193,7 @@ class Result:
     failures: tuple[Failure, ...] = ()
     agreement: tuple[Agreement, ...] = ()
     up: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    georeference: Mapping[str, Georeference] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
     comparisons: tuple[BackboneComparison, ...] = ()
@@ -185,6 +209,27 @@ class Result:
             and scene in (None, record.unit.scene)
             and backbone in (None, record.unit.backbone)
             and value in (None, record.variation.value)
+        )
+
+    def record(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Record:
+        """The one record at the base settings of that scene, backbone and backend, the base backend where not given.
+
+        Raises ConfigError where there is none, or several, with what there is.
+        """
+        kept = (*self.select(), *self.select(BACKENDS))
+        asked = {"scene": scene, "backbone": backbone, "backend": backend or self.backend}
+        for what, name in asked.items():
+            there = list(dict.fromkeys(getattr(record.unit, what) for record in kept))
+            if name is not None and name not in there:
+                raise ConfigError(f"{self.name}: no {what} '{name}'; {nearest(name, there)}")
+        found = [
+            record for record in kept if all(name in (None, getattr(record.unit, what)) for what, name in asked.items())
+        ]
+        if len(found) == 1:
+            return found[0]
+        units = ", ".join(f"{record.unit.scene} of {record.unit.backbone}" for record in found[:4])
+        raise ConfigError(
+            f"{self.name}: {len(found)} units fit" + (f" ({units}); choose with scene and backbone" if found else "")
         )
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections.abc import Mapping
@@ -17,6 +18,9 @@ SCHEMA = 2
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
 """Where a frame's time goes: decoding in a worker thread, beside the rest; waiting for it; flicker; the two parts of
 fusion, where the backend tells them apart; telling the observers."""
+
+LONGEST_NAME = 60
+"""Bytes of a name in a file's name: with three of them, and what is put around them, it has fewer than 255."""
 
 RECURRENT = 3
 """A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
@@ -37,8 +41,25 @@ class Unit:
 
 
 def slug(*names: str) -> str:
-    """Names joined to a file name: what is not a letter, digit, '.', '_' or '-' becomes '-'."""
-    return "__".join(re.sub(r"[^\w.-]+", "-", name) for name in names)
+    """Names joined to a file name: other names give another one.
+
+    A name stays as it is where it consists of letters, digits, '.', '_' and '-', begins with none of '.', '_', does not
+    end with '_', holds no '__' and is at most LONGEST_NAME bytes long. Else what does not fit becomes '-', what is too
+    long is cut, and a digest of the name follows.
+
+    >>> slug("scene-1", "a b"), slug("scene-1", "a-b")
+    ('scene-1__a-b~8b9dcb43cd', 'scene-1__a-b')
+    """
+    return "__".join(map(_slug, names))
+
+
+def _slug(name: str) -> str:
+    readable = re.sub(r"[^\w.-]+|_{2,}|^[._]+|_$", "-", name)
+    encoded = readable.encode()
+    if readable == name and 0 < len(encoded) <= LONGEST_NAME:
+        return name
+    digest = hashlib.blake2b(name.encode(errors="surrogatepass"), digest_size=5).hexdigest()
+    return f"{encoded[: LONGEST_NAME - 11].decode(errors='ignore')}~{digest}"
 
 
 @dataclass(frozen=True)
@@ -127,8 +148,9 @@ class UnitSummary:
     """One entry of 'runs' in summary.json.
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose; statistics is
-    what `semstab.statistics.describe` says of the map, None where nothing was asked for.
+    fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
+    the fused ones of which no pixel was valid; statistics is what `semstab.statistics.describe` says of the map, None
+    where nothing was asked for.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -140,6 +162,7 @@ class UnitSummary:
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     left_out: int = 0
     frames_left_out: int = 0
+    frames_empty: int = 0
     statistics: MapStatistics | None = None
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from semstab.model.measures import Measure, MeasureMeans
 from semstab.runtime.json_form import INLINE
@@ -29,6 +30,37 @@ class Estimate:
 
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)
+
+Question = Literal["this map", "the next flight"]
+THIS_MAP: Question = "this map"
+NEXT_FLIGHT: Question = "the next flight"
+
+
+@dataclass(frozen=True)
+class Interval(Estimate):
+    """A value with its interval, and what that answers.
+
+    question    'this map': other places like these, in these very frames; 'the next flight': other frames, too
+    frames      that were sampled, about; 0 where they are not known
+    places      cubes of space that hold something that counts
+    block_size  edge of the blocks in which errors may depend on each other, metres
+    degrees     of freedom of the standard error
+    undecided   why nothing may be claimed, and what to fly; empty where something may
+    p_value     of a difference: that there is none
+    """
+
+    question: Question = THIS_MAP
+    frames: int = 0
+    places: int = 0
+    block_size: float = math.nan
+    degrees: float = math.nan
+    undecided: str = ""
+    p_value: float = math.nan
+
+    @property
+    def decided(self) -> bool:
+        """Whether something may be claimed."""
+        return not self.undecided
 
 
 @dataclass(frozen=True)
@@ -70,13 +102,61 @@ class ClassAgreement:
 
 @dataclass(frozen=True)
 class FrameAgreement:
-    """Do frames agree about a place? Over the voxels with OP >= 2."""
+    """Do frames agree about a place? Over the voxels with OP >= 2.
+
+    within, between  the parts of 1 - PSA that are there within a frame, and between frames
+    alpha_between    alpha of the evidence of frames: forgives what is within one
+    each_place       the same with each voxel counting once, however often it was seen: weights that flights share
+    """
 
     psa: Estimate
     kappa: Estimate
     alpha: Estimate
     vss: Estimate
+    within: Estimate
+    between: Estimate
+    alpha_between: Estimate
+    each_place: Estimate
     classes: tuple[ClassAgreement, ...]
+
+
+@dataclass(frozen=True)
+class ClassReach:
+    """`Reach` of one class against all others.
+
+    places   the evidence for it in the whole map's voxels with OP >= 2, in voxels
+    matters  whether the verdict depends on it
+    """
+
+    name: str
+    places: float
+    matters: bool
+    alpha: float
+    ceiling: float
+    reached: Estimate
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Alpha between frames beside its ceiling, that of labels which do not depend on the view, in sampled voxels.
+
+    by       whose labels those are
+    voxels   sampled ones with OP >= 2
+    reached  alpha / ceiling: what is left to the model, whatever the size of the voxels
+    """
+
+    by: str
+    voxels: int
+    alpha: Estimate
+    ceiling: Estimate
+    reached: Estimate
+    classes: tuple[ClassReach, ...]
+
+    @property
+    def worst(self) -> ClassReach | None:
+        """The class that matters whose frames agree least; one of which nothing is known first."""
+        matter = [row for row in self.classes if row.matters]
+        return min(matter, key=lambda row: (not math.isnan(row.reached.value), row.reached.value), default=None)
 
 
 @dataclass(frozen=True)
@@ -250,6 +330,7 @@ class MapStatistics:
     blocks: BlockCut
     verdict: StabilityVerdict
     agreement: FrameAgreement
+    reach: Reach | None
     drift: DriftStatistics
     uncertainty: EntropyParts
     geometry: Losses | None

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.model.evidence import Evidence, row_chunks
+from semstab.model.evidence import Evidence
 from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.runtime.files import atomic_path
 
@@ -65,12 +65,11 @@ class VoxelTable:
         _freeze_columns(self, _VOXEL_TYPES, self.ix)
         if self.classes and len(self.classes) != self.K:
             raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
-        for some in row_chunks(len(self), 8):
-            x, y, z = (
-                np.diff(column[some.start : some.stop + 1].astype(np.int64)) for column in (self.ix, self.iy, self.iz)
-            )
-            if not ((x > 0) | (x == 0) & ((y > 0) | (y == 0) & (z > 0))).all():
-                raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
+        ascends = self.iz[1:] > self.iz[:-1]
+        for column in (self.iy, self.ix):  # a column decides where those before it are equal
+            ascends = (column[1:] > column[:-1]) | ((column[1:] == column[:-1]) & ascends)
+        if not ascends.all():
+            raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
 
     def __len__(self) -> int:
         return len(self.ix)
@@ -138,6 +137,11 @@ class Events:
 
     def __len__(self) -> int:
         return len(self.voxel)
+
+    @property
+    def K(self) -> int:
+        """Number of classes."""
+        return self.evidence.K
 
     @cached_property
     def starts(self) -> Int64:

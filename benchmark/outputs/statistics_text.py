@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import Estimate, MapStatistics, RuleOutcome
+from semstab.model.statistics import Estimate, MapStatistics, Reach, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -66,6 +66,20 @@ def _agreement(found: MapStatistics) -> list[Row]:
         ("Fleiss' kappa", found.agreement.kappa, ""),
         ("Krippendorff's alpha", found.agreement.alpha, ""),
         ("VSS", found.agreement.vss, ""),
+        ("two looks differ within a frame", found.agreement.within, ""),
+        ("  and between frames", found.agreement.between, ""),
+        ("alpha between frames", found.agreement.alpha_between, ""),
+        ("  each place counting once", found.agreement.each_place, ""),
+        *([] if found.reach is None else _reach(found.reach)),
+    ]
+
+
+def _reach(reach: Reach) -> list[Row]:
+    return [
+        ("alpha b.f., sampled voxels", reach.alpha, ""),
+        ("  its ceiling", reach.ceiling, f"of {reach.by}"),
+        ("  share reached", reach.reached, ""),
+        *((f"  {row.name}"[:34], row.reached, f"{row.places:.0f} places") for row in reach.classes if row.matters),
     ]
 
 

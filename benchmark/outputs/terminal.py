@@ -35,6 +35,9 @@ def print_summary(result: Result, console: Console) -> None:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
             text += f" {run.frames + run.frames_left_out} selected frames were left out: they lack a file or a pose"
             console.print(text, soft_wrap=True, markup=False)
+        if run.frames_empty:
+            text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_empty} of {run.frames} frames hold no pixel"
+            console.print(f"{text} with both depth and a label", soft_wrap=True, markup=False)
     once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
     console.print(
         f"{once:.0%} of the voxels were seen once: they say nothing about stability. "

@@ -52,7 +52,7 @@ def run(
     finally:
         bar.close()
     for report in reports:
-        print_report(report, Console(quiet=quiet))
+        print_report(report, Console(quiet=quiet, markup=False))
     if dataset is not None and out is None and backbone.label_space is not None:
         hint = _next_command(config, dataset, selection)
         Console(quiet=quiet).print(hint, soft_wrap=True, highlight=False, markup=False)

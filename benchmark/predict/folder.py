@@ -17,7 +17,7 @@ from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
-from semstab.runtime.files import atomic_path, content_key, read_json, write_json, write_png
+from semstab.runtime.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png
 
 SCHEMA = 1
 """Version of predictions.json."""
@@ -68,6 +68,7 @@ class PredictionFolder:
         self._frames: dict[str, dict[str, Any]] = self._claim(overwrite)
         self._space = space
         self._saved = -math.inf
+        self._lock: FolderLock | None = None
 
     def has(self, name: str, image: str) -> bool:
         """Whether the map of that frame is there, predicted from an image of that digest."""
@@ -79,6 +80,9 @@ class PredictionFolder:
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
         """Keep a frame's map: ids (H, W), or scores (H, W, K)."""
+        if self._lock is None:
+            self._lock = FolderLock(self.path)
+            self._save()  # before the first map: without it, maps are taken for somebody else's
         if self.kind == "scores":
             with atomic_path(self.file(name)) as temporary:
                 np.savez(temporary, scores=values.transpose(2, 0, 1).astype(self._score_type))
@@ -90,8 +94,16 @@ class PredictionFolder:
 
     def save(self) -> None:
         """Write the classes and the manifest, once there is a map: what is not in the manifest is predicted again."""
-        if not self._frames:
-            return
+        if self._frames:
+            self._save()
+
+    def close(self) -> None:
+        """Save it, and let another process have it."""
+        self.save()
+        if self._lock is not None:
+            self._lock.release()
+
+    def _save(self) -> None:
         if self._space is not None:
             self._space.save(self.path / LABEL_SPACE_FILE)
         write_json(self.path / MANIFEST_FILE, self._content | {"frames": self._frames})

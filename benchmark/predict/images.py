@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.backbones import Backbone, Image, image_digest
 from semstab.datasets.views.resampling import Labels, Scores
+from semstab.errors import ConfigError
 from semstab.model.frames import Frame
-
-Image = npt.NDArray[np.uint8]
 
 
 class ImageSequence(Protocol):
@@ -40,6 +41,57 @@ class ImageSequence(Protocol):
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
         """The frame with what was predicted on its image, at the depth's pixels; None where there is no depth."""
         ...
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame | None:
+        """Depth and pose of the frame at the pixels of its image, of shape (H, W); None where there is no depth."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image of a sequence as a model is shown it.
+
+    geometry  of models that want it, at the image's pixels
+    digest    of all that is shown
+    """
+
+    index: int
+    name: str
+    pixels: Image
+    geometry: tuple[Frame, ...]
+    digest: str
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it keeps in memory."""
+        return self.pixels.nbytes + sum(frame.nbytes for frame in self.geometry)
+
+
+def picture(sequence: ImageSequence, index: int, backbone: Backbone) -> Picture:
+    """What the backbone is shown of an index. Raises DataError that names the file, and as `geometry_of`."""
+    pixels = sequence.image(index)
+    geometry, digest = geometry_of(sequence, index, pixels, backbone), image_digest(pixels)
+    for frame in geometry:
+        seen = hashlib.blake2b(repr((digest, frame.intrinsics)).encode(), digest_size=16)
+        seen.update(np.ascontiguousarray(frame.depth).data)
+        seen.update(np.ascontiguousarray(frame.T_wc).data)
+        digest = seen.hexdigest()
+    return Picture(index, sequence.image_name(index), pixels, geometry, digest)
+
+
+def geometry_of(sequence: ImageSequence, index: int, pixels: Image, backbone: Backbone) -> tuple[Frame, ...]:
+    """Of backbones that want it the frame's depth and pose at the image's pixels; else nothing.
+
+    Raises ConfigError where there is none.
+    """
+    if not backbone.wants_geometry:
+        return ()
+    frame = sequence.view(index, (pixels.shape[0], pixels.shape[1]))
+    if frame is None:
+        raise ConfigError(
+            f"{sequence.name}: the model looks at depth and pose, which single images have not; use --data"
+        )
+    return (frame,)
 
 
 def first_images(sequence: ImageSequence, count: int) -> list[Image]:

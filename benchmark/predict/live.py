@@ -7,20 +7,23 @@ import hashlib
 import json
 import threading
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field, field_validator
 
-from semstab.backbones import Backbone, Prediction
-from semstab.config import DatasetConfig, Settings
+from semstab.backbones import Backbone, Image, Prediction, ask
+from semstab.config import DatasetConfig, FrameSelection, Settings
 from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset, resolved
+from semstab.datasets.selection import select_frames
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
-from semstab.predict.images import first_images
+from semstab.predict.images import first_images, geometry_of
+from semstab.predict.in_order import InOrder, size_of
 from semstab.predict.predictor import PredictorConfig, load_predictor
 from semstab.runtime.registry import Entry
 
@@ -35,6 +38,12 @@ class PredictedOptions(Settings):
 
     dataset: DatasetConfig = Field(description="a dataset with its options")
     backbones: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
+    frames: FrameSelection = Field(
+        FrameSelection(), description="what sequential backbones are shown, in order; those of the run by default"
+    )
+    scene_frames: dict[str, FrameSelection] = Field(
+        default_factory=dict, description="frames of single scenes, instead of `frames`"
+    )
 
     @field_validator("dataset")
     @classmethod
@@ -58,7 +67,8 @@ def source_name(predictor: PredictorConfig) -> str:
 class PredictedDataset(Dataset):
     """The scenes of another dataset with predicted labels; the ground truth stays what it is there.
 
-    Models are loaded when their classes are first asked for, once for all scenes.
+    Models are loaded when their classes are first asked for, once for all scenes. One image is predicted at a time,
+    whoever asks: `lock`.
     """
 
     Options: type[BaseModel] = PredictedOptions
@@ -66,8 +76,10 @@ class PredictedDataset(Dataset):
     def __init__(self, options: PredictedOptions) -> None:
         self._dataset = open_dataset(options.dataset.name, options.dataset.options)
         self._configs = {source_name(predictor): predictor for predictor in options.backbones}
+        self._options = options
         self._loaded: dict[str, Backbone] = {}
-        self._lock = threading.Lock()
+        self._shown_by: dict[str, object] = {}
+        self.lock = threading.RLock()
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -87,20 +99,34 @@ class PredictedDataset(Dataset):
         """The model behind a label source. Raises ConfigError where there is none of that name."""
         if source not in self._configs:
             raise ConfigError(f"backbone '{source}' does not predict here; there is {', '.join(self._configs)}")
-        with self._lock:
+        with self.lock:
             if source not in self._loaded:
                 self._loaded[source] = load_predictor(self._configs[source])
             return self._loaded[source]
 
+    def frames_of(self, scene: Scene) -> list[int]:
+        """What sequential backbones are shown of a scene: the selected frames that have image, depth and pose."""
+        selection = self._options.scene_frames.get(scene.name, self._options.frames)
+        return select_frames(scene, selection, color=True).indices
+
+    def claim(self, source: str, who: object) -> bool:
+        """Whether the model was last shown a sequence by somebody else; from now on it is `who` that shows."""
+        before, self._shown_by[source] = self._shown_by.get(source), who
+        return before is not who
+
 
 class PredictedScene(Scene):
-    """One scene of another dataset, with predicted labels. One image is predicted at a time, whoever asks."""
+    """One scene of another dataset, with predicted labels.
+
+    A sequential backbone is shown the dataset's `frames` of the scene in order, whichever of them is asked for.
+    """
 
     def __init__(self, inner: Scene, dataset: PredictedDataset) -> None:
         self.name = inner.name
         self.backbones = tuple(dataset.predictors)
         self.ground_truth = inner.ground_truth
         self.up = inner.up
+        self.georeference = inner.georeference
         self.folder = inner.folder
         self.settings_file = inner.settings_file
         self.skips_incomplete = inner.skips_incomplete
@@ -110,7 +136,8 @@ class PredictedScene(Scene):
         self._digests: dict[int, bytes] = {}
         self._kept: dict[tuple[str, int], Prediction] = {}
         self._room = KEPT_BYTES
-        self._lock = threading.Lock()
+        self._lock = dataset.lock
+        self._in_order: dict[str, InOrder] = {}
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -144,6 +171,10 @@ class PredictedScene(Scene):
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
         """The frame with what was predicted on its image."""
         return self._inner.predicted(index, labels=labels, scores=scores)
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame:
+        """Depth and pose at the pixels of the colour image, of shape (H, W)."""
+        return self._inner.view(index, shape)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """The frame but for its labels; nothing is predicted for it."""
@@ -179,14 +210,18 @@ class PredictedScene(Scene):
         return dataclasses.replace(frame, color=image if color else None)
 
     def digest(self, indices: list[int], backbone: str) -> str:
-        """A hash of the model, its settings, and the image, depth and pose of those frames."""
+        """A hash of the model, its settings, and the image, depth and pose of those frames.
+
+        A sequential model's is of all frames that it is shown. Raises ConfigError for a frame that is not.
+        """
         if backbone == GROUND_TRUTH:
             return self._inner.digest(indices, backbone)
         with self._lock:
-            identity = self._model(backbone).identity()
-        scores = self._dataset.predictors[backbone].scores
-        digest = hashlib.blake2b(json.dumps([identity, scores], sort_keys=True).encode(), digest_size=16)
-        for index in indices:
+            model = self._model(backbone)
+            shown = self._ordered(backbone, model).shown_for(indices) if model.sequential else None
+        about = [model.identity(), self._dataset.predictors[backbone].scores, *([] if shown is None else [shown])]
+        digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
+        for index in shown or indices:
             if index not in self._digests:
                 image = self._inner.image(index)
                 nothing = np.full(image.shape[:2], 255, dtype=np.uint8)
@@ -194,18 +229,30 @@ class PredictedScene(Scene):
             digest.update(self._digests[index])
         return digest.hexdigest()
 
-    def _predict(self, index: int, backbone: str, image: npt.NDArray[np.uint8]) -> Prediction:
-        """What the model says about a frame's image; scores where they are wanted."""
+    def _predict(self, index: int, backbone: str, image: Image) -> Prediction:
+        """What the model says about a frame; scores where they are wanted."""
         with self._lock:
+            model = self._model(backbone)
+            if model.sequential:
+                return self._ordered(backbone, model).at(index)
             if (backbone, index) in self._kept:
                 return self._kept[backbone, index]
-            model = self._model(backbone)
-            (prediction,) = model.predict([image], scores=self._dataset.predictors[backbone].scores)
-            size = prediction.labels.nbytes + (0 if prediction.scores is None else prediction.scores.nbytes)
-            if size <= self._room:
+            geometry = geometry_of(self._inner, index, image, model)
+            scores = self._dataset.predictors[backbone].scores
+            (prediction,) = ask(model, [image], scores=scores, geometry=geometry)
+            if (size := size_of(prediction)) <= self._room:
                 self._kept[backbone, index] = prediction
                 self._room -= size
             return prediction
+
+    def _ordered(self, backbone: str, model: Backbone) -> InOrder:
+        if backbone not in self._in_order:
+            scores = self._dataset.predictors[backbone].scores
+            shown = self._dataset.frames_of(self._inner)
+            self._in_order[backbone] = InOrder(
+                model, self._inner, shown, scores, partial(self._dataset.claim, backbone)
+            )
+        return self._in_order[backbone]
 
     def _model(self, backbone: str) -> Backbone:
         """The model, fitted to this sequence's first images."""

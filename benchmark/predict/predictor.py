@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -10,6 +11,9 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 
 from semstab.backbones import Backbone, create, options_model
 from semstab.backbones.class_names import InTaxonomy
+from semstab.backbones.outside.border import Checked
+from semstab.backbones.outside.code import absolute
+from semstab.backbones.outside.own import is_path
 from semstab.config import Settings, validated
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
@@ -20,7 +24,7 @@ from semstab.runtime.files import parse_yaml
 class PredictorConfig(Settings):
     """Which backbone predicts, and how its predictions are called and given."""
 
-    backbone: str = Field(description="a name from `semstab-bench list`")
+    backbone: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, package.module:NAME")
     name: str | None = Field(None, description="what its predictions are called; the backbone's name by default")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that backbone")
     scores: bool = Field(False, description="soft scores, not labels alone")
@@ -46,7 +50,7 @@ class PredictorConfig(Settings):
     @property
     def label_name(self) -> str:
         """What its label maps are called."""
-        return self.name or self.backbone
+        return self.name or self.backbone.rpartition(":")[2]
 
     def resolved(self) -> PredictorConfig:
         """With every default of the backbone's options, and absolute paths.
@@ -54,7 +58,8 @@ class PredictorConfig(Settings):
         Raises ConfigError for an option that cannot be used, MissingDependencyError.
         """
         options = validated(options_model(self.backbone), self.options, f"backbone '{self.backbone}': ")
-        return self.model_copy(update={"options": _absolute(options).model_dump(mode="json")})
+        full = {"backbone": absolute(self.backbone), "options": _absolute(options).model_dump(mode="json")}
+        return self.model_copy(update=full)
 
 
 def load_predictor(config: PredictorConfig) -> Backbone:
@@ -62,7 +67,7 @@ def load_predictor(config: PredictorConfig) -> Backbone:
 
     Raises ConfigError where scores are wanted of a backbone that has none, or classes map nowhere.
     """
-    backbone = create(config.backbone, **config.options)
+    backbone = Checked(create(config.backbone, **config.options), config.label_name)
     if config.scores and not backbone.gives_scores:
         raise ConfigError(f"backbone '{config.backbone}' gives labels, no scores; leave scores out")
     if config.taxonomy is None:
@@ -70,14 +75,16 @@ def load_predictor(config: PredictorConfig) -> Backbone:
     return InTaxonomy(backbone, LabelSpace.load(config.taxonomy), config.mapping)
 
 
-def parse_predictor(text: str) -> PredictorConfig:
+def parse_predictor(text: str, more: Mapping[str, Any] | None = None) -> PredictorConfig:
     """'segformer,model=FOLDER,taxonomy=uavid3': the backbone, then settings of the predictor, or its own options.
+
+    `more` are options that are said elsewhere.
 
     Raises ConfigError for anything else.
     """
     backbone, *settings = re.split(r",(?![^\[{]*[\]}])", text)  # not at the commas of a list
     own: dict[str, Any] = {}
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = {**(more or {})}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
@@ -88,9 +95,10 @@ def parse_predictor(text: str) -> PredictorConfig:
 
 
 def _absolute(options: BaseModel) -> BaseModel:
-    """Paths, and a model that is a folder, from the root of the file system."""
-    paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
+    """Paths, what names a file, and a model that is a folder, from the root of the file system."""
+    paths: dict[str, Any] = {key: value.absolute() for key, value in options if isinstance(value, Path)}
+    paths |= {key: str(Path(value).expanduser().absolute()) for key, value in options if is_path(value)}
     model = getattr(options, "model", None)
     if isinstance(model, str) and Path(model).expanduser().is_dir():
-        paths["model"] = str(Path(model).expanduser().absolute())  # type: ignore[assignment]
+        paths["model"] = str(Path(model).expanduser().absolute())
     return options.model_copy(update=paths)

@@ -13,7 +13,7 @@ from semstab.datasets.formats.images import read_labels
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
 from semstab.pixels.warp import warp
 from semstab.predict.images import ImageSequence
-from semstab.runtime.files import write_text
+from semstab.runtime.files import csv_text, write_text
 
 COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))
 
@@ -49,7 +49,7 @@ class RegionSeries:
         for kind, changes in (("plain", self.plain), ("compensated", self.compensated)):
             for (before, now), change in zip(itertools.pairwise(self.frames), changes, strict=False):
                 cells = ["" if value != value else value for value in asdict(change).values()]  # noqa: PLR0124  NaN
-                writer.writerow((kind, before, now, *cells))
+                writer.writerow((kind, csv_text(before), csv_text(now), *cells))
         write_text(path, text.getvalue())
 
 

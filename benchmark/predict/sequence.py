@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from semstab.backbones import Backbone, Prediction, image_digest
+from semstab.backbones import Backbone, Prediction, ask
 from semstab.datasets.views.same_view import fitted
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType
-from semstab.predict.images import Image, ImageSequence, first_images
+from semstab.predict.images import ImageSequence, Picture, first_images, picture
 from semstab.predict.region_series import RegionSeries, region_series
+from semstab.runtime.files import content_key
 from semstab.runtime.prefetch import prefetch
 
 REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers", "onnxruntime")
@@ -75,14 +78,6 @@ class PredictionObserver:
         """One frame further: predicted, or kept from before."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    index: int
-    name: str
-    pixels: Image
-    digest: str
-
-
 def predict_sequence(
     sequence: ImageSequence,
     backbone: Backbone,
@@ -94,7 +89,8 @@ def predict_sequence(
     """Predict the images of these indices into out/labels/NAME, and out/scores/NAME; regions into out/regions/NAME.
 
     A backbone that adapts to a sequence is fitted to the sequence's first images. Frames that an earlier start of the
-    same finished are kept; an image whose content changed is predicted again.
+    same finished are kept; an image whose content changed is predicted again. A sequential backbone that lacks a frame
+    is shown all of them again from the first one.
 
     Raises ConfigError where the folder holds other predictions, DataError that names an image; what was finished stays.
     """
@@ -102,10 +98,11 @@ def predict_sequence(
         observer.sequence_started(sequence.name, len(indices))
     started = time.perf_counter()
     backbone = backbone.fit(first_images(sequence, backbone.fit_frames))
-    work = _Work(sequence, backbone, out, options, observers)
+    work = _Work(sequence, backbone, indices, out, options, observers)
     with contextlib.closing(work):
-        for fetched in prefetch(work.picture, indices, threads=options.threads, size=lambda p: p.pixels.nbytes):
-            work.take(fetched.item)
+        anew = backbone.sequential and not all(work.kept(picture) for picture in work.pictures())
+        for picture in work.pictures():
+            work.take(picture, anew)
         work.flush()
     seconds = time.perf_counter() - started
     series = None
@@ -122,24 +119,41 @@ class _Work:
         self,
         sequence: ImageSequence,
         backbone: Backbone,
+        indices: Sequence[int],
         out: Path,
         options: SequenceOptions,
         observers: Sequence[PredictionObserver],
     ) -> None:
         self.sequence, self.backbone, self.options, self.observers = sequence, backbone, options, observers
-        self.folders = _folders(backbone, out, options)
-        self._waiting: list[_Picture] = []
+        self.indices = indices
+        self.folders = _folders(sequence, backbone, indices, out, options)
+        self._waiting: list[Picture] = []
         self._predicted = self._kept = 0
         self._model_seconds = 0.0
 
-    def picture(self, index: int) -> _Picture:
-        """An image with its name and digest."""
-        pixels = self.sequence.image(index)
-        return _Picture(index, self.sequence.image_name(index), pixels, image_digest(pixels))
+    def pictures(self) -> Iterator[Picture]:
+        """What the model is shown, in order; what a sequential one says depends on all that it was shown before."""
+        if self.backbone.sequential:
+            self.backbone.reset()
+        so_far = ""
+        read = partial(picture, self.sequence, backbone=self.backbone)
+        with contextlib.closing(
+            prefetch(read, self.indices, threads=self.options.threads, size=lambda item: item.nbytes)
+        ) as ahead:
+            for fetched in ahead:
+                item = fetched.item
+                if self.backbone.sequential:
+                    so_far = content_key({"after": so_far, "shown": item.digest})
+                    item = dataclasses.replace(item, digest=so_far)
+                yield item
 
-    def take(self, picture: _Picture) -> None:
-        """Keep what is finished, predict the rest in batches of one size."""
-        if all(folder.has(picture.name, picture.digest) for folder in self.folders):
+    def kept(self, picture: Picture) -> bool:
+        """Whether an earlier start finished it."""
+        return all(folder.has(picture.name, picture.digest) for folder in self.folders)
+
+    def take(self, picture: Picture, anew: bool) -> None:
+        """Keep what is finished, unless everything is made anew; predict the rest in batches of one size."""
+        if not anew and self.kept(picture):
             self._kept += 1
             self._tell(kept=True)
             return
@@ -155,18 +169,20 @@ class _Work:
         if not pictures:
             return
         started = time.perf_counter()
-        found = self.backbone.predict([picture.pixels for picture in pictures], scores=self.options.scores)
+        geometry = [frame for picture in pictures for frame in picture.geometry]
+        images = [picture.pixels for picture in pictures]
+        found = ask(self.backbone, images, scores=self.options.scores, geometry=geometry)
         seconds = time.perf_counter() - started
         self._model_seconds += seconds
-        for picture, prediction in zip(pictures, found, strict=True):
-            self._write(picture, prediction, seconds / len(pictures))
+        for shown, prediction in zip(pictures, found, strict=True):
+            self._write(shown, prediction, seconds / len(pictures))
             self._predicted += 1
             self._tell(kept=False)
 
     def close(self) -> None:
         """Say in the manifests what is finished, also after an error or an interruption."""
         for folder in self.folders:
-            folder.save()
+            folder.close()
 
     def report(self, seconds: float, series: RegionSeries | None) -> SequenceReport:
         """What was done."""
@@ -175,7 +191,7 @@ class _Work:
             self.sequence.name, paths, self._predicted, self._kept, self._model_seconds, seconds, series
         )
 
-    def _write(self, picture: _Picture, prediction: Prediction, seconds: float) -> None:
+    def _write(self, picture: Picture, prediction: Prediction, seconds: float) -> None:
         placed = _placed(self.sequence, picture, prediction)
         for folder in self.folders:
             values = placed.scores if folder.kind == "scores" else placed.labels
@@ -187,7 +203,7 @@ class _Work:
             observer.frame_done(kept)
 
 
-def _placed(sequence: ImageSequence, picture: _Picture, prediction: Prediction) -> Prediction:
+def _placed(sequence: ImageSequence, picture: Picture, prediction: Prediction) -> Prediction:
     """The prediction at the pixels that the scene's label files have."""
     frame = sequence.predicted(picture.index, labels=prediction.labels) if sequence.labels_like_depth else None
     if frame is None:
@@ -197,8 +213,12 @@ def _placed(sequence: ImageSequence, picture: _Picture, prediction: Prediction) 
     return Prediction(frame.labels, scores)
 
 
-def _folders(backbone: Backbone, out: Path, options: SequenceOptions) -> list[PredictionFolder]:
-    space = backbone.label_space
+def _folders(
+    sequence: ImageSequence, backbone: Backbone, indices: Sequence[int], out: Path, options: SequenceOptions
+) -> list[PredictionFolder]:
+    space, settings = backbone.label_space, backbone.identity()
+    if backbone.sequential:
+        settings = {**settings, "frames": _selection([sequence.image_name(index) for index in indices])}
     about = {"command": list(options.command), "packages": _versions(), "batch": options.batch}
     kinds: list[Kind] = ["regions"] if space is None else ["labels"]
     if options.scores:
@@ -207,7 +227,7 @@ def _folders(backbone: Backbone, out: Path, options: SequenceOptions) -> list[Pr
         PredictionFolder(
             out / kind / options.name,
             kind,
-            backbone.identity(),
+            settings,
             about,
             space,
             score_type=options.score_type,
@@ -215,6 +235,12 @@ def _folders(backbone: Backbone, out: Path, options: SequenceOptions) -> list[Pr
         )
         for kind in kinds
     ]
+
+
+def _selection(names: Sequence[str]) -> str:
+    """Which frames a sequential backbone saw, in a few words that are equal where all of them are."""
+    digest = content_key({"names": list(names)})[:8]
+    return f"{len(names)} from {names[0]} to {names[-1]} ({digest})" if names else "none"
 
 
 def _versions() -> dict[str, str | None]:

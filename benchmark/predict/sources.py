@@ -6,12 +6,12 @@ import glob
 from collections.abc import Sequence
 from pathlib import Path
 
+from semstab.backbones import Image
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, read_color
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
-from semstab.predict.images import Image
 
 
 class ImageFiles:
@@ -50,6 +50,10 @@ class ImageFiles:
         return []
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
+        """None: single images have no depth."""
+        return None
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame | None:
         """None: single images have no depth."""
         return None
 

@@ -14,7 +14,12 @@ class PredictionBar(PredictionObserver):
     """One bar a sequence. Speed and time left count frames that the model saw, not those kept from before."""
 
     def __init__(self, console: Console) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+        )
         self._bar = Progress(*columns, TextColumn("{task.fields[speed]}"), console=console, transient=True)
         self._work = self._bar.add_task("starting", total=None, speed="")
         self._left = self._predicted = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import math
@@ -21,6 +22,9 @@ import yaml
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.runtime.json_form import to_json
 
+TEMPORARY = ".semstab-"
+"""How names of files begin that are not whole yet."""
+
 MAX_YAML_BYTES = 2**24
 MAX_ALIASED = 10**5
 
@@ -30,7 +34,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` if the block succeeds, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -39,6 +43,35 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+class FolderLock:
+    """A folder that one process owns until `release`, or until it dies. What a killed one left half-written is removed.
+
+    Raises ConfigError where another one has it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.mkdir(parents=True, exist_ok=True)
+        self._handle: int | None = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self.release()
+            raise ConfigError(f"{path}: another process works on it; wait for it, or choose another folder") from error
+        remove_leftovers(path)
+
+    def release(self) -> None:
+        """Let another process have it."""
+        if self._handle is not None:
+            os.close(self._handle)
+        self._handle = None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `atomic_path` left where its process was killed; nobody else may be writing there."""
+    for path in folder.glob(f"{TEMPORARY}*"):
+        path.unlink()
 
 
 def _umask() -> int:
@@ -56,6 +89,11 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: Any) -> None:
     """Write `value`, a dataclass for example, atomically as JSON; undefined numbers (NaN, infinity) become null."""
     write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def csv_text(text: str) -> str:
+    """A name for a cell of a CSV file, in which a spreadsheet sees no formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
@@ -100,6 +138,8 @@ def read_limited(path: str | Path, limit: int) -> bytes:
 
 def open_file(path: str | Path) -> BufferedReader:
     """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "no file can be called so")
     file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  an opener; the caller closes it
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()

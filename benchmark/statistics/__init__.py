@@ -15,7 +15,14 @@ from semstab.model.statistics import (
     Reliability,
     StabilityVerdict,
 )
-from semstab.statistics.agreement import class_agreement, fleiss_kappa, krippendorff_alpha, psa
+from semstab.statistics.agreement import (
+    alpha_between,
+    class_agreement,
+    disagreement,
+    fleiss_kappa,
+    krippendorff_alpha,
+    psa,
+)
 from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
 from semstab.statistics.ceiling import ceiling, losses, rendered
@@ -40,6 +47,7 @@ from semstab.statistics.drift import (
     voxel_drift,
 )
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
+from semstab.statistics.looks import Sample, Sampler, View, reach_of
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.verdict import verdict
 
@@ -58,11 +66,15 @@ __all__ = [
     "MapStatistics",
     "Quadrants",
     "Reliability",
+    "Sample",
+    "Sampler",
     "SceneDrift",
     "StabilityVerdict",
     "Truth",
     "Uncertainty",
+    "View",
     "VoxelDrift",
+    "alpha_between",
     "analyse",
     "benjamini_hochberg",
     "ceiling",
@@ -72,6 +84,7 @@ __all__ = [
     "coverage",
     "decompose",
     "describe",
+    "disagreement",
     "expected_sbd",
     "fleiss_kappa",
     "flips",
@@ -82,6 +95,7 @@ __all__ = [
     "paired",
     "psa",
     "quadrants",
+    "reach_of",
     "reliability",
     "rendered",
     "scene_drift",

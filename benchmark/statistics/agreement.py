@@ -18,6 +18,9 @@ Float64 = npt.NDArray[np.float64]
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
 ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(2, 4))
+ALPHA_BETWEEN = Quantity(
+    key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(2, 4)
+)
 
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""
@@ -83,13 +86,16 @@ def kappa_of(sums: Float64) -> Float64:
     return _beyond_chance(observed, expected)
 
 
-def alpha_columns(table: VoxelTable) -> Float64:
-    """(n, 3 + K): what Krippendorff's alpha is a function of by its sum over voxels."""
+def alpha_columns(table: VoxelTable, weights: Float64 | None = None) -> Float64:
+    """(n, 3 + K): what Krippendorff's alpha, and alpha between frames, are functions of by their sums over voxels.
+
+    weights (n,) count voxels by themselves instead of by their OP: the same ones for several flights make their alphas
+    comparable where these saw some places more often than others.
+    """
     again = table.op >= 2
-    T = np.where(again, table.op, 0)
-    agreeing = T * np.where(again, psa(table), 0.0)
-    own = np.where(again, table.self_sum, 0.0)
-    return np.concatenate([np.stack([agreeing, T, own], axis=1), np.where(again[:, None], table.evidence, 0.0)], axis=1)
+    w = np.where(again, table.op if weights is None else weights, 0.0)
+    agreeing, own = w * np.where(again, psa(table), 0.0), w * table.self_sum / table.op
+    return np.concatenate([np.stack([agreeing, w, own], axis=1), (w / table.op)[:, None] * table.evidence], axis=1)
 
 
 def alpha_of(sums: Float64) -> Float64:
@@ -98,6 +104,60 @@ def alpha_of(sums: Float64) -> Float64:
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 3:] ** 2).sum(axis=-1) - sums[..., 2]) / (n * (n - 1))
     return _beyond_chance(ratio_of(sums[..., :2]), expected)
+
+
+def alpha_between(table: VoxelTable) -> float:
+    """Krippendorff's alpha with the distance ||s - s'||^2 / 2, of the voxels with OP >= 2, each counting by its OP.
+
+    1 - D / D_e: D is the mean distance of two frames' evidence at a voxel, ||s_t||^2 averaged less PSA, and D_e the
+    same between all observations, as if they were of one voxel. On one-hot evidence it is `krippendorff_alpha`. Two
+    frames that both see the same mixture agree here, and frames that both give the same scores.
+    """
+    return float(between_of(alpha_columns(table).sum(axis=0)))
+
+
+def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
+    """1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN where OP < 2.
+
+    Within: 1 - ||s_t||^2 averaged, two pixels of one frame. Between: half the mean ||s_t - s_u||^2 of two frames. The
+    expectation of neither depends on OP where frames are independent draws.
+    """
+    agreement = psa(table)
+    again = table.op >= 2
+    own = np.where(again, table.self_sum / table.op, np.nan)
+    return 1 - own, np.maximum(own - agreement, 0.0)
+
+
+def between_of(sums: Float64) -> Float64:
+    """Alpha between frames (...,) from the sums (..., 3 + K) of `alpha_columns`."""
+    n, own = sums[..., 1], sums[..., 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        expected = own / n - ((sums[..., 3:] ** 2).sum(axis=-1) - own) / (n * (n - 1))
+        ratio = (own - sums[..., 0]) / n / expected
+    beyond: Float64 = np.where(expected > ONE_HOT, 1 - ratio, np.nan)
+    return beyond
+
+
+def class_columns(events: Events) -> Float64:
+    """(n, K, 4): what the alphas of the classes are functions of by their sum over voxels, as `class_of` takes them."""
+    starts = events.starts
+    T = np.diff(np.append(starts, len(events))).astype(np.float64)[:, None]
+    e, squares = (np.add.reduceat(values, starts, axis=0) for values in (events.evidence, events.evidence**2))
+    disagreement = 2 * (T * squares - e**2) / np.maximum(T - 1, 1)
+    return np.where(T[..., None] >= 2, np.stack([disagreement, T + 0 * e, squares, e], axis=-1), 0.0)
+
+
+def class_of(sums: Float64) -> Float64:
+    """Alpha between frames (...,) of a class against all others, from sums (..., 4).
+
+    Every observation is reduced to s_k and two of them are (s_k - s'_k)^2 apart: `alpha_between` of two classes.
+    """
+    apart, n, squares, total = np.moveaxis(sums, -1, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        expected = 2 * (n * squares - total**2) / (n * (n - 1))
+        ratio = apart / n / expected
+    beyond: Float64 = np.where(expected > ONE_HOT, 1 - ratio, np.nan)
+    return beyond
 
 
 def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[ClassAgreement, ...]:

@@ -35,7 +35,9 @@ from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
     alpha_columns,
     alpha_of,
+    between_of,
     class_agreement,
+    disagreement,
     kappa_columns,
     kappa_of,
     psa,
@@ -62,6 +64,7 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
+from semstab.statistics.looks import Sample, reach_of
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 
@@ -87,12 +90,16 @@ def describe(
     truth: VoxelTable | None = None,
     *,
     limit: VoxelTable | None = None,
+    sample: Sample | None = None,
     name: str = "",
     seed: int = 0,
     edges: Sequence[int] = STRATA,
+    critical: Sequence[str] = (),
 ) -> MapStatistics:
     """All statistics of one map: the `summary` of `analyse`, which takes the same arguments."""
-    return analyse(table, events, truth, limit=limit, name=name, seed=seed, edges=edges).summary
+    return analyse(
+        table, events, truth, limit=limit, sample=sample, name=name, seed=seed, edges=edges, critical=critical
+    ).summary
 
 
 def analyse(
@@ -101,17 +108,21 @@ def analyse(
     truth: VoxelTable | None = None,
     *,
     limit: VoxelTable | None = None,
+    sample: Sample | None = None,
     name: str = "",
     seed: int = 0,
     edges: Sequence[int] = STRATA,
+    critical: Sequence[str] = (),
 ) -> Analysis:
     """All statistics of one map; the same seed gives the same numbers.
 
     events  the log behind the table; without it there is no drift test, no flip rate and no other fusion rule
     truth   the map of the ground truth labels of the same frames; without it nothing is said about right and wrong
     limit   the map of view-independent labels (`ceiling`); without it nothing is said about geometry's part
+    sample  what a `Sampler` took of the same frames; without it there is no ceiling to judge agreement against
     name    of the backbone, for the verdict
     edges   upper bounds of the strata of OP
+    critical  the classes that the verdict depends on; where none is named, all with enough places
 
     Intervals are at 95 %, from a spatial block bootstrap over the voxels with OP >= 2; undefined numbers are NaN, and
     a section that cannot be computed is None.
@@ -130,10 +141,11 @@ def analyse(
     right = None if known is None else _correctness(table, known, means, maps, edges, seed)
     repeats = int(np.count_nonzero(again))
     repeated = Repeated(repeats, repeats / len(table) if len(table) else math.nan)
+    reach = None if sample is None else reach_of(sample, table, critical=critical, seed=seed)
     judged = verdict(
         name or "backbone",
-        alpha=agreement.alpha,
-        psa=agreement.psa,
+        agreement=agreement,
+        reach=reach,
         voxels=repeated.voxels,
         share=repeated.share,
         blocks=blocks.count,
@@ -151,6 +163,7 @@ def analyse(
         blocks=BlockCut(blocks.count, blocks.size),
         verdict=judged,
         agreement=agreement,
+        reach=reach,
         drift=drift,
         uncertainty=uncertainty,
         geometry=None if limit is None else losses(table, limit, seed=seed),
@@ -186,11 +199,19 @@ class _Means:
 
 def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> FrameAgreement:
     repeated = rows_of(table, means.again)
+    T = repeated.op.astype(np.float64)
+    parts = dict(zip(("disagreement_within", "disagreement_between"), disagreement(table), strict=True))
+    within, between = (T * part[means.again] for part in parts.values())
+    maps |= parts
     return FrameAgreement(
         psa=means.mean(maps["psa"]),
         kappa=means.function(kappa_columns(repeated), kappa_of, (-1.0, 1.0)),
         alpha=means.function(alpha_columns(repeated), alpha_of, (-1.0, 1.0)),
         vss=means.mean(vss(table)),
+        within=means.function(np.stack([within, T], axis=1), ratio_of, (0.0, 1.0)),
+        between=means.function(np.stack([between, T], axis=1), ratio_of, (0.0, 1.0)),
+        alpha_between=means.function(alpha_columns(repeated), between_of, (-1.0, 1.0)),
+        each_place=means.function(alpha_columns(repeated, np.ones(len(repeated))), between_of, (-1.0, 1.0)),
         classes=class_agreement(repeated) if events is None else class_agreement(table, events),
     )
 

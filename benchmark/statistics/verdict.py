@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 
-from semstab.model.statistics import UNDEFINED, Estimate, StabilityVerdict
+from semstab.model.statistics import UNDEFINED, ClassReach, Estimate, FrameAgreement, Reach, StabilityVerdict
 
 RELIABLE = 0.8
 """Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""
 
 TENTATIVE = 2 / 3
 """Alpha from which tentative conclusions are allowed; below, none (same source)."""
+
+LEAST_CEILING = 0.5
+"""A ceiling below which the share of it that is reached says little."""
 
 DANGEROUS = 0.05
 """Largest share of the stable places that may be wrong."""
@@ -20,9 +23,11 @@ LEAST_VOXELS, LEAST_BLOCKS = 100, 16
 
 ADVICE = {
     "stable": "its labels agree from frame to frame; act on them",
+    "partly stable": "act on its labels but for those of the class named",
     "usable": "act on a label only where several frames agree",
     "unstable": "do not act on its labels",
     "undecided": "the data do not decide; fly with more overlap, or more of the scene",
+    "too coarse": "voxels are too large for what the labels show; use smaller ones",
     "misleading": "do not take agreement for truth",
     "no verdict": "too few places were seen twice; fly with more overlap",
 }
@@ -34,8 +39,8 @@ ONE_CLASS = "hardly more than one class was predicted, so that agreement says no
 def verdict(
     backbone: str,
     *,
-    alpha: Estimate,
-    psa: Estimate,
+    agreement: FrameAgreement,
+    reach: Reach | None,
     voxels: int,
     share: float,
     blocks: int,
@@ -43,33 +48,62 @@ def verdict(
 ) -> StabilityVerdict:
     """Judge by the intervals, never by values alone, from voxels with OP >= 2 only.
 
-    alpha, psa       of these voxels
+    agreement        of these voxels
+    reach            the same beside its ceiling; where it is not known, alpha between frames is judged as it is
     voxels, share    how many they are, and of all voxels
     blocks           in how many blocks they lie
     wrong_of_stable  share of the stable voxels that are wrong, where ground truth tells
     """
-    level = _level(alpha, wrong_of_stable, voxels, blocks)
+    enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
+    level = _level(agreement, reach, wrong_of_stable) if enough else "no verdict"
     support = f"{voxels} places seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
-        enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
         return StabilityVerdict(level, f"{backbone}: no verdict, {ONE_CLASS if enough else ADVICE[level]}; {support}")
-    found = [
-        f"two frames agree on {psa.value:.0%} of the places ({psa.low:.0%} to {psa.high:.0%})",
-        f"alpha {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f})",
-    ]
+    psa = agreement.psa
+    found = [f"two frames agree on {psa.value:.0%} of the places ({psa.low:.0%} to {psa.high:.0%})"]
+    found += [_alpha(agreement.alpha_between)] if reach is None else _reached(reach)
     if not math.isnan(wrong_of_stable.low):
         wrong = wrong_of_stable
         found.append(f"{wrong.value:.0%} of the stable places are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     return StabilityVerdict(level, f"{backbone}: {level}, {ADVICE[level]}: {', '.join(found)}; {support}")
 
 
-def _level(alpha: Estimate, wrong_of_stable: Estimate, voxels: int, blocks: int) -> str:
-    if voxels < LEAST_VOXELS or blocks < LEAST_BLOCKS or math.isnan(alpha.low):
+def _alpha(alpha: Estimate) -> str:
+    return f"alpha between frames {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}), its ceiling not known"
+
+
+def _reached(reach: Reach) -> list[str]:
+    share = reach.reached
+    said = [
+        f"alpha between frames {reach.alpha.value:.2f} is {share.value:.0%} ({share.low:.0%} to {share.high:.0%})"
+        f" of the {reach.ceiling.value:.2f} that {reach.by} allow"
+    ]
+    if (worst := reach.worst) is not None:
+        said.append(f"worst class {worst.name} {_class_share(worst)}")
+    return said
+
+
+def _class_share(row: ClassReach) -> str:
+    if math.isnan(row.reached.value):
+        return "not known"
+    return f"{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
+
+
+def _level(agreement: FrameAgreement, reach: Reach | None, wrong_of_stable: Estimate) -> str:
+    judged = agreement.alpha_between if reach is None else reach.reached
+    if math.isnan(judged.low):
         return "no verdict"
     if wrong_of_stable.low > DANGEROUS:
         return "misleading"
-    if alpha.low >= RELIABLE:
-        return "stable"
-    if alpha.low >= TENTATIVE:
+    if judged.low < TENTATIVE:
+        return "unstable" if judged.high < TENTATIVE else "undecided"
+    if reach is not None and not reach.ceiling.value >= LEAST_CEILING:
+        return "too coarse"
+    if judged.low < RELIABLE:
         return "usable"
-    return "unstable" if alpha.high < TENTATIVE else "undecided"
+    return "stable" if reach is None or _every_class_holds(reach) else "partly stable"
+
+
+def _every_class_holds(reach: Reach) -> bool:
+    """Whether each class that matters allows at least tentative conclusions."""
+    return all(row.reached.low >= TENTATIVE for row in reach.classes if row.matters)

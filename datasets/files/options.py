@@ -10,7 +10,7 @@ from pydantic import Field, PositiveInt, model_validator
 from semstab.config import Settings
 from semstab.datasets import GROUND_TRUTH
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e30)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Id = Annotated[int, Field(ge=0, le=65535)]
 
@@ -32,12 +32,20 @@ CameraAxes = Annotated[
     Field(description="axes of the camera: opencv, opengl, or ned (x forward, y right, z down)"),
 ]
 UpAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, Field(description="the world's up axis")]
+Crs = Annotated[
+    str | None,
+    Field(description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT"),
+]
 PixelCentre = Annotated[
     float | None, Field(ge=0, le=1, description="where the intrinsics have the centre of the first pixel: 0 or 0.5")
 ]
 FourIntrinsics = Annotated[
     tuple[Positive, Positive, Finite, Finite] | None,
     Field(description="[fx, fy, cx, cy] in pixels; those of the dataset where not given"),
+]
+Offset = Annotated[
+    tuple[Finite, Finite, Finite] | None,
+    Field(description="[east, north, up] in metres that makes scene coordinates those of crs"),
 ]
 Size = Annotated[
     tuple[PositiveInt, PositiveInt] | None,
@@ -92,6 +100,8 @@ class FileSettings(Settings):
     camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = None
     metres_per_unit: MetresPerUnit = 1.0
+    crs: Crs = None
+    offset: Offset = None
 
     intrinsics_size: Size = None
     pixel_centre: PixelCentre = 0
@@ -103,6 +113,8 @@ class FileSettings(Settings):
     def _one_label_space(self) -> Self:
         if self.classes is not None and self.taxonomy is not None:
             raise ValueError("give classes or taxonomy, not both")
+        if self.offset is not None and self.crs is None:
+            raise ValueError("give crs with offset")
         return self
 
 

@@ -23,6 +23,7 @@ from semstab.datasets.scene import Dataset
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError, DataError
+from semstab.model.georeference import Georeference
 
 DEEPEST = 3
 """Levels of folders below root that are searched for scenes."""
@@ -65,6 +66,7 @@ class FileDataset(Dataset, Generic[Options]):
         if not frames:
             raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
         scene = FileScene(place, frames, options, self.class_ids())
+        scene.georeference = self.georeference(place.folder, options)
         scene.labels_like_depth = self.labels_like_depth
         scene.settings_file = None if self.settings_file is None else place.folder / self.settings_file
         return scene
@@ -72,6 +74,12 @@ class FileDataset(Dataset, Generic[Options]):
     def settled(self, folder: Path) -> FileOptions:
         """The options with which a scene's folder is read."""
         return self.options
+
+    def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
+        """Where a scene lies on Earth: what the options say, else None. Raises what `Georeference.of` raises."""
+        if options.crs is None:
+            return None
+        return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs")
 
     def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
         """By label source, a table (65536,) from the ids of its files to those of its taxonomy, where they differ."""

@@ -36,12 +36,12 @@ from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
 from semstab.datasets.views.ray_depth import planar
 from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
-from semstab.datasets.views.same_view import fitted
+from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 
-PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table"}
+PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset"}
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
 
 
@@ -167,12 +167,21 @@ class FileScene(Scene):
         scores = None if scores is None else self._fitted(index, scores, depth.shape, where)
         return self._framed(index, depth, labels, scores, color=False)
 
+    def view(self, index: int, shape: tuple[int, int]) -> Frame:
+        """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0."""
+        source = self._frame(index)
+        camera = source.label_camera
+        K = None if camera is None else camera.at(shape, self.options.pixel_centre or 0.0)
+        return at_image(self.geometry(index), shape, str(source.color or source.name), K)
+
     def depth(self, index: int) -> npt.NDArray[np.float32]:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
         source = self._frame(index)
         scale = self.options.depth_scale or source.depth_scale
         read = read_depth_map if source.depth.suffix.lower() == ".bin" else read_depth
         depth = read(source.depth, scale, self._read)
+        if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
+            depth = np.zeros_like(depth)
         for value in self.options.invalid_depth:
             with np.errstate(over="ignore"):
                 depth[depth == np.float32(value) / np.float32(self._scale(source))] = 0

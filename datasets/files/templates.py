@@ -70,7 +70,7 @@ def matching_folders(base: Path, template: Template, placeholder: str, **values:
     if k == len(parts) - 1 or any(PLACEHOLDER.search(part) for part in parts[:k]):
         raise ConfigError(f"{template.option}: {hole} must be in the name of a folder, before the other placeholders")
     before, _, after = parts[k].partition(hole)
-    pattern = re.compile(f"{re.escape(before)}(?P<value>.+){re.escape(after.replace(hole, ''))}")
+    pattern = re.compile(f"{re.escape(before)}(?P<value>.+){re.escape(after.replace(hole, ''))}", re.DOTALL)
     matches = (pattern.fullmatch(name) for name in subfolders(base.joinpath(*parts[:k])))
     found = sorted((match["value"] for match in matches if match), key=natural)
     return {value: "/".join(parts).replace(hole, value) for value in found}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -34,13 +34,14 @@ def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[
 
     K is that of the label map. Both images share centre and axes. What K does not see is ignored.
     """
-    v, u = _positions(K, K_depth, shape)
-    rows, columns = (np.floor(x + 0.5 + TIE).astype(np.intp) for x in (v, u))
-    H, W = labels.shape
-    fitted: Labels = labels[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
-    outside = ~(_within(rows, H)[:, None] & _within(columns, W))
-    fitted[outside] = ignore_id(labels)
-    return fitted
+    return _nearest(labels, K, K_depth, shape, ignore_id(labels))
+
+
+def fit_depth(
+    depth: npt.NDArray[np.float32], K_depth: Intrinsics, K: Intrinsics, shape: tuple[int, int]
+) -> npt.NDArray[np.float32]:
+    """Depth as a camera with K and an image (H, W) sees it: of each pixel the nearest depth, 0 where there is none."""
+    return _nearest(depth, K_depth, K, shape, 0)
 
 
 def fit_scores(scores: Scores, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Scores:
@@ -53,6 +54,16 @@ def fit_scores(scores: Scores, K: Intrinsics, K_depth: Intrinsics, shape: tuple[
     fitted = _linear(_linear(wide, v, axis=0), u, axis=1)
     inside = (_within(v, scores.shape[0])[:, None]) & _within(u, scores.shape[1])
     return np.where(inside[..., None], fitted, wide.dtype.type(0))
+
+
+def _nearest(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int], fill: int) -> Pixels:
+    v, u = _positions(K, K_fit, shape)
+    rows, columns = (np.floor(x + 0.5 + TIE).astype(np.intp) for x in (v, u))
+    H, W = values.shape
+    fitted: Any = values[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
+    outside = ~(_within(rows, H)[:, None] & _within(columns, W))
+    fitted[outside] = fill
+    return cast(Pixels, fitted)
 
 
 def _positions(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.resampling import Pixels, fit
+from semstab.datasets.views.resampling import Pixels, fit, fit_depth
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
+from semstab.model.frames import Frame, Intrinsics
 
 SHAPE_TOLERANCE = 0.02
 """Images whose ratios of width and height differ by more do not show the same view."""
@@ -18,8 +20,27 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
     """
     if values.shape[:2] == shape:
         return values
-    (H, W), (h, w) = values.shape[:2], shape
-    if abs(W * h / (H * w) - 1) > SHAPE_TOLERANCE:
-        raise DataError(f"{where}: {what} {W}x{H} but depth is {w}x{h}, another view; register one to the other")
+    _require_one_view(values.shape, shape, where, what)
+    h, w = shape
     target = Intrinsics(1, 1, (w - 1) / 2, (h - 1) / 2)
     return fit(values, Camera(target, (w, h)).at(values.shape), target, (h, w))
+
+
+def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | None = None) -> Frame:
+    """A frame's depth and pose at the pixels of its colour image (H, W); no labels, depth 0 where it is not known.
+
+    K is the image's, where it shows another view than the depth. Raises DataError with `where` for another shape.
+    """
+    depth = frame.depth
+    if K is None:
+        _require_one_view(shape, frame.shape, where, "the image is")
+        K = frame.intrinsics.resized((frame.shape[1], frame.shape[0]), (shape[1], shape[0]))
+    if (K, shape) != (frame.intrinsics, frame.shape):
+        depth = fit_depth(depth, frame.intrinsics, K, shape)
+    return Frame(frame.index, depth, K, frame.T_wc, labels=np.zeros(shape, np.uint8), timestamp=frame.timestamp)
+
+
+def _require_one_view(image: tuple[int, ...], depth: tuple[int, ...], where: str, what: str) -> None:
+    (H, W), (h, w) = image[:2], depth
+    if abs(W * h / (H * w) - 1) > SHAPE_TOLERANCE:
+        raise DataError(f"{where}: {what} {W}x{H} but depth is {w}x{h}, another view; register one to the other")

@@ -30,7 +30,7 @@ from semstab.model.results import STAGES, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
-from semstab.statistics import Analysis
+from semstab.statistics import Analysis, Sample
 from semstab.task import Task, read
 
 Savers = dict[str, Callable[[Path], None]]
@@ -50,7 +50,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("statistics"):
         truth = None if one.truth is None else _table(one.truth, task)
         events = one.backend.events() if config.statistics else None
-        found = analyse_map(task, config, table, events, truth) if one.request.judged else None
+        found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
     with watch("measure"):
         summary = _summary(one, table, found)
     with watch("write"):
@@ -67,6 +67,14 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
 
 def _table(backend: FusionBackend, task: Task) -> VoxelTable:
     return dataclasses.replace(backend.table(), classes=task.mapping.target.classes)
+
+
+def sample_of(one: UnitMap) -> Sample | None:
+    """What was sampled of a unit's frames; its limit is the ground truth's where that was fused as well."""
+    if one.sampler is None:
+        return None
+    sample = one.sampler.sample()
+    return sample if one.truth_sampler is None else sample.against(one.truth_sampler.sample())
 
 
 def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
@@ -96,6 +104,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
         frames_left_out=task.left_out,
+        frames_empty=sum(row.report.points == 0 for row in rows),
         statistics=None if found is None else found.summary,
     )
 

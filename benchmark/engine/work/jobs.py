@@ -10,8 +10,9 @@ from pathlib import Path
 from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.errors import SemstabError, one_line
+from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.model.records import UnitContent
+from semstab.runtime.files import TEMPORARY
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,14 @@ def failed(requests: Iterable[Request], error: str | Exception) -> list[Outcome]
 
 def message(error: Exception) -> str:
     """One line; an error that is not semstab's own says its type."""
+    if isinstance(error, MemoryError):
+        return OUT_OF_MEMORY
     return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def shared_marker(folder: Path, start: str) -> Path:
     """The file by which a worker knows that it sees the folder itself, not one of the same name elsewhere."""
-    return folder / f".shared-{start}"
+    return folder / f"{TEMPORARY}{start}"
 
 
 def split(jobs: Sequence[Job], width: int) -> list[Job]:

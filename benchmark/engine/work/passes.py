@@ -24,6 +24,7 @@ from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.runtime.prefetch import Fetched, prefetch
 from semstab.runtime.stopwatch import Stopwatch
+from semstab.statistics import Sampler
 from semstab.task import Task, tasks_of
 
 logger = logging.getLogger("semstab")
@@ -129,7 +130,8 @@ class Pass:
             (task,) = tasks_of(self._scene, request.config)
             task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
-            return [UnitMap(request, task, _new_map(request.config, task), truth)]
+            sampler, of_truth = (_sampler(request, task) if wanted else None for wanted in (request.judged, truth))
+            return [UnitMap(request, task, _new_map(request.config, task), truth, sampler, of_truth)]
         return []
 
     def _decode(self, index: int) -> Decoded:
@@ -166,8 +168,13 @@ class Pass:
             _warm_up(one, frame)
         with self._watch(f"fuse {one.task.backends[0]}"):
             report = one.backend.integrate(frame)
+        with self._watch("sample"):
+            if one.sampler is not None:
+                one.sampler.add(frame)
         if one.truth is not None and now.truth is not None:
             one.truth.integrate(now.truth)
+            if one.truth_sampler is not None:
+                one.truth_sampler.add(now.truth)
         return FrameRow(
             report, frame.timestamp, now.flicker, fetched.seconds, fetched.waited, now.seconds,
             left_out=frame.left_out_pixels,
@@ -227,6 +234,10 @@ def _truth_map(config: Config, task: Task) -> FusionBackend | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
     without_log = config.model_copy(update={"statistics": False, "events": False})
     return _new_map(without_log, task) if truth_task(task) else None
+
+
+def _sampler(request: Request, task: Task) -> Sampler:
+    return Sampler(request.config.voxel_size, len(task.mapping.target))
 
 
 _warm: set[tuple[str, str, int, bool]] = set()

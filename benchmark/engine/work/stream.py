@@ -18,6 +18,7 @@ from semstab.engine.work.jobs import Request
 from semstab.metrics import flicker_percent
 from semstab.model.frames import Frame
 from semstab.runtime.stopwatch import Stopwatch
+from semstab.statistics import Sampler
 from semstab.task import Task, prepare
 
 SHOWN_WIDTH = 1280
@@ -26,12 +27,14 @@ SHOWN_WIDTH = 1280
 
 @dataclass(eq=False)
 class UnitMap:
-    """A unit that is being fused; `truth` takes the ground truth of the same frames, for statistics."""
+    """A unit that is being fused; `truth` takes the ground truth of the same frames, samplers what statistics need."""
 
     request: Request
     task: Task
     backend: FusionBackend
     truth: FusionBackend | None = None
+    sampler: Sampler | None = None
+    truth_sampler: Sampler | None = None
     rows: list[FrameRow] = field(default_factory=list)
 
 

@@ -12,11 +12,12 @@ from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
 from semstab.outputs.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
 from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.outputs.plots.histograms import Histograms, histograms, together
+from semstab.outputs.plots.histograms import Histograms, together
 from semstab.outputs.plots.judgement import statistics_figures
 from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability
 from semstab.outputs.plots.style import Figure
 from semstab.outputs.plots.sweeps import draw_sweep
+from semstab.outputs.plots.views import Views
 from semstab.runtime.files import keep_only
 
 if TYPE_CHECKING:
@@ -24,19 +25,25 @@ if TYPE_CHECKING:
 
     from semstab.outputs.plots.drawing import DrawingProcess
 
-__all__ = ["Figure", "figures", "write_figures"]
+__all__ = ["Figure", "Views", "figures", "write_figures"]
 
 
-def write_figures(result: Result, folder: str | Path, beside: DrawingProcess | None = None) -> list[Path]:
+def write_figures(
+    result: Result, folder: str | Path, views: Views | None = None, beside: DrawingProcess | None = None
+) -> list[Path]:
     """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
 
-    A process `beside` this one draws every second of them. Other figures there are removed.
+    What `views` lacks of a unit is read from its voxels. A process `beside` this one draws about half of them. Other
+    figures there are removed.
     """
     target = Path(folder) / "figures"
-    wanted = figures(result, folder)
-    ordered = sorted(wanted, key=lambda figure: figure.dense)  # these take longest: to each process its half of them
-    own, others = (ordered, []) if beside is None else (ordered[1::2], ordered[::2])
-    drawn = None if beside is None else beside.draw(Path(folder), [figure.name for figure in others])
+    views = views or Views()
+    wanted = figures(result, folder, views)
+    units = list(dict.fromkeys(figure.unit for figure in wanted if figure.unit))
+    elsewhere = [] if beside is None else [*units[:3], *units[4::2]]  # three take as long as all that show no map
+    others = sorted((figure for figure in wanted if figure.unit in elsewhere), key=lambda figure: figure.unit)
+    own = sorted((figure for figure in wanted if figure.unit not in elsewhere), key=lambda figure: figure.unit)
+    drawn = None if beside is None else beside.draw(result, Path(folder), views, [figure.name for figure in others])
     for figure in own:
         figure.save(target)
     if drawn is not None and not drawn():
@@ -47,29 +54,30 @@ def write_figures(result: Result, folder: str | Path, beside: DrawingProcess | N
     return written
 
 
-def figures(result: Result, folder: str | Path) -> list[Figure]:
+def figures(result: Result, folder: str | Path, views: Views | None = None) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
+    views = views or Views()
     kept = [record for record in result.select() if record.voxels_file is not None]
     return [
-        *_overviews(result, kept, Path(folder) / OVERVIEW),
-        *_distributions(kept),
-        *_maps(result, kept),
+        *_overviews(result, kept, views, Path(folder) / OVERVIEW),
+        *_distributions(kept, views),
+        *_maps(result, kept, views),
         *_sweeps(result),
-        *statistics_figures(result, kept),
+        *statistics_figures(result, kept, views),
     ]
 
 
-def _overviews(result: Result, kept: list[Record], folder: Path) -> Iterator[Figure]:
+def _overviews(result: Result, kept: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
     """One a backbone, of the first scene that has a saved frame."""
     for backbone, records in by_backbone(kept).items():
         for record in records:
             path = folder / f"{slug(record.unit.scene, backbone)}.npz"
             if record.unit.scene in result.up and path.exists():
-                yield _overview(record, result.up[record.unit.scene], path)
+                yield _overview(record, result.up[record.unit.scene], views, path)
                 break
 
 
-def _overview(record: Record, up: tuple[float, float, float], path: Path) -> Figure:
+def _overview(record: Record, up: tuple[float, float, float], views: Views, path: Path) -> Figure:
     scene, backbone = record.unit.scene, record.unit.backbone
     return Figure(
         slug("overview", scene, backbone),
@@ -78,12 +86,12 @@ def _overview(record: Record, up: tuple[float, float, float], path: Path) -> Fig
         " class of the topmost voxels, in the prediction's colours.",
         f"A camera image of {scene}, the classes that {backbone} predicts for it, and the fused map from above in the"
         " same colours.",
-        lambda: draw_overview(record.table(), up, Overview.load(path)),
-        dense=True,
+        lambda: draw_overview(views.above(record, up), Overview.load(path)),
+        unit=record.unit.slug,
     )
 
 
-def _distributions(kept: list[Record]) -> Iterator[Figure]:
+def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
     if not kept:
         return
 
@@ -91,7 +99,7 @@ def _distributions(kept: list[Record]) -> Iterator[Figure]:
     def of_all() -> dict[str, dict[str, Histograms]]:
         """By backbone and scene."""
         return {
-            backbone: {record.unit.scene: histograms(record.table()) for record in records}
+            backbone: {record.unit.scene: views.sums(record).measures for record in records}
             for backbone, records in by_backbone(kept).items()
         }
 
@@ -120,7 +128,7 @@ def _distributions(kept: list[Record]) -> Iterator[Figure]:
     )
 
 
-def _maps(result: Result, kept: list[Record]) -> Iterator[Figure]:
+def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
         if scene in result.up:
@@ -130,13 +138,13 @@ def _maps(result: Result, kept: list[Record]) -> Iterator[Figure]:
                 "The topmost voxel of each column along the up axis: its stability category and every measure; grey:"
                 " seen once, which says nothing. Values beyond a scale look like its end.",
                 f"Maps of {scene} from above with the stability category and each measure of {backbone}'s voxels.",
-                partial(_draw_map, record, result.up[scene]),
-                dense=True,
+                partial(_draw_map, record, result.up[scene], views),
+                unit=record.unit.slug,
             )
 
 
-def _draw_map(record: Record, up: tuple[float, float, float]) -> Canvas:
-    return draw_stability(record.table(), up)
+def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> Canvas:
+    return draw_stability(views.above(record, up))
 
 
 def _sweeps(result: Result) -> Iterator[Figure]:

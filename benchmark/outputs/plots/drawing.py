@@ -10,8 +10,8 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from semstab.engine.folder import load_result
-from semstab.outputs.plots import figures
+from semstab.model.records import Result
+from semstab.outputs.plots import Views, figures
 from semstab.runtime.process import follow_parent
 
 
@@ -26,15 +26,15 @@ class DrawingProcess:
         with contextlib.suppress(BrokenProcessPool):
             self._given.append(self._pool.submit(_load))
 
-    def draw(self, folder: Path, names: Sequence[str]) -> Callable[[], bool]:
-        """Begin to draw the figures of those names from the finished folder.
+    def draw(self, result: Result, folder: Path, views: Views, names: Sequence[str]) -> Callable[[], bool]:
+        """Begin to draw the figures of those names of a result in the folder.
 
         What is returned waits for them, and says whether they are there: not where the process died, or never came to
         life, as in a script that cannot be imported.
         """
         drawing = None
         with contextlib.suppress(BrokenProcessPool, RuntimeError):
-            drawing = self._pool.submit(_draw, folder, names)
+            drawing = self._pool.submit(_draw, result, folder, views, names)
             self._given.append(drawing)
 
         def drawn() -> bool:
@@ -60,7 +60,7 @@ def _load() -> None:
     import pyarrow.parquet  # noqa: F401
 
 
-def _draw(folder: Path, names: Sequence[str]) -> None:
-    for figure in figures(load_result(folder), folder):
-        if figure.name in names:
-            figure.save(folder / "figures")
+def _draw(result: Result, folder: Path, views: Views, names: Sequence[str]) -> None:
+    found = {figure.name: figure for figure in figures(result, folder, views)}
+    for name in names:
+        found[name].save(folder / "figures")

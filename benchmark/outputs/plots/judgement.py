@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial, reduce
 from operator import add
-from typing import TYPE_CHECKING, Any
-
-import numpy.typing as npt
+from typing import TYPE_CHECKING
 
 from semstab.model.records import Record, Result
 from semstab.model.results import Unit, slug
@@ -23,7 +21,7 @@ from semstab.outputs.plots.statistics import (
     draw_reliability,
 )
 from semstab.outputs.plots.style import Figure
-from semstab.statistics import expected_sbd
+from semstab.outputs.plots.views import Views, column
 from semstab.statistics.agreement import ALPHA, PSA
 from semstab.statistics.comparison import compared
 from semstab.statistics.verdict import RELIABLE, TENTATIVE
@@ -35,15 +33,15 @@ if TYPE_CHECKING:
 Judged = Sequence[tuple[Unit, MapStatistics]]
 
 
-def statistics_figures(result: Result, kept: Sequence[Record]) -> list[Figure]:
+def statistics_figures(result: Result, kept: Sequence[Record], views: Views) -> list[Figure]:
     """Every one for which the study has records; `kept` are the base ones whose voxels were kept."""
     judged = [(record.unit, record.statistics) for record in result.select() if record.statistics is not None]
     return [
         *_agreement(judged),
-        *_drift([record for record in kept if record.statistics is not None]),
+        *_drift([record for record in kept if record.statistics is not None], views),
         *_reliability(judged),
         *_comparison(result),
-        *_maps(result, kept),
+        *_maps(result, kept, views),
         *_sweeps(result),
     ]
 
@@ -74,7 +72,10 @@ def _estimates(judged: Judged, take: Callable[[MapStatistics], Estimate]) -> Row
     return rows
 
 
-def _drift(kept: Sequence[Record]) -> Iterator[Figure]:
+def _drift(kept: Sequence[Record], views: Views) -> Iterator[Figure]:
+    def pooled(records: Sequence[Record]) -> DriftByOP:
+        return reduce(add, (views.sums(record).drift for record in records))
+
     if kept:
         yield Figure(
             "drift",
@@ -83,14 +84,8 @@ def _drift(kept: Sequence[Record]) -> Iterator[Figure]:
             " what the same observations give in the mean of all their orders. Where both coincide, the fall of SBD"
             " with OP is arithmetic. Voxels whose expectation is not known are left out.",
             "One panel a backbone: mean SBD against OP on a logarithmic axis, and a dashed line for random order.",
-            lambda: draw_drift({name: reduce(add, map(_drift_of, rows)) for name, rows in by_backbone(kept).items()}),
+            lambda: draw_drift({name: pooled(records) for name, records in by_backbone(kept).items()}),
         )
-
-
-def _drift_of(record: Record) -> DriftByOP:
-    table = record.table()
-    null = _column(record, "sbd_null")
-    return DriftByOP.of(table, expected_sbd(table) if null is None else null)
 
 
 def _reliability(judged: Judged) -> Iterator[Figure]:
@@ -132,7 +127,7 @@ def _comparison(result: Result) -> Iterator[Figure]:
         )
 
 
-def _maps(result: Result, kept: Sequence[Record]) -> Iterator[Figure]:
+def _maps(result: Result, kept: Sequence[Record], views: Views) -> Iterator[Figure]:
     """Of the studies that were asked for statistics: they kept what the maps show beside the voxels."""
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
@@ -145,24 +140,14 @@ def _maps(result: Result, kept: Sequence[Record]) -> Iterator[Figure]:
                 " once; and where ground truth is known, which voxels are stable and which right.",
                 f"Maps of {scene} from above with the two parts of the entropy of {backbone}'s voxels, and whether they"
                 " are right.",
-                partial(_draw_map, record, result.up[scene]),
-                dense=True,
+                partial(_draw_map, record, result.up[scene], views),
+                unit=record.unit.slug,
             )
 
 
-def _draw_map(record: Record, up: tuple[float, float, float]) -> Canvas:
-    table, truth = record.table(), _column(record, "true_label")
-    return draw_uncertainty(table, up, None if truth is None else right_or_wrong(table, truth))
-
-
-def _column(record: Record, name: str) -> npt.NDArray[Any] | None:
-    """A column that was written beside the voxels; None where it was not."""
-    import pyarrow.parquet as pq
-
-    if name not in pq.read_schema(record.voxels_file).names:
-        return None
-    values: npt.NDArray[Any] = pq.read_table(record.voxels_file, columns=[name]).column(name).to_numpy()
-    return values
+def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> Canvas:
+    above, truth = views.above(record, up), column(record, "true_label")
+    return draw_uncertainty(above, None if truth is None else right_or_wrong(above.table, truth[above.shown]))
 
 
 def _sweeps(result: Result) -> Iterator[Figure]:

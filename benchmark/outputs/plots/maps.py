@@ -18,7 +18,7 @@ from semstab.model.measures import dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
-from semstab.outputs.plots.topdown import EMPTY, Float64, Int64, top_down
+from semstab.outputs.plots.topdown import EMPTY, Float64, FromAbove, Int64
 from semstab.statistics import decompose, psa
 from semstab.statistics.correctness import STABLE
 
@@ -47,9 +47,9 @@ WIDE = 1.4
 """A map this many times as wide as high or more has its panels beneath each other."""
 
 
-def draw_stability(table: VoxelTable, up: Sequence[float]) -> Figure:
+def draw_stability(above: FromAbove) -> Figure:
     """Stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
-    rows, cell = top_down(table, up)
+    table, rows = above.table, above.rows
     shown = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = _panels(rows, 1 + len(shown))
     _draw_categories(figure, kind, rows, categories(table))
@@ -60,16 +60,16 @@ def draw_stability(table: VoxelTable, up: Sequence[float]) -> Figure:
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         _frame(axes)
-        _scale_bar(axes, rows.shape[1], cell)
+        _scale_bar(axes, rows.shape[1], above.cell)
     return figure
 
 
-def draw_uncertainty(table: VoxelTable, up: Sequence[float], wrong: npt.NDArray[np.integer[Any]] | None) -> Figure:
+def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | None) -> Figure:
     """Entropy within and between frames of the topmost voxels and, where truth tells, which are stable and wrong.
 
-    `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel.
+    `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel that is seen.
     """
-    rows, cell = top_down(table, up)
+    table, rows = above.table, above.rows
     figure, panels = _panels(rows, 2 if wrong is None else 3)
     parts, again = decompose(table), table.op > 1
     most = math.log(2) / math.log(table.K)
@@ -84,7 +84,7 @@ def draw_uncertainty(table: VoxelTable, up: Sequence[float], wrong: npt.NDArray[
     for axes, letter, title in zip(panels, "abc", titles, strict=False):
         mark_panel(axes, letter, title)
         _frame(axes)
-        _scale_bar(axes, rows.shape[1], cell)
+        _scale_bar(axes, rows.shape[1], above.cell)
     return figure
 
 
@@ -128,9 +128,9 @@ class Overview:
             ) from error
 
 
-def draw_overview(table: VoxelTable, up: Sequence[float], overview: Overview) -> Figure:
+def draw_overview(above: FromAbove, overview: Overview) -> Figure:
     """Image, prediction and the fused map from above, in one palette."""
-    rows, cell = top_down(table, up)
+    table, rows = above.table, above.rows
     palette: Colors = [(int(r), int(g), int(b)) for r, g, b in overview.palette]
     images = [] if overview.color is None else [("image", overview.color)]
     images.append(
@@ -147,7 +147,7 @@ def draw_overview(table: VoxelTable, up: Sequence[float], overview: Overview) ->
     mark_panel(axes[-1], "abc"[len(images)], "fused, from above")
     for panel in axes:
         _frame(panel)
-    _scale_bar(axes[-1], rows.shape[1], cell)
+    _scale_bar(axes[-1], rows.shape[1], above.cell)
     names = table.classes or tuple(str(k) for k in range(table.K))
     shown = {int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K}
     entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in sorted(shown)]

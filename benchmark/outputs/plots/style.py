@@ -57,8 +57,8 @@ _STYLE: Any = {
 class Figure:
     """A figure of the study: the name of its files, what to write beside it, and what draws it.
 
-    alt    for readers who do not see it
-    dense  whether most of it is an image, so that PNG is the better format on a screen
+    alt   for readers who do not see it
+    unit  whose voxels it shows as a map; empty: it shows none
     """
 
     name: str
@@ -66,7 +66,12 @@ class Figure:
     caption: str
     alt: str
     draw: Callable[[], Canvas]
-    dense: bool = False
+    unit: str = ""
+
+    @property
+    def dense(self) -> bool:
+        """Whether most of it is an image, so that PNG is the better format on a screen."""
+        return bool(self.unit)
 
     def paths(self, folder: Path) -> list[Path]:
         """Its files in a folder: FOLDER/NAME.png and .svg."""
@@ -79,12 +84,29 @@ class Figure:
         png, svg = self.paths(folder)
         with matplotlib.rc_context(_STYLE):
             canvas = self.draw()
+            _without_formulas(canvas)
             with atomic_path(png) as temporary:
                 canvas.savefig(temporary, dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
             canvas.set_layout_engine("none")  # it is laid out by now; doing so again takes as long as drawing it
             with atomic_path(svg) as temporary:
                 canvas.savefig(temporary, dpi=DPI, metadata={"Date": None, "Creator": None})
         return [png, svg]
+
+
+def _without_formulas(canvas: Canvas) -> None:
+    """Take names as they are: a '$' in one begins no formula. Ticks of logarithmic axes are formulas."""
+    from matplotlib.text import Text
+
+    logarithmic = {
+        label
+        for axes in canvas.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        if axis.get_scale() == "log"
+        for label in axis.get_ticklabels(which="both")
+    }
+    for text in canvas.findobj(Text):
+        if text not in logarithmic:
+            text.set_parse_math(False)
 
 
 def canvas(width: float, height: float) -> Canvas:

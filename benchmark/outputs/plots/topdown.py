@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.metrics.matching import rows_of
 from semstab.model.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
@@ -20,7 +22,7 @@ OUTLIERS = 0.002
 """Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
 
 
-def level_axes(up: Sequence[float]) -> tuple[Float64, Float64, Float64]:
+def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
     """Right-handed unit vectors (right, ahead, up): right is the world's x axis, or y where up is x, laid level."""
     up_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     along = np.eye(3)[0 if abs(up_axis[0]) < 0.9 else 1]
@@ -29,7 +31,7 @@ def level_axes(up: Sequence[float]) -> tuple[Float64, Float64, Float64]:
     return right, np.cross(up_axis, right), up_axis
 
 
-def top_down(table: VoxelTable, up: Sequence[float]) -> tuple[Int64, float]:
+def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
     """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
 
     The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
@@ -41,11 +43,7 @@ def top_down(table: VoxelTable, up: Sequence[float]) -> tuple[Int64, float]:
     low, high = np.quantile(plane, [OUTLIERS, 1 - OUTLIERS], axis=0)
     factor = max(1, int(np.ceil((high - low).max() / table.voxel_size / LARGEST)))
     cell = factor * table.voxel_size
-    aligned = np.isclose(np.abs(up_axis).max(), 1.0)
-    reach = 0.0 if aligned or factor > 1 else 0.499 * table.voxel_size
-    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
-    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
-    rows = np.tile(np.arange(len(table)), len(corners))
+    cells, rows = covered(plane, up_axis, table.voxel_size, cell)
     first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
     inside = ((cells >= first) & (cells <= last)).all(axis=1)
     cells, rows = cells[inside] - first, rows[inside]
@@ -53,3 +51,46 @@ def top_down(table: VoxelTable, up: Sequence[float]) -> tuple[Int64, float]:
     image = np.full(last - first + 1, EMPTY, dtype=np.int64)
     image[tuple(cells[order].T)] = rows[order]
     return image[::-1], cell
+
+
+def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tuple[Int64, Int64]:
+    """The cells (m, 2) of an edge, and the voxel (m,) that covers each, by the voxels' centres (n, 2) in the plane.
+
+    Where up is an axis of the world a cell is a column of voxels; else each voxel covers the cells that a level square
+    of its size touches, where a cell is one voxel.
+    """
+    aligned = np.isclose(np.abs(up).max(), 1.0)
+    reach = 0.0 if aligned or cell > voxel_size else 0.499 * voxel_size
+    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
+    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
+    return cells, np.tile(np.arange(len(plane)), len(corners))
+
+
+@dataclass(frozen=True, eq=False)
+class FromAbove:
+    """The voxels that are seen from above.
+
+    table  these voxels alone
+    shown  (n,) whether a voxel of the map is one of them
+    rows   (H, W) the row of each cell's voxel in `table`, EMPTY where there is none
+    cell   the edge of a cell in metres
+    """
+
+    table: VoxelTable
+    shown: npt.NDArray[np.bool_]
+    rows: Int64
+    cell: float
+
+    @property
+    def nbytes(self) -> int:
+        """Of memory, about."""
+        return self.table.evidence.nbytes + self.rows.nbytes + self.shown.nbytes
+
+    @classmethod
+    def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
+        """See `top_down`."""
+        rows, cell = top_down(table, up)
+        shown = np.zeros(len(table), dtype=np.bool_)
+        shown[rows[rows != EMPTY]] = True
+        renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
+        return cls(rows_of(table, shown), shown, renumbered, cell)

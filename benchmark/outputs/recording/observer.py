@@ -24,7 +24,7 @@ from semstab.engine.units import Plan, Planned, PlannedUnit
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.measures import measures
-from semstab.model.records import Result, Variation
+from semstab.model.records import RECORDING_PARTS, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import drift_colors, legend, series
@@ -37,7 +37,7 @@ from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.group import GroupLog
 from semstab.outputs.recording.layout import Known, Scenery, blueprint
 from semstab.outputs.recording.parts import Parts
-from semstab.outputs.recording.target import DEFAULT_URL, Target
+from semstab.outputs.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of
 from semstab.task import Task
 
@@ -57,7 +57,8 @@ class Recording(Observer):
     target  a file, or a `Target`: a file and a viewer
     run     the run folder, from which the recording of a resumed run takes what an earlier start finished
 
-    The file is opened at the first fused frame: a start that finds every group kept leaves an earlier recording alone.
+    The file is opened at the first fused frame: a start that finds every group kept leaves an earlier recording alone,
+    unless a kill cut it: then it is made again, of what the run folder tells.
     Call `close` where a run does not come to its end. Raises ConfigError where the file cannot be written.
     """
 
@@ -80,6 +81,7 @@ class Recording(Observer):
         self._group: GroupLog | None = None  # the backbone on a scene that is being fused
         self._background: Background | None = None
         self._parts: Parts | None = None
+        self._cut = False  # whether there is no earlier recording that is whole
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
         """Keep the plan: layout, names and colours follow from it."""
@@ -87,6 +89,8 @@ class Recording(Observer):
         self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
         first = CHUNKS if self.target.live else FIRST_CHUNKS  # a live viewer keeps the layout that it got first
         self._known.chunks = {task.scene.name: first for task in plan.tasks}
+        unmerged = self._run is not None and (self._run / RECORDING_PARTS).exists()
+        self._cut = unmerged or not is_whole(self.target.file)
 
     def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
         """Keep the map, where it can be followed: the first one of a backbone on a scene will be."""
@@ -166,7 +170,7 @@ class Recording(Observer):
         if self._parts is not None:
             self._finish_parts(self._parts, result)
             return
-        if not self.target.file.exists():
+        if self._cut:
             self._opened()
         if self.target.viewer != "serve":
             self.close()

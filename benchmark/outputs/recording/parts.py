@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from semstab.errors import ConfigError
+from semstab.model.records import RECORDING_PARTS
 from semstab.model.results import slug
 from semstab.outputs.recording.target import Target, rerun_program
+from semstab.runtime.files import atomic_path
 from semstab.task import Task
 
 
@@ -27,10 +29,8 @@ class Parts:
 
     @classmethod
     def of(cls, folder: Path) -> Parts:
-        """In the folder of a run or a study; what an earlier start left there is removed."""
-        parts = folder / "recording"
-        shutil.rmtree(parts, ignore_errors=True)
-        return cls(parts, uuid.uuid4().hex)
+        """In the folder of a run or a study."""
+        return cls(folder / RECORDING_PARTS, uuid.uuid4().hex)
 
     def of_the_whole(self, target: Target) -> Target:
         """Where what all jobs have in common goes, of a recording that is to be that file in the end."""
@@ -44,12 +44,12 @@ class Parts:
         """Make one file of the parts, and remove them. Raises ConfigError where that fails."""
         assert whole.final is not None
         parts = sorted(self.folder.glob("*.rrd"))
-        whole.final.parent.mkdir(parents=True, exist_ok=True)
-        command = [rerun_program(), "rrd", "optimize", *map(str, parts), "-o", str(whole.final)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise ConfigError(
-                f"{whole.final}: the parts in {self.folder} cannot be merged ({done.stderr.strip()[:200]})"
-            )
+        with atomic_path(whole.final) as file:
+            command = [rerun_program(), "rrd", "optimize", *map(str, parts), "-o", str(file)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise ConfigError(
+                    f"{whole.final}: the parts in {self.folder} cannot be merged ({done.stderr.strip()[:200]})"
+                )
         shutil.rmtree(self.folder)
         return Target(whole.final)

@@ -18,9 +18,13 @@ from urllib.parse import urlsplit
 import rerun as rr
 
 from semstab.errors import ConfigError
+from semstab.runtime.files import open_file
 
 DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 CHOICES = "FILE.rrd, spawn, connect, rerun+http://HOST:PORT/proxy, serve, or off"
+
+FOOTER, FOOTER_BYTES = b"RRF2FOOT", 64
+"""How a recording ends, among its last bytes."""
 
 ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
 """How long a viewer may take to answer, and one that is started to listen."""
@@ -95,6 +99,16 @@ class Target:
         if (reason := _why_no_viewer(url)) is not None:
             raise ConfigError(f"{url}: no rerun viewer listens there ({reason}); start one with: rerun")
         return rr.GrpcSink(url)
+
+
+def is_whole(file: Path) -> bool:
+    """Whether a recording was closed: one that was cut by a kill, or by a full disk, has no footer."""
+    try:
+        with open_file(file) as recording:
+            recording.seek(-min(FOOTER_BYTES, recording.seek(0, os.SEEK_END)), os.SEEK_END)
+            return FOOTER in recording.read()
+    except OSError:
+        return False
 
 
 def rerun_program() -> str:

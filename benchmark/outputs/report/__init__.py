@@ -26,7 +26,14 @@ from semstab.outputs.tables.writers import ARROWS, relations, sections
 from semstab.runtime.files import write_text
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from semstab.config import Config
+    from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
+    from semstab.model.results import Unit, UnitSummary
+    from semstab.model.voxels import VoxelTable
     from semstab.outputs.plots.drawing import DrawingProcess
+    from semstab.task import Task
 
 __all__ = ["Reporting", "write_report"]
 
@@ -49,6 +56,22 @@ class Reporting(Observer):
         self._processes = processes
         self._began = time.monotonic()
         self._beside: DrawingProcess | None = None
+        self._views = plots.Views()
+        self._watched = ""
+        self._up: npt.ArrayLike | None = None
+
+    def run_started(self, plan: Plan, kept: Sequence[PlannedUnit | PlannedRegions]) -> None:
+        """Figures show the units of the first backend; of the statistics they show more than the map says."""
+        self._watched = "" if plan.config.statistics else plan.config.backends[0].name
+
+    def group_started(self, task: Task, config: Config) -> None:
+        """Where up is in the scene that is fused now."""
+        self._up = task.scene.up
+
+    def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
+        """Take from the map what figures show of it."""
+        if unit.backend == self._watched:
+            self._views.see(unit, table, self._up)
 
     def advanced(self, frames: int, what: str) -> None:
         """What takes a while is worth a second process for its figures."""
@@ -61,7 +84,7 @@ class Reporting(Observer):
         """Write them; nothing where every unit failed."""
         if result.select():
             write_tables(result, self._folder)
-            plots.write_figures(result, self._folder, self._beside)
+            plots.write_figures(result, self._folder, self._views, self._beside)
             write_report(result, self._folder)
 
     def close(self) -> None:
@@ -244,7 +267,7 @@ def _unfolded(shown: Sequence[Figure], result: Result) -> tuple[list[Figure], li
     first: dict[tuple[str, str], Figure] = {}
     for figure in shown:
         for backbone in result.backbones:
-            if figure.name.endswith(slug("", backbone)):
+            if figure.name.endswith(f"__{slug(backbone)}"):
                 first.setdefault((figure.name.partition("__")[0], backbone), figure)
     return list(first.values()), [figure for figure in shown if figure not in first.values()]
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 from semstab.metrics import macro_mean
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.records import Record, Result
-from semstab.model.statistics import UNDEFINED, DriftTests, Estimate, MapStatistics
+from semstab.model.statistics import UNDEFINED, DriftTests, Estimate, MapStatistics, Reach
 from semstab.outputs.averages import by_backbone
 from semstab.outputs.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
@@ -29,7 +29,13 @@ def temporal_agreement(result: Result) -> list[Table]:
     """Do frames agree about a place? Measures that do not depend on OP."""
     columns = (
         REPEATED,
-        *map(Column.of, (VSS, PSA, KAPPA, ALPHA, FLIP_RATE)),
+        *map(Column.of, (VSS, PSA, KAPPA, ALPHA)),
+        Column("within", "within a frame", 3, "lower", over="Disagreement"),
+        Column("between", "between frames", 3, "lower", over="Disagreement"),
+        Column("alpha_between", "found", 2, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 2, over="Alpha between frames"),
+        Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
+        Column.of(FLIP_RATE),
     )
     numbers: tuple[Number, ...] = (
         lambda found: found.repeated.voxels,
@@ -37,11 +43,18 @@ def temporal_agreement(result: Result) -> list[Table]:
         lambda found: found.agreement.psa,
         lambda found: found.agreement.kappa.value,
         lambda found: found.agreement.alpha,
+        lambda found: found.agreement.within.value,
+        lambda found: found.agreement.between.value,
+        lambda found: found.agreement.alpha_between.value,
+        reached(lambda reach: reach.ceiling.value),
+        reached(lambda reach: reach.reached.percent),
         lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
     )
     caption = (
         f"{SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel; kappa (Fleiss) and alpha (Krippendorff):"
-        " the same beyond chance, 1 perfect, 0 chance; flip rate: share of the steps from one observation to the next"
+        " the same beyond chance, 1 perfect, 0 chance; disagreement: the parts of 1 - PSA within a frame and between"
+        " frames; alpha between frames: of the latter alone, beside its ceiling, that of labels which do not depend on"
+        " the view (in sampled voxels); flip rate: share of the steps from one observation to the next"
         f" at which the predicted class changes. {INTERVALS}"
     )
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
@@ -140,7 +153,9 @@ def verdicts(result: Result) -> list[Table]:
     columns = (
         SCENE,
         Column("verdict", "Verdict"),
-        Column.of(ALPHA),
+        Column("reached_percent", "Reached (%)", 0, "higher"),
+        Column("worst_class", "Worst class"),
+        Column("worst_percent", "reached (%)", 0, "higher"),
         Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
@@ -148,7 +163,8 @@ def verdicts(result: Result) -> list[Table]:
     )
     groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
     caption = (
-        f"{SEEN_TWICE} Decided by the intervals: stable where alpha is at least 0.8, usable from 0.667, unstable below;"
+        f"{SEEN_TWICE} Reached: alpha between frames, in percent of its ceiling. Decided by the intervals: stable where"
+        " it is at least 80 and no class that matters below 67, usable from 67, unstable below;"
         " misleading where more than 5% of the stable places are wrong, which only ground truth tells."
         f" {INTERVALS}"
     )
@@ -200,6 +216,11 @@ def tested(take: Callable[[DriftTests], float]) -> Number:
     return lambda found: math.nan if found.drift.tests is None else take(found.drift.tests)
 
 
+def reached(take: Callable[[Reach], float | Estimate]) -> Number:
+    """A number of the ceiling; NaN where it is not known."""
+    return lambda found: math.nan if found.reach is None else take(found.reach)
+
+
 def _value(found: float | Estimate) -> float:
     return found.value if isinstance(found, Estimate) else found
 
@@ -236,11 +257,13 @@ def _class_rows(judged: Sequence[tuple[Record, MapStatistics]]) -> tuple[Row, ..
 
 
 def _verdict_row(record: Record, found: MapStatistics) -> Row:
-    right = found.correctness
+    right, worst = found.correctness, None if found.reach is None else found.reach.worst
     return (
         record.unit.scene,
         found.verdict.level,
-        found.agreement.alpha,
+        UNDEFINED if found.reach is None else found.reach.reached.percent,
+        "" if worst is None else worst.name,
+        UNDEFINED if worst is None else worst.reached.percent,
         UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
         found.repeated.voxels,
         100 * found.repeated.share,

@@ -13,6 +13,7 @@ from typing import Any
 
 from semstab.outputs.averages import Spread
 from semstab.outputs.tables.table import Cell, Column, Table
+from semstab.runtime.files import csv_text
 from semstab.statistics import Estimate
 
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
@@ -114,7 +115,7 @@ def _json_cell(cell: Cell) -> Any:
 
 def _leading(table: Table, cell: str) -> list[str]:
     """The leading column, where the groups have names."""
-    return [cell] if table.by else []
+    return [csv_text(cell)] if table.by else []
 
 
 def _csv_parts(cells: Sequence[Cell]) -> list[str]:
@@ -126,7 +127,7 @@ def _csv_parts(cells: Sequence[Cell]) -> list[str]:
 
 def _csv_cells(column: Column, cell: Cell, parts: Sequence[str]) -> list[str]:
     if isinstance(cell, str):
-        return [cell, *[""] * (len(parts) - 1)]
+        return [csv_text(cell), *[""] * (len(parts) - 1)]
     if isinstance(cell, Estimate):
         values = [cell.value, cell.low, cell.high]
     else:

@@ -1,0 +1,195 @@
+"""A model that a user brings as a class or a function: an image in, labels or scores out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
+from semstab.backbones.outside.code import Code, guarded
+from semstab.backbones.wrapped import Wrapped
+from semstab.errors import ConfigError, DataError
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+
+
+class OwnOptions(BaseModel):
+    """What the code is called with, and the names of its classes."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    classes: list[str] | str | None = Field(
+        None, description="names in the order of ids; or a file: a name a line, or a taxonomy's YAML; the code's own"
+    )
+
+
+class Own:
+    """Makes backbones of a user's class or function; has `Options` and is called with them, like a backbone's class."""
+
+    def __init__(self, text: str) -> None:
+        self.code = Code.load(text)
+        self._is_backbone = isinstance(self.code.target, type) and Backbone in self.code.target.__mro__
+        own = getattr(self.code.target, "Options", None) if self._is_backbone else None
+        self.has_options = isinstance(own, type) and issubclass(own, BaseModel)
+        self.Options: type[BaseModel] = own if self.has_options and own is not None else OwnOptions
+
+    def __call__(self, options: BaseModel) -> Backbone:
+        """The backbone. Raises ConfigError, DataError, MissingDependencyError, each in one line."""
+        code = self.code
+        if self.has_options:
+            return OfCode(guarded(code.text, lambda: code.target(options)), code, {})
+        assert isinstance(options, OwnOptions)
+        extra = dict(options.model_extra or {})
+        if self._is_backbone:
+            code.accepts(extra)
+            return OfCode(guarded(code.text, lambda: code.target(**extra)), code, extra)
+        return OwnModel(code, extra, options.classes)
+
+
+class OfCode(Wrapped):
+    """A backbone of a user's own class: its file is part of what its predictions are kept under."""
+
+    def __init__(self, inner: Backbone, code: Code, options: Mapping[str, Any]) -> None:
+        super().__init__(inner)
+        self._about = {"code": code.digest, "options": contents(options)}
+
+    def identity(self) -> dict[str, Any]:
+        """Its own, its file and its options."""
+        return {**self.inner.identity(), **self._about}
+
+
+class OwnModel(Backbone):
+    """A function of an image (H, W, 3) uint8 RGB, or an object with such a method `predict`, or that is called so.
+
+    It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
+    0 where it says nothing; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say `classes`,
+    `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and frame).
+    """
+
+    def __init__(self, code: Code, options: Mapping[str, Any], classes: Sequence[str] | str | None) -> None:
+        self._code, self._options = code, options
+        made: Any = code.target
+        if isinstance(code.target, type):
+            code.accepts(dict(options))
+            made = guarded(code.text, lambda: code.target(**options))
+            self._call: Callable[..., Any] = getattr(made, "predict", made)
+        else:
+            self._call = partial(code.target, **options)
+        if not callable(self._call):
+            raise ConfigError(f"{code.text}: has no method predict(image), and cannot be called with an image")
+        self._made = made
+        self.label_space = _label_space(code, made, classes)
+        self.gives_scores = bool(getattr(made, "gives_scores", True))
+        self.sequential = bool(getattr(made, "sequential", False))
+        self.wants_geometry = bool(getattr(made, "wants_geometry", False))
+        if self.sequential and not hasattr(made, "reset"):
+            raise ConfigError(f"{code.text}: a sequential model needs a method reset(), called before each sequence")
+        if not isinstance(code.target, type):
+            code.accepts(dict(options), *([None] * (1 + self.wants_geometry)))
+
+    def reset(self) -> None:
+        """Forget all images."""
+        guarded(self._code.text, self._made.reset)
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`. Raises DataError for an answer that is neither labels nor scores."""
+        shown = zip(images, geometry, strict=True) if self.wants_geometry else zip(images, strict=True)
+        return [self._one(image, frame, scores) for image, *frame in shown]
+
+    def identity(self) -> dict[str, Any]:
+        """Its file, its options, its classes."""
+        assert self.label_space is not None
+        about = {"code": self._code.digest, "name": self._code.name, "options": contents(self._options)}
+        return {**about, "classes": list(self.label_space.classes)}
+
+    def _one(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
+        found = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
+        shape, K = image.shape[:2], len(self.label_space or ())
+        if found.shape == shape and found.dtype.kind in "iu":
+            if scores:
+                raise DataError(
+                    f"{self._code.text}: gives labels, no scores; leave scores out, or let it give (H, W, K)"
+                )
+            return Prediction(_ids(found, K, self._code.text))
+        if found.shape == (*shape, K) and found.dtype.kind == "f":
+            soft = found.astype(np.float32, copy=False)
+            return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None)
+        raise DataError(
+            f"{self._code.text}: gave {found.dtype} of shape {found.shape} for an image of {shape}; give labels"
+            f" {shape} of whole numbers, or scores {(*shape, K)}"
+        )
+
+
+def contents(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by what they say; a file or a folder by what is in it."""
+    return {key: _content(value) for key, value in options.items()}
+
+
+def is_path(value: Any) -> bool:
+    """Whether an option names a file or a folder that is there."""
+    return isinstance(value, str) and bool(Path(value).suffix or "/" in value) and Path(value).expanduser().exists()
+
+
+def _content(value: Any) -> Any:
+    if not is_path(value):
+        return value
+    path = Path(value).expanduser()
+    digest = hashlib.blake2b(digest_size=16)
+    for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
+        digest.update(b"" if file == path else str(file.relative_to(path)).encode() + b"\0")
+        with file.open("rb") as opened:
+            digest.update(hashlib.file_digest(opened, "blake2b").digest())
+    return digest.hexdigest()
+
+
+def _array(found: Any) -> npt.NDArray[Any]:
+    """An array of what a model gives; tensors come from where they are."""
+    return np.asarray(found.detach().cpu().numpy() if hasattr(found, "detach") else found)
+
+
+def _ids(found: npt.NDArray[Any], classes: int, who: str) -> Labels:
+    """Labels as the narrowest type. Raises DataError for one that is no class and not ignored."""
+    ignore = IGNORE_8BIT if classes <= IGNORE_8BIT else IGNORE_16BIT
+    wrong = (found >= classes) & (found != ignore)
+    if wrong.any():
+        raise DataError(f"{who}: gave the label {found[wrong][0]}, but has {classes} classes, 0 to {classes - 1}")
+    return narrowed(np.where(found < 0, ignore, found), classes)
+
+
+def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> LabelSpace:
+    found = class_names(classes) if classes is not None else None
+    for owner in (made, code.module):
+        for name in ("label_space", "classes", "names", "CLASSES"):
+            found = getattr(owner, name, None) if found is None else found
+    if isinstance(found, LabelSpace):
+        return found
+    if isinstance(found, Mapping):  # from ids, as Ultralytics has it
+        found = [found[k] for k in sorted(found)]
+    if found is None or isinstance(found, str) or not all(isinstance(name, str) for name in found):
+        raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or say --classes a,b,c")
+    return LabelSpace(code.name, tuple(found))
+
+
+def class_names(said: Sequence[str] | str) -> Sequence[str] | LabelSpace:
+    """'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML. Raises ConfigError for an empty one."""
+    if not isinstance(said, str):
+        return said
+    path = Path(said).expanduser()
+    if path.suffix in (".yaml", ".yml"):
+        return LabelSpace.load(path)
+    if path.suffix and path.is_file():
+        names = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    else:
+        names = [name.strip() for name in said.split(",")]
+    if not (found := [name for name in names if name]):
+        raise ConfigError(f"classes {said}: holds no name")
+    return found

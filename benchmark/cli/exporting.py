@@ -1,0 +1,54 @@
+"""The command export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from semstab.cli.options import Quiet
+
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
+Backbone = Annotated[str | None, typer.Option("--backbone", "-m", help="Label source; needed where there are several.")]
+Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map; the run's first backend by default.")]
+
+
+def export(
+    run: Run,
+    to: Annotated[
+        list[Path], typer.Option("--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet or .csv; repeatable.")
+    ],
+    scene: Scene = None,
+    backbone: Backbone = None,
+    backend: Backend = None,
+    measure: Annotated[
+        list[str] | None, typer.Option(help="Column that goes along: vss, sbd, entropy, margin, op, ...; repeatable.")
+    ] = None,
+    min_op: Annotated[int, typer.Option(min=1, help="Only voxels that so many frames saw.")] = 1,
+    classes: Annotated[list[str] | None, typer.Option("--class", help="Only voxels of this class; repeatable.")] = None,
+    cell: Annotated[int, typer.Option(min=1, help="Edge of a cell of .tif, in voxels.")] = 1,
+    asprs: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML 'CLASS: CODE' for .las and .laz.")] = None,
+    onto: Annotated[
+        Path | None, typer.Option(metavar="CLOUD", help="Classify this .las, .laz or .ply cloud, and write it.")
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(min=0, help="Metres from a point to the voxel that it may take; a voxel's edge.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """The fused map as a point cloud, raster, mesh or table, with how far to trust each place."""
+    from rich.console import Console
+
+    from semstab.outputs.export import export as write
+
+    unit = {"scene": scene, "backbone": backbone, "backend": backend}
+    written = write(
+        run, to, **unit, measures=measure, min_op=min_op, classes=classes or (),
+        cell=cell, asprs=asprs, onto=onto, radius=radius,
+    )  # fmt: skip
+    console = Console(quiet=quiet)
+    for file in written:
+        for line in (f"{file.path}: {file.content}", *(f"  {remark}" for remark in file.remarks)):
+            console.print(line, soft_wrap=True, markup=False, highlight=False)

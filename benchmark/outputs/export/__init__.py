@@ -1,0 +1,115 @@
+"""What a finished run found, for other programs: point clouds, rasters, meshes and tables, in global coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from semstab.config import nearest
+from semstab.engine.folder import load_result
+from semstab.errors import ConfigError
+from semstab.outputs.export import las, mesh, ply, raster, tabular
+from semstab.outputs.export.onto import MEASURES as ONTO_MEASURES
+from semstab.outputs.export.onto import classify
+from semstab.outputs.export.voxels import Voxels, crs_name, voxels_of
+
+__all__ = ["SUFFIXES", "Exported", "export"]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written: what it holds, in a line, and what its reader has to know."""
+
+    path: Path
+    content: str
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What some formats take: a raster's cell in voxels, a table of ASPRS codes."""
+
+    cell: int = 1
+    asprs: Path | None = None
+
+
+Writer = Callable[[Voxels, Path, Settings], None]
+
+WRITERS: Mapping[str, Writer] = {
+    ".ply": lambda voxels, path, settings: ply.write(voxels, path),
+    ".las": lambda voxels, path, settings: las.write(voxels, path, settings.asprs),
+    ".laz": lambda voxels, path, settings: las.write(voxels, path, settings.asprs),
+    ".tif": lambda voxels, path, settings: raster.write(voxels, path, settings.cell),
+    ".glb": lambda voxels, path, settings: mesh.write(voxels, path),
+    ".parquet": lambda voxels, path, settings: tabular.write_parquet(voxels, path),
+    ".csv": lambda voxels, path, settings: tabular.write_csv(voxels, path),
+}
+
+SUFFIXES = tuple(WRITERS)
+
+
+def export(
+    run: str | Path,
+    to: str | Path | Sequence[str | Path],
+    *,
+    scene: str | None = None,
+    backbone: str | None = None,
+    backend: str | None = None,
+    measures: Sequence[str] | None = None,
+    min_op: int = 1,
+    classes: Sequence[str] = (),
+    cell: int = 1,
+    asprs: str | Path | None = None,
+    onto: str | Path | None = None,
+    radius: float | None = None,
+) -> list[Exported]:
+    """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
+
+    scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
+    measures  columns that go along: measures, op, category, psa, or what the run's Parquet file has
+    min_op, classes  only voxels seen that often, of these dominant classes
+    cell      edge of a raster's cell, in voxels
+    asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
+    onto      a cloud: what is written is this cloud, classified; a point outside of all voxels takes the nearest one
+              within `radius` metres, a voxel's edge where not given
+
+    Raises ConfigError, DataError, MissingDependencyError, each with the file.
+    """
+    files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
+    for file in files:
+        if file.suffix.lower() not in WRITERS:
+            raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
+    result = load_result(run)
+    record = result.record(scene=scene, backbone=backbone, backend=backend)
+    settings = Settings(cell, None if asprs is None else Path(asprs))
+
+    def chosen(usual: Sequence[str] | None) -> Voxels:
+        return voxels_of(result, record, columns=measures or usual, min_op=min_op, classes=classes)
+
+    if onto is not None:
+        return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]
+    return [
+        _written(chosen(raster.MEASURES if file.suffix.lower() == ".tif" else None), file, settings) for file in files
+    ]
+
+
+def _written(voxels: Voxels, file: Path, settings: Settings) -> Exported:
+    kind = file.suffix.lower()
+    WRITERS[kind](voxels, file, settings)
+    where = "coordinates of the scene, which has no georeference"
+    where = where if voxels.georeference is None else crs_name(voxels.georeference)
+    return Exported(file, f"{len(voxels.table):,} voxels, {where}", tuple(_remarks(voxels, kind, settings)))
+
+
+def _classified(voxels: Voxels, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:
+    tally = classify(voxels, cloud, file, voxels.table.voxel_size if radius is None else radius, settings.asprs)
+    share = tally.classified / tally.points
+    content = f"{tally.points:,} points, {share:.1%} of them classified"
+    return Exported(file, content, tuple(_remarks(voxels, file.suffix.lower(), settings)))
+
+
+def _remarks(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
+    if kind in (".las", ".laz") and (names := list(las.without_code(voxels, settings.asprs))):
+        listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        yield f"without ASPRS code (--asprs): {listed}; their classification is 1, dimension 'class' tells them apart"

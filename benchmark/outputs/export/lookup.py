@@ -1,0 +1,72 @@
+"""Which voxel a point belongs to: the one that it lies in, else the nearest within a radius."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.metrics.matching import voxel_keys
+from semstab.outputs.export.voxels import Voxels
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+NONE = -1
+"""The row of a point that belongs to no voxel."""
+
+
+class VoxelLookup:
+    """Finds voxels by coordinates, those of the export; a radius of 0 takes no neighbours. Its memory is the map's."""
+
+    def __init__(self, voxels: Voxels, radius: float) -> None:
+        self._table, self._offset, self._radius = voxels.table, voxels.offset, radius
+        index = self._table.index.astype(np.int64)
+        self._low, self._high = index.min(axis=0), index.max(axis=0)
+        (self._keys,) = voxel_keys(index)
+
+    @property
+    def bounds(self) -> tuple[Float64, Float64]:
+        """(3,) the lowest and the highest coordinates that may belong to a voxel, metres."""
+        r = self._table.voxel_size
+        return self._low * r + self._offset - self._radius, (self._high + 1) * r + self._offset + self._radius
+
+    def rows(self, points: Float64) -> Int64:
+        """(n,) the voxel of each point (n, 3), a row of the table, or NONE."""
+        points = points - self._offset
+        index = np.floor(points / self._table.voxel_size).astype(np.int64)
+        inside = np.flatnonzero(((index >= self._low) & (index <= self._high)).all(axis=1))
+        rows = np.full(len(points), NONE)
+        keys = np.ravel_multi_index(tuple((index[inside] - self._low).T), tuple(self._high - self._low + 1))
+        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        met = self._keys[at] == keys
+        rows[inside[met]] = at[met]
+        if self._radius > 0:
+            lost = np.flatnonzero(rows == NONE)
+            rows[lost] = self._nearest(points[lost])
+        return rows
+
+    def _nearest(self, points: Float64) -> Int64:
+        """(n,) the voxel whose centre is nearest to each point of the scene, within the radius."""
+        low, high = (edge - self._offset for edge in self.bounds)
+        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+        rows = np.full(len(points), NONE)
+        _, found = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
+        rows[near] = np.where(found < len(self._table), found, NONE)
+        return rows
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self._table.centers)
+
+
+def for_points(values: npt.NDArray[Any], rows: Int64) -> npt.NDArray[Any]:
+    """Values (n,) of the voxels for points (m,) by their rows; 0 where a point has none."""
+    return np.append(values, np.zeros(1, values.dtype))[rows]

@@ -1,0 +1,190 @@
+"""A given cloud, classified: each point takes what is known of its voxel; the cloud is never whole in memory."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.errors import ConfigError, DataError, one_line
+from semstab.outputs.export import las, ply
+from semstab.outputs.export.lookup import NONE, VoxelLookup, for_points
+from semstab.outputs.export.voxels import Voxels
+from semstab.runtime.files import atomic_path
+
+if TYPE_CHECKING:
+    import laspy
+
+CHUNK = 1_000_000
+"""Points at a time."""
+
+MEASURES = ("vss", "op", "category")
+"""What a point takes beside its class where nothing is chosen."""
+
+BEFORE = "classification_before"
+"""The extra dimension that keeps what a LAS cloud was classified as."""
+
+OLD_CODES = 31
+"""The largest code that the point formats before LAS 1.4 have room for."""
+
+Finder = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.int64]]
+Writer = Callable[[Voxels, Path, Path, Finder], None]
+
+
+@dataclass
+class Tally:
+    """How many points there were, how many of them have a voxel, and where they lie."""
+
+    points: int = 0
+    classified: int = 0
+    low: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
+    high: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
+
+    def add(self, points: npt.NDArray[np.float64], rows: npt.NDArray[np.int64]) -> None:
+        """A chunk of points (n, 3) with the rows (n,) of their voxels."""
+        self.points += len(points)
+        self.classified += int(np.count_nonzero(rows != NONE))
+        self.low = np.minimum(self.low, points.min(axis=0, initial=np.inf))
+        self.high = np.maximum(self.high, points.max(axis=0, initial=-np.inf))
+
+
+def classify(voxels: Voxels, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> Tally:
+    """Write the cloud with all its fields, and class, classification (LAS) and the voxels' columns.
+
+    A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else all
+    it takes is 0, class 0 'unclassified'. Classes count from 1.
+    Raises ConfigError for files of different or unknown kinds, DataError for a damaged cloud, or one beside the map.
+    """
+    of_las = partial(_classify_las, asprs=asprs)
+    kinds: dict[str, Writer] = {".las": of_las, ".laz": of_las, ".ply": _classify_ply}
+    write = kinds.get(cloud.suffix.lower())
+    if write is None:
+        raise ConfigError(f"{cloud}: a cloud is a .las, .laz or .ply file")
+    if kinds.get(out.suffix.lower()) is not write:
+        raise ConfigError(f"{out}: {cloud.name} stays what it is; write {out.with_suffix(cloud.suffix)}")
+    if out.exists() and out.samefile(cloud):
+        raise ConfigError(f"{out}: is the cloud itself; choose another file")
+    lookup, tally = VoxelLookup(voxels, radius), Tally()
+    with atomic_path(out) as temporary:
+        write(voxels, cloud, temporary, _finder(lookup, tally))
+        if not tally.classified:
+            raise _beside(cloud, tally.low, tally.high, lookup)
+    return tally
+
+
+def _finder(lookup: VoxelLookup, tally: Tally) -> Finder:
+    def find(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+        rows = lookup.rows(points)
+        tally.add(points, rows)
+        return rows
+
+    return find
+
+
+def _beside(cloud: Path, low: Any, high: Any, lookup: VoxelLookup) -> DataError:
+    there, here = (
+        " to ".join("(" + ", ".join(f"{value:.1f}" for value in corner) + ")" for corner in box)
+        for box in ((low, high), lookup.bounds)
+    )
+    return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; mend its coordinates")
+
+
+# --- LAS --------------------------------------------------------------------------------------------------------------
+
+
+def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
+    library = las.library(cloud)
+    try:
+        with library.open(cloud) as reader:
+            _require_same_crs(voxels, reader.header, cloud)
+            header = _extended(reader.header, voxels)
+            compress = out.suffix.lower() == ".laz"
+            with library.open(out, mode="w", header=header, do_compress=compress) as writer:
+                for points in reader.chunk_iterator(CHUNK):
+                    writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
+    except (OSError, ValueError, library.errors.LaspyException) as error:
+        raise DataError(f"{cloud}: cannot be read ({one_line(error)})") from error
+
+
+def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:
+    """The cloud's header with the dimensions that its points take."""
+    extended = copy.deepcopy(header)
+    extended.vlrs = type(header.vlrs)(
+        vlr for vlr in header.vlrs if vlr.user_id != "copc"
+    )  # the order of points is none
+    las.declare(extended, BEFORE, np.uint8, "what was there before")
+    las.declare(extended, "class", voxels.classified.dtype, "1 to K; 0 unclassified")
+    for name, column in voxels.columns.items():
+        las.declare_column(extended, name, column)
+    las.describe(extended, voxels)
+    return extended
+
+
+def _classified_points(
+    points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, voxels: Voxels, find: Finder, asprs: Path | None
+) -> laspy.ScaleAwarePointRecord:
+    """A chunk with what its points take."""
+    rows = find(np.stack([points.x, points.y, points.z], axis=1))
+    taken = type(points).zeros(len(points), header=header)
+    taken.copy_fields_from(points)
+    if BEFORE not in points.point_format.dimension_names:
+        taken[BEFORE] = points.classification
+    label = for_points(voxels.classified, rows)
+    codes = las.codes(voxels, asprs)
+    if header.point_format.id < las.FIRST_OF_1_4:
+        codes[codes > OLD_CODES] = las.UNCLASSIFIED
+    taken.classification = codes[label]
+    taken["class"] = label
+    for name, column in voxels.columns.items():
+        taken[name] = for_points(ply.as_stored(column.values), rows)
+    return taken
+
+
+def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> None:
+    """Raise DataError where cloud and run say different projections."""
+    said = header.parse_crs()
+    if said is None or voxels.georeference is None:
+        return
+    from pyproj import CRS
+
+    flat = said.sub_crs_list[0] if said.is_compound else said
+    there, here = (crs.to_epsg() for crs in (flat, CRS.from_wkt(voxels.georeference.crs)))
+    if there is not None and here is not None and there != here:
+        raise DataError(f"{cloud}: is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
+
+
+# --- PLY --------------------------------------------------------------------------------------------------------------
+
+
+def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
+    with cloud.open("rb") as source, out.open("wb") as target:
+        header = ply.Header.read(source, cloud)
+        own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
+        stored = {name: ply.as_stored(column.values) for name, column in voxels.columns.items()}
+        taken = {"class": voxels.classified, **stored}
+        dtype = np.dtype([*(own | {name: values.dtype for name, values in taken.items()}).items()])
+        comments = dict.fromkeys((*header.comments, *ply.legend(voxels)))
+        target.write(ply.Header(dtype, header.count, 0, tuple(comments)).text())
+        for points in _ply_chunks(source, header, cloud):
+            rows = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
+            chunk = np.empty(len(points), dtype)
+            for name in own:
+                chunk[name] = points[name]
+            for name, values in taken.items():
+                chunk[name] = for_points(values, rows)
+            target.write(chunk.tobytes())
+
+
+def _ply_chunks(source: Any, header: ply.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
+    for first in range(0, header.count, CHUNK):
+        wanted = min(CHUNK, header.count - first)
+        points = np.fromfile(source, header.dtype, wanted)
+        if len(points) < wanted:
+            raise DataError(f"{cloud}: ends after {first + len(points):,} of {header.count:,} points; it is cut short")
+        yield points

@@ -1,0 +1,166 @@
+"""The voxels of a finished unit that are to leave it: which of them, what is said of each, where they lie on Earth."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.config import nearest
+from semstab.errors import ConfigError, DataError
+from semstab.metrics import categories
+from semstab.metrics.matching import rows_of
+from semstab.model.georeference import Georeference
+from semstab.model.labels import PALETTE, name_key
+from semstab.model.measures import dominant, measures
+from semstab.model.records import OVERVIEW, Record, Result
+from semstab.model.results import slug
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.plots.maps import Overview
+from semstab.statistics import psa
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A number of each voxel (n,), its unit, and what it is in a few words."""
+
+    values: npt.NDArray[Any]
+    unit: str = ""
+    about: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """The voxels of a map that are exported, in the order of its table.
+
+    table        their rows
+    columns      what is said of each, by name
+    classes      K names
+    colors       (K, 3) RGB
+    taxonomy     whose classes they are
+    up           (3,) the scene's up axis, None where it is not known
+    georeference of the scene, None where it has none
+    """
+
+    table: VoxelTable
+    columns: Mapping[str, Column]
+    classes: tuple[str, ...]
+    colors: npt.NDArray[np.uint8]
+    taxonomy: str
+    up: tuple[float, float, float] | None
+    georeference: Georeference | None
+
+    @property
+    def points(self) -> Float64:
+        """(n, 3) centres: global coordinates where there is a georeference, else the scene's; metres."""
+        return self.table.centers + self.offset
+
+    @property
+    def offset(self) -> Float64:
+        """(3,) what leads from the scene's coordinates to those of the file."""
+        return np.zeros(3) if self.georeference is None else np.array(self.georeference.offset)
+
+    @property
+    def classified(self) -> npt.NDArray[np.unsignedinteger[Any]]:
+        """(n,) dominant class in 8 or 16 bits, counted from 1: 0 is 'unclassified' in what is exported."""
+        return (dominant(self.table) + 1).astype(np.min_scalar_type(self.table.K))
+
+
+def voxels_of(
+    result: Result,
+    record: Record,
+    *,
+    columns: Sequence[str] | None = None,
+    min_op: int = 1,
+    classes: Sequence[str] = (),
+) -> Voxels:
+    """Those of a unit with OP >= min_op and one of these dominant classes, all where none is named.
+
+    `columns` names measures, op, category, psa, or columns of the unit's Parquet file; where not given, see `usual`.
+    Raises ConfigError for a name that is not there, and where no voxel is left.
+    """
+    if record.voxels_file is None:
+        raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
+    table = record.table()
+    names = table.classes or tuple(str(k) for k in range(table.K))
+    keep = table.op >= min_op
+    if classes:
+        keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
+    if not keep.any():
+        limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
+        raise ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {int(table.op.max(initial=0))}")
+    chosen = {name: _column(name, table, record.voxels_file) for name in columns or usual()}
+    scene, backbone = record.unit.scene, record.unit.backbone
+    georeference = result.georeference.get(scene)
+    return Voxels(
+        rows_of(table, keep),
+        {name: Column(column.values[keep], column.unit, column.about) for name, column in chosen.items()},
+        names,
+        _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, backbone)}.npz", table.K),
+        record.summary.taxonomy,
+        result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
+        georeference,
+    )
+
+
+def crs_name(georeference: Georeference) -> str:
+    """What a reference system is called, with its number where there is one: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
+    name = re.search(r'"([^"]*)"', georeference.crs)
+    number = re.search(r'ID\["EPSG",\s*(\d+)\]\s*\]\s*$', georeference.crs)
+    return f"{name[1] if name else 'a projection'}{f' (EPSG:{number[1]})' if number else ''}"
+
+
+def usual() -> tuple[str, ...]:
+    """The columns that go along where none is chosen: the measures, OP, category."""
+    return (*(measure.key for measure in measures()), "op", "category")
+
+
+def rows_named(wanted: Sequence[str], names: Sequence[str], where: str) -> list[int]:
+    """The rows of classes by name. Raises ConfigError with the nearest known one."""
+    known = {name_key(name): row for row, name in enumerate(names)}
+    for name in wanted:
+        if name_key(name) not in known:
+            raise ConfigError(f"{where}: no class '{name}'; {nearest(name, names)}")
+    return [known[name_key(name)] for name in wanted]
+
+
+def _column(name: str, table: VoxelTable, file: Path) -> Column:
+    """A number of each voxel by its name."""
+    known = {measure.key: measure for measure in measures()}
+    if name in known:
+        return Column(known[name].of(table), known[name].unit, known[name].title)
+    if name == "op":
+        return Column(table.op, "frames", "observations")
+    if name == "category":
+        return Column(categories(table), "", "0 low 1 drift 2 uncert 3 stable")
+    if name == "psa":
+        return Column(psa(table), "", "pairwise semantic agreement")
+    return _kept_column(name, file, known)
+
+
+def _kept_column(name: str, file: Path, known: Iterable[str]) -> Column:
+    """A column that the run wrote beside those that every map has."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    kept = [field.name for field in pq.read_schema(file) if not pa.types.is_nested(field.type)]
+    if name not in kept:
+        there = sorted({*known, "op", "category", "psa", *kept} - {"ix", "iy", "iz", "label"})
+        raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, there)}")
+    return Column(pq.read_table(file, columns=[name]).column(name).to_numpy())
+
+
+def _colors(overview: Path, K: int) -> npt.NDArray[np.uint8]:
+    """Of the classes, as the run's figures show them; of the palette where it kept none."""
+    try:
+        palette = Overview.load(overview).palette
+    except DataError:
+        palette = np.array([PALETTE[k % len(PALETTE)] for k in range(K)], dtype=np.uint8)
+    return palette

@@ -1,0 +1,71 @@
+"""What figures show of units' voxels, each table read once; the figures of a unit are drawn one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy.typing as npt
+
+from semstab.model.records import Record, Tables
+from semstab.model.results import Unit
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.plots.histograms import Histograms, histograms
+from semstab.outputs.plots.statistics import DriftByOP
+from semstab.outputs.plots.topdown import FromAbove
+from semstab.statistics import expected_sbd
+
+LARGEST = 2e8
+"""Bytes of views that are kept in memory; those of further units are made from the units' files."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """A unit's voxels by OP: each measure, and SBD beside random order."""
+
+    measures: Histograms
+    drift: DriftByOP
+
+
+class Views:
+    """The sums of every unit that was asked for or seen, and views from above: of the last one, and of units seen."""
+
+    def __init__(self) -> None:
+        self._tables = Tables()
+        self._sums: dict[str, Sums] = {}
+        self._above: dict[str, FromAbove] = {}
+        self._last: tuple[str, FromAbove] | None = None
+
+    def see(self, unit: Unit, table: VoxelTable, up: npt.ArrayLike | None) -> None:
+        """Take what figures show of a unit while its map is in memory; from above where up is known."""
+        self._sums[unit.slug] = Sums(histograms(table), DriftByOP.of(table, expected_sbd(table)))
+        if up is not None and sum(above.nbytes for above in self._above.values()) < LARGEST:
+            self._above[unit.slug] = FromAbove.of(table, up)
+
+    def sums(self, record: Record) -> Sums:
+        """The unit's voxels by OP."""
+        slug = record.unit.slug
+        if slug not in self._sums:
+            table, null = self._tables.of(record), column(record, "sbd_null")
+            drift = DriftByOP.of(table, expected_sbd(table) if null is None else null)
+            self._sums[slug] = Sums(histograms(table), drift)
+        return self._sums[slug]
+
+    def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
+        """The unit's voxels that are seen from above."""
+        slug = record.unit.slug
+        if slug in self._above:
+            return self._above[slug]
+        if self._last is None or self._last[0] != slug:
+            self._last = slug, FromAbove.of(self._tables.of(record), up)
+        return self._last[1]
+
+
+def column(record: Record, name: str) -> npt.NDArray[Any] | None:
+    """A column that was written beside the voxels; None where it was not."""
+    import pyarrow.parquet as pq
+
+    if name not in pq.read_schema(record.voxels_file).names:
+        return None
+    values: npt.NDArray[Any] = pq.read_table(record.voxels_file, columns=[name]).column(name).to_numpy()
+    return values

@@ -1,0 +1,46 @@
+"""The compiled pass over a frame's pixels that finds those which show a sampled voxel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.backends.shared.hashing import mix
+from semstab.runtime.compiled import serial
+
+CELLS = 4
+"""Cells along a voxel's edge; two bits an axis."""
+
+
+@serial
+def draw(depth, valid, ray_x, ray_y, T, size, origin, reach, share, cell, drawn, pixel):
+    """The cell, hash and number of each pixel that shows a sampled voxel; returns how many there are.
+
+    The order of operations is the protocol's. A cell's key is its voxel's (19 bits an axis) with 2 bits an axis more.
+    """
+    n = 0
+    H, W = depth.shape
+    for v in range(H):
+        for u in range(W):
+            if not valid[v, u]:
+                continue
+            z = np.float64(depth[v, u])
+            x, y = ray_x[u] * z, ray_y[v] * z
+            key = np.int64(0)
+            child = np.int64(0)
+            h = np.uint64(0)
+            inside = True
+            for i in range(3):
+                at = (((T[i, 0] * x + T[i, 1] * y) + T[i, 2] * z) + T[i, 3]) / size
+                q = np.floor(at)
+                relative = np.int64(q) - origin[i] + reach
+                inside = inside and relative >= 0 and relative < 2 * reach
+                key = (key << np.int64(19)) | relative
+                child = child * CELLS + min(np.int64((at - q) * CELLS), np.int64(CELLS - 1))
+                h = mix(h ^ np.uint64(np.int64(q)))
+            hashed = h >> np.uint64(32)
+            if inside and hashed < share:
+                cell[n] = (key << np.int64(6)) | child
+                drawn[n] = hashed
+                pixel[n] = v * W + u
+                n += 1
+    return n

@@ -1,0 +1,162 @@
+"""The compiled pass over the log that adds up what each frame contributed to each cube of space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.runtime.compiled import serial
+from semstab.statistics.kernels import CHUNKS
+
+(VOXELS, PSA, OBSERVATIONS, AGREEING, OWN, TWICE, TWICE_AGREEING, RECURRENT, VSS, ENTROPY) = range(10)
+"""The columns that every map has, before those by class."""
+
+(KNOWN, RIGHT, LOOKS, LOOKS_RIGHT, STABLE, STABLE_WRONG) = range(6)
+"""The columns with ground truth, counted from the first of them."""
+
+
+@serial
+def _classes_of(log, first, T, rows, total, squares, own, active):
+    """A voxel's observations as dense rows (T, K), which are 0 before, their sums by class and those of squares.
+
+    log is (starts, label, weight) of all observations. Returns how many classes the voxel ever saw: those in `active`,
+    ascending; total and squares are of these only.
+    """
+    at, label, weight = log
+    A = 0
+    for t in range(T):
+        own[t] = 0.0
+        for e in range(at[first + t], at[first + t + 1]):
+            k = np.int64(label[e])
+            rows[t, k] = weight[e]
+            own[t] += weight[e] ** 2
+            j = A - 1
+            while j >= 0 and active[j] > k:
+                j -= 1
+            if j < 0 or active[j] != k:
+                for later in range(A, j + 1, -1):
+                    active[later] = active[later - 1]
+                active[j + 1] = k
+                total[k] = squares[k] = 0.0
+                A += 1
+            total[k] += weight[e]
+            squares[k] += weight[e] ** 2
+    return A
+
+
+@serial
+def _cleared(log, first, T, rows):
+    """Leave 0 where a voxel's observations were."""
+    for t in range(T):
+        for e in range(log[0][first + t], log[0][first + t + 1]):
+            rows[t, log[1][e]] = 0.0
+
+
+@serial
+def _label(total, active, A):
+    """The dominant class, the lowest of equals."""
+    best = active[0]
+    for j in range(1, A):
+        if total[active[j]] > total[best]:
+            best = active[j]
+    return best
+
+
+@serial
+def _label_without(total, row, active, A):
+    """The dominant class of the other observations."""
+    best, most = active[0], total[active[0]] - row[active[0]]
+    for j in range(1, A):
+        rest = total[active[j]] - row[active[j]]
+        if rest > most + 1e-12:
+            best, most = active[j], rest
+    return best
+
+
+@serial
+def _add_truth(out, rows, first, T, group, truth, stable, counts_stable, total, active, A, without, column, K):
+    """What is right: of the fused label by leaving a frame out, of each look by itself."""
+    right = 1.0 if _label(total, active, A) == truth else 0.0
+    mean = 0.0
+    for t in range(T):
+        without[t] = 1.0 if _label_without(total, rows[t], active, A) == truth else 0.0
+        mean += without[t] / T
+    for t in range(T):
+        sums = out[group[first + t]]
+        own = (right + (T - 1) * (mean - without[t])) / T
+        sums[column + KNOWN] += 1.0 / T
+        sums[column + RIGHT] += own
+        sums[column + LOOKS] += 1.0
+        sums[column + LOOKS_RIGHT] += rows[t, truth]
+        if counts_stable and stable:
+            sums[column + STABLE] += 1.0 / T
+            sums[column + STABLE_WRONG] += (1.0 - right) / T
+        if K:
+            sums[column + 6 + truth] += 1.0 / T
+            sums[column + 6 + K + truth] += own
+
+
+@serial
+def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, stable, by_class, with_truth, sums):
+    """Add the observations of the voxels with T >= 2 to `sums` (cells, groups, C).
+
+    order (n,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts, op (n,) are a voxel's rows
+    of the log and of group (m,), truth (n,) its true class or -1, stable the PSA from which a place is. A place's
+    pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
+    agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
+    against, and the shares add up to T P.
+    """
+    longest = op.max() if op.shape[0] else 0
+    rows = np.zeros((longest, K))
+    total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
+    own, without = np.empty(longest), np.empty(longest)
+    scale = 1.0 / np.log(K)
+    first_truth = ENTROPY + 1 + (3 * K if by_class else K)
+    for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
+        out = sums[cell]
+        for i in order[bounds[cell] : bounds[cell + 1]]:
+            first, T = starts[i], op[i]
+            if T < 2:
+                continue
+            A = _classes_of(log, first, T, rows, total, squares, own, active)
+            best = _label(total, active, A)
+            agreed = 0.0
+            for j in range(A):
+                agreed += total[active[j]] ** 2 - squares[active[j]]
+            agreed /= T * (T - 1.0)
+            spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
+            for t in range(T):
+                s, add = rows[t], out[group[first + t]]
+                with_others = surprise = 0.0
+                for j in range(A):
+                    k = active[j]
+                    with_others += s[k] * total[k]
+                    add[ENTROPY + 1 + k] += s[k]
+                    if s[k] > 0.0:
+                        surprise -= s[k] * np.log(total[k] / T)
+                share = agreed + spread * ((with_others - own[t]) / (T - 1.0) - agreed)
+                add[VOXELS] += 1.0 / T
+                add[PSA] += share / T
+                add[OBSERVATIONS] += 1.0
+                add[AGREEING] += share
+                add[OWN] += own[t]
+                add[ENTROPY] += surprise * scale / T
+                if T == 2:
+                    add[TWICE] += 1.0
+                    add[TWICE_AGREEING] += agreed
+                else:
+                    add[RECURRENT] += 1.0 / T
+                    add[VSS] += s[best] / T
+                if by_class:
+                    for j in range(A):
+                        k = active[j]
+                        others = (total[k] - s[k]) / (T - 1.0)
+                        apart = 2.0 * (total[k] / T - (total[k] ** 2 - squares[k]) / (T * (T - 1.0)))
+                        differs = s[k] + others - 2.0 * s[k] * others
+                        add[ENTROPY + 1 + K + k] += apart + spread * (differs - apart)
+                        add[ENTROPY + 1 + 2 * K + k] += s[k] ** 2
+            if with_truth and truth[i] >= 0:
+                _add_truth(
+                    out, rows, first, T, group, truth[i], agreed >= stable, T > 2, total, active, A, without,
+                    first_truth, K if by_class else 0,
+                )  # fmt: skip
+            _cleared(log, first, T, rows)

@@ -1,0 +1,75 @@
+"""Names that would collide, climb, or be too long as those of files: every result has a file of its own, inside OUT."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import tiny_scene
+import yaml
+from command_line import bench
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from posed_config import configure
+
+import semstab
+from semstab.engine.folder import require_file_names
+from semstab.errors import ConfigError
+from semstab.model.results import Unit, slug
+
+HORRORS = (
+    "a b", "a-b", "x", "x__y", "_x", "-rf", "[/bold]", "$x^{", "=1+1", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
+)  # fmt: skip
+"""Every one of them can be the name of a folder."""
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.lists(st.text("ab_-. /\u00e9", max_size=5), min_size=3, max_size=3), min_size=2, max_size=2))
+def test_other_names_give_another_file_name(pair) -> None:
+    one, other = pair
+    assert (slug(*one) == slug(*other)) == (one == other)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(st.characters(exclude_categories=()), max_size=400))
+def test_a_file_name_is_short_plain_and_visible(name) -> None:
+    path = f"{slug(name, name, name)}.parquet"
+    assert len(path.encode()) < 220
+    assert not set(path) & set("/\\\0\n *?[]'\"$&;")
+    assert path[0] not in "."
+
+
+def test_usual_names_stay_as_they_are() -> None:
+    assert slug("scene-1", "segformer.b5_ade", "Gebäude") == "scene-1__segformer.b5_ade__Gebäude"
+
+
+def test_what_would_share_a_file_is_refused_before_fusion(tmp_path) -> None:
+    """Two names with one digest of five bytes."""
+    one, other = Unit("a#>@$ b", "a", "numpy"), Unit("a#>@:+b", "a", "numpy")
+    assert one.slug == other.slug
+    with pytest.raises(ConfigError, match="would be written to one file"):
+        require_file_names(tmp_path / "out", [one, other])
+    require_file_names(tmp_path / "out", [one, one])
+
+
+def test_every_hostile_name_gets_results_of_its_own(tmp_path) -> None:
+    """Scenes and label sources: as many files as there are, all within OUT, and a second start finds them again."""
+    tiny_scene.write(tmp_path / "scenes" / "plain", backbones=("z", "y__z"), frames=2)
+    for name in HORRORS:
+        shutil.copytree(tmp_path / "scenes" / "plain", tmp_path / "scenes" / name)
+    config = configure(tmp_path / "scenes", backbones=["z", "y__z"], check=None, voxel_size=1.0)
+    result = semstab.engine.run(config, out=tmp_path / "out")
+    files = [record.voxels_file for record in result.records]
+    assert len(set(files)) == len(files) == 2 * (len(HORRORS) + 1)
+    assert all(file.parent == tmp_path / "out" / "voxels" and file.is_file() for file in files)
+    again = semstab.engine.run(config, out=tmp_path / "out")
+    assert again.manifest["units"]["kept"] == len(files)
+
+
+def test_a_study_is_kept_below_studies_whatever_its_name(tmp_path) -> None:
+    tiny_scene.write(tmp_path / "wall")
+    content = {"name": "../../escape", "dataset": {"name": "posed_folder", "options": {"root": "wall"}}}
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump({**content, "backends": ["numpy"], "backbones": ["a"]}))
+    bench("study", "study.yaml", "--report", "off", "--quiet", cwd=tmp_path)
+    assert len(list((tmp_path / "studies").iterdir())) == 1
+    assert not list(tmp_path.parent.parent.glob("escape"))

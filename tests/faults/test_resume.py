@@ -1,0 +1,88 @@
+"""What a kill left behind, of every kind: taken over, cleaned away, finished or made again."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import tiny_scene
+from posed_config import configure
+
+import semstab
+from semstab.convert import convert
+from semstab.errors import ConfigError
+from semstab.outputs.recording import Recording
+from semstab.outputs.recording.target import is_whole
+from semstab.runtime.files import FolderLock
+
+
+@pytest.fixture
+def root(tmp_path):
+    return tiny_scene.write(tmp_path / "wall")
+
+
+@pytest.mark.parametrize("damage", ["cut", "unmerged parts", "gone"])
+def test_a_recording_cut_by_a_kill_is_made_again_where_all_else_is_kept(root, tmp_path, damage) -> None:
+    config, out = configure(root, backbones=["a"], check=None), tmp_path / "out"
+    file = out / "recording.rrd"
+    semstab.engine.run(config, out=out, observers=[Recording(file, run=out)])
+    size, before = file.stat().st_size, file.stat().st_mtime_ns
+    again = semstab.engine.run(config, out=out, observers=[Recording(file, run=out)])
+    assert (file.stat().st_mtime_ns, again.manifest["units"]["kept"]) == (before, 1)  # whole: left alone
+    if damage == "cut":
+        os.truncate(file, size * 2 // 3)
+    elif damage == "gone":
+        file.unlink()
+    else:
+        (out / "recording").mkdir()
+        (out / "recording" / "whole.rrd").write_bytes(b"RRF2")
+    assert is_whole(file) == (damage == "unmerged parts")
+    again = semstab.engine.run(config, out=out, observers=[Recording(file, run=out)])
+    assert again.manifest["units"]["kept"] == 1
+    assert file.stat().st_mtime_ns > before
+    assert is_whole(file)
+    assert not (out / "recording").exists()
+
+
+class Killed(BaseException):
+    """Ends a start where it is, as a kill does; what it was writing stays half-written."""
+
+
+class FirstFrame:
+    """A progress that ends the start at the first frame."""
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        raise Killed
+
+
+def test_a_conversion_killed_at_its_birth_goes_on(root, tmp_path, monkeypatch) -> None:
+    config, out = configure(root, backbones=["a"]), tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("semstab.convert.folder.write_json", stop)
+        with pytest.raises(Killed):
+            list(convert(config, out))
+    (out / "wall" / ".semstab-ab12cd34.yaml").write_text("half")
+    with monkeypatch.context() as patch:
+        patch.setattr("semstab.convert.folder.write_text", stop)
+        with pytest.raises(Killed):
+            list(convert(config, out))
+    with pytest.raises(Killed):
+        list(convert(config, out, progress=FirstFrame()))
+    (out / "wall" / "pose" / ".semstab-ab12cd34.txt").write_text("half")
+    (converted,) = convert(config, out)
+    assert (converted.frames, converted.written) == (3, 2)
+    assert not list(out.rglob(".*"))
+
+
+def stop(*_: object) -> None:
+    raise Killed
+
+
+def test_a_folder_of_a_conversion_or_of_predictions_belongs_to_one_process(root, tmp_path) -> None:
+    config, out = configure(root, backbones=["a"]), tmp_path / "out"
+    list(convert(config, out))
+    held = FolderLock(out / "wall")
+    with pytest.raises(ConfigError, match="wall: another process works on it"):
+        list(convert(config, out))
+    held.release()
+    list(convert(config, out))

@@ -1,0 +1,133 @@
+"""Simulated flights over a floor or a city of known errors, and the sums that semstab keeps of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.sampling import InfluenceSums, influence_sums
+
+ROUGH = 0.5
+"""How abruptly a place is one on which the model errs."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """How a model errs on a scene, and how it is flown over.
+
+    side     of the floor in voxels
+    reach    of errors, in voxels: the correlation of places d apart is exp(-d^2 / (2 reach^2))
+    ease     larger means fewer errors
+    frames   of the flight
+    looks    frames that see a place, on average; all of them where it is as many as frames
+    quality  of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with 0.8),
+             'view' (the farther from the middle of the frame, the worse)
+    city     whether the floor is one of boxes with walls, in three dimensions
+    coin     whether labels are drawn at random instead
+    """
+
+    side: int = 48
+    reach: float = 2.0
+    ease: float = 1.0
+    frames: int = 4
+    looks: int = 4
+    quality: str = "alike"
+    city: bool = False
+    coin: bool = False
+
+
+def field(side: int, reach: float, rng: np.random.Generator) -> np.ndarray:
+    """A Gaussian field (side, side), mean 0, variance 1, that does not know its border."""
+    n = side + int(8 * reach) + 1
+    wave = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n)[None])
+    gain = np.exp(-((np.pi * reach * wave) ** 2))
+    noise = np.fft.fft2(rng.standard_normal((n, n)))
+    return np.fft.ifft2(noise * gain).real[:side, :side] / np.sqrt((gain**2).mean())
+
+
+def qualities(flight: Flight, rng: np.random.Generator) -> np.ndarray:
+    """How much worse each frame is than usual (F,)."""
+    steps = rng.standard_normal(flight.frames)
+    if flight.quality == "bad":
+        return np.where(rng.random(flight.frames) < 0.1, 2.0, 0.0)
+    if flight.quality == "uneven":
+        return 0.5 * steps
+    if flight.quality == "lasting":
+        for t in range(1, flight.frames):
+            steps[t] = 0.8 * steps[t - 1] + 0.6 * steps[t]
+        return 0.5 * steps
+    return np.zeros(flight.frames)
+
+
+def places(flight: Flight) -> np.ndarray:
+    """Voxel indices (n, 3): a floor, or blocks of houses 12 voxels wide and up to 8 high, with streets of 8 between."""
+    x, y = (axis.ravel() for axis in np.indices((flight.side, flight.side)))
+    if not flight.city:
+        return np.stack([x, y, np.zeros_like(x)], axis=1)
+    house = (x % 20 < 12) & (y % 20 < 12)
+    height = np.where(house, 4 + (3 * (x // 20) + 5 * (y // 20)) % 5, 0)
+    edge = house & ((x % 20 % 11 == 0) | (y % 20 % 11 == 0))
+    walls = [np.stack([x, y, np.full_like(x, z)], axis=1)[edge & (z < height)] for z in range(8)]
+    return np.concatenate([np.stack([x, y, height], axis=1), *walls])
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene as it is: indices (n, 3), the true class (n,) of two, and how hard each place is (n,)."""
+
+    index: np.ndarray
+    truth: np.ndarray
+    hard: np.ndarray
+
+
+def world(flight: Flight, rng: np.random.Generator) -> World:
+    """A scene of the kind that the flight says."""
+    index = places(flight)
+    x, y, z = index.T
+    classes, hard = field(flight.side, max(flight.reach, 0.5), rng), field(flight.side, flight.reach, rng)
+    turned = (x + z) % flight.side  # a wall continues the field of the floor
+    order = np.lexsort(index.T[::-1])
+    return World(index[order], (classes[turned, y] > 0).astype(int)[order], hard[turned, y][order])
+
+
+def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | None = None) -> np.ndarray:
+    """Labels (n, F) of a flight over a scene; -1 where a frame does not see a place."""
+    n, F = len(over.index), flight.frames
+    off = over.index[:, :1] - (np.arange(F) + 0.5) / F * flight.side
+    width = flight.side * flight.looks / F
+    seen = np.ones((n, F), bool) if flight.looks >= F else np.abs(off) <= width / 2
+    harder = over.hard[:, None] - (flight.ease if ease is None else ease) + qualities(flight, rng)
+    if flight.quality == "view":
+        harder = harder + 3 * np.abs(off) / width - 0.7
+    wrong = rng.random((n, F)) < (0.5 if flight.coin else 0.6 * norm.cdf(harder / ROUGH))
+    return np.where(seen, np.where(wrong, 1 - over.truth[:, None], over.truth[:, None]), -1)
+
+
+def log_of(labels: np.ndarray, index: np.ndarray, voxel_size: float = 0.125) -> Events:
+    """The log of labels (n, F) of the voxels of these indices (n, 3), which are sorted."""
+    some = (labels >= 0).any(axis=1)
+    voxel, frame = np.nonzero(labels[some] >= 0)
+    evidence = np.eye(2)[labels[some][voxel, frame]]
+    return Events(*index[some].T, voxel, frame, evidence, np.ones(len(voxel)), voxel_size)
+
+
+def table_of(log: Events) -> VoxelTable:
+    """The map of a log of labels; nothing here asks for its drift."""
+    op = np.bincount(log.voxel)
+    evidence = np.add.reduceat(log.evidence, log.starts, axis=0)
+    rest = {"drift_sum": np.zeros(len(op)), "frame_entropy_sum": np.zeros(len(op))}
+    frames = {"first_frame": np.zeros(len(op)), "last_frame": np.zeros(len(op))}
+    return VoxelTable(
+        log.ix, log.iy, log.iz, op=op, evidence=evidence, pixels=op, self_sum=op.astype(float), **rest, **frames,
+        voxel_size=log.voxel_size,
+    )  # fmt: skip
+
+
+def sums_of(labels: np.ndarray, over: World) -> InfluenceSums:
+    """The sums of a flight, with the truth."""
+    log = log_of(labels, over.index)
+    some = (labels >= 0).any(axis=1)
+    return influence_sums(table_of(log), log, over.truth[some])

@@ -1,0 +1,309 @@
+"""Exports of a finished run are opened with other libraries, and hold its voxels where they lie on Earth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import laspy
+import numpy as np
+import open3d as o3d
+import pyarrow.csv
+import pyarrow.parquet
+import pyproj
+import pytest
+import rasterio
+import tiny_scene
+import trimesh
+from command_line import bench
+from posed_config import configure, dataset_of
+from posed_scene import fails
+from records import voxels as voxels_by_hand
+
+import semstab
+from semstab.errors import ConfigError, DataError
+from semstab.metrics import categories, dominant, vss
+from semstab.outputs.export import export
+from semstab.outputs.export.raster import seen_from_above
+from semstab.outputs.export.voxels import Column, Voxels
+
+CRS, OFFSET = "EPSG:32615", (576714, 5188162, 200)
+CLASSES = ["wall", "door", "window"]
+
+
+@pytest.fixture(scope="module")
+def fused(tmp_path_factory):
+    """A run of two backbones with a georeference, and one without; its folder."""
+    folder = tmp_path_factory.mktemp("runs")
+    tiny_scene.write(folder / "scene")
+    for name, options in (("run", {"crs": CRS, "offset": OFFSET}), ("nowhere", {})):
+        config = configure(folder / "scene", dataset=dataset_of(folder / "scene", **options), check=None)
+        semstab.run(config, out=folder / name, report=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def table(fused):
+    return semstab.load_result(fused / "run").record(backbone="a").table()
+
+
+def written(fused, file, run="run", **options):
+    export(fused / run, fused / file, **{"backbone": "a", **options})
+    return fused / file
+
+
+def test_las_has_the_voxels_to_the_millimetre_with_their_measures_and_projection(fused, table):
+    codes = fused / "codes.yaml"
+    codes.write_text("door: 64\nWall: 6\n")
+    for name in ("map.las", "map.laz"):
+        cloud = laspy.read(written(fused, name, asprs=codes))
+        np.testing.assert_allclose(cloud.xyz, table.centers + OFFSET, atol=5.1e-4)
+        assert cloud.header.parse_crs().to_epsg() == 32615
+        assert (cloud["class"] == dominant(table) + 1).all()
+        assert (cloud.classification == np.array([6, 64, 1])[dominant(table)]).all()
+        np.testing.assert_allclose(cloud.vss, vss(table), rtol=1e-6)
+        assert (cloud.op == table.op).all()
+        assert {d.name: d.description for d in cloud.point_format.extra_dimensions}["sbd"] == "SBD, bits"
+        legend = next(vlr for vlr in cloud.vlrs if vlr.user_id == "semstab")
+        assert json.loads(legend.record_data_bytes())["classes"] == ["unclassified", *CLASSES]
+
+
+def test_codes_of_a_shipped_taxonomy(fused, table):
+    voxels = as_voxels(table, classes=("building", "road", "static car"), taxonomy="uavid7")
+    from semstab.outputs.export.las import codes
+
+    assert codes(voxels).tolist() == [0, 6, 11, 64]
+
+
+def test_ply_opens_in_two_libraries(fused, table):
+    path = written(fused, "map.ply")
+    cloud = o3d.t.io.read_point_cloud(str(path))
+    np.testing.assert_array_equal(cloud.point.positions.numpy(), table.centers + OFFSET)
+    assert (cloud.point["class"].numpy().ravel() == dominant(table) + 1).all()
+    assert (cloud.point["category"].numpy().ravel() == categories(table)).all()
+    np.testing.assert_allclose(cloud.point["vss"].numpy().ravel(), vss(table), rtol=1e-6)
+    other = trimesh.load(path)
+    np.testing.assert_array_equal(other.vertices, table.centers + OFFSET)
+    assert (other.colors[:, :3] == cloud.point.colors.numpy()).all()
+    assert b"comment class 2 door" in path.read_bytes()
+
+
+def test_tables_have_names_and_empty_fields_where_something_is_undefined(fused, table):
+    for path, rows in (
+        (written(fused, "map.parquet"), pyarrow.parquet.read_table(fused / "map.parquet")),
+        (written(fused, "map.csv"), pyarrow.csv.read_csv(fused / "map.csv")),
+    ):
+        assert rows.column("class").to_pylist() == [CLASSES[k] for k in dominant(table)], path
+        assert rows.column("sbd").null_count == np.count_nonzero(table.op < 2) > 0
+        np.testing.assert_array_equal(rows.column("y").to_numpy(), table.centers[:, 1] + OFFSET[1])
+        assert set(rows.column("category").to_pylist()) <= set(semstab.metrics.CATEGORIES)
+
+
+def test_the_mesh_has_the_sides_that_no_other_voxel_hides(fused, table):
+    scene = trimesh.load(written(fused, "map.glb"))
+    (mesh,) = scene.geometry.values()
+    hidden = sum(
+        len(np.intersect1d(*(pack(index) for index in (table.index, table.index + step))))
+        for step in np.eye(3, dtype=int)
+    )
+    assert len(mesh.faces) == 2 * (6 * len(table) - 2 * hidden)
+    low, high = table.index.min(axis=0) * 0.25, (table.index.max(axis=0) + 1) * 0.25
+    np.testing.assert_allclose(scene.metadata["origin"], low + OFFSET)
+    x, y, z = high - low
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, -y], [x, z, 0]], atol=1e-6)  # y is up in glTF, north is -z
+
+
+def pack(index):
+    return index @ np.array([10**6, 10**3, 1])
+
+
+def test_the_raster_lies_where_the_voxels_do(fused, table):
+    written(fused, "map.tif")
+    with rasterio.open(fused / "map.tif") as raster, rasterio.open(fused / "map.class.tif") as classes:
+        assert raster.crs.to_epsg() == 32615
+        assert raster.descriptions == ("class", "vss", "entropy", "op", "stable", "height")
+        x, y, z = (table.centers + OFFSET).T
+        edge, _, west, _, _, north = raster.transform[:6]
+        bands = raster.read()[:, ((north - y) // edge).astype(int), ((x - west) // edge).astype(int)]
+        seen = bands[5] == z.astype(np.float32)  # the topmost of its column
+        assert seen.any()
+        assert (bands[0][seen] == dominant(table)[seen] + 1).all()
+        np.testing.assert_allclose(bands[1][seen], vss(table)[seen], rtol=1e-6)
+        assert (classes.read(1) == np.nan_to_num(raster.read(1))).all()
+        assert classes.nodata == 0
+        assert classes.colormap(1)[1][:3] == tuple(
+            trimesh.load(written(fused, "map.ply")).colors[dominant(table) == 0][0][:3]
+        )
+
+
+def as_voxels(table, columns=(), classes=CLASSES, taxonomy="t", up=(0.0, 0.0, 1.0)):
+    colors = np.zeros((table.K, 3), np.uint8)
+    return Voxels(table, dict(columns), tuple(classes), colors, taxonomy, up, None)
+
+
+def test_a_cell_of_several_voxels_sums_the_beliefs_of_the_topmost():
+    """Two columns of two voxels: the lower ones only count for the share of stable voxels."""
+    made = voxels_by_hand((1, 3, [3, 0, 0]), (1, 3, [1, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [1, 0, 4]), r=1.0)
+    table = dataclasses.replace(made, ix=np.array([0, 0, 1, 1]), iz=np.array([0, 1, 0, 3]))
+    stable = categories(table) == 3
+    bands, west, north = seen_from_above(as_voxels(table, {"op": Column(table.op)}), cell=2)
+    value = {name: band.values.item() for name, band in bands.items()}
+    assert value["class"] == 3  # 1/3 + 1/5, 2/3, 4/5
+    assert value["op"] == 4
+    assert value["stable"] == stable.mean() == 0.75
+    assert value["height"] == 3.5
+    assert (west, north) == (0.0, 2.0)
+
+
+def test_without_a_georeference_coordinates_are_the_scenes_which_is_said(fused, table):
+    (done,) = export(fused / "nowhere", fused / "plain.laz", backbone="a")
+    assert "no georeference" in done.content
+    cloud = laspy.read(fused / "plain.laz")
+    np.testing.assert_allclose(cloud.xyz, table.centers, atol=5.1e-4)
+    assert cloud.header.parse_crs() is None
+
+
+def test_what_is_exported_can_be_chosen(fused, table):
+    rows = pyarrow.csv.read_csv(written(fused, "few.csv", measures=["psa", "pixels"], min_op=2, classes=["Door"]))
+    assert rows.column_names == ["x", "y", "z", "class", "psa", "pixels"]
+    assert len(rows) == np.count_nonzero((table.op >= 2) & (dominant(table) == 1)) > 0
+
+
+@pytest.mark.parametrize(
+    ("message", "options"),
+    [
+        ("no column 'drift_p'; did you mean 'drift", {"measures": ["drift_p"]}),
+        ("no class 'dor'; did you mean 'door'", {"classes": ["dor"]}),
+        (r"no voxel with OP >= 9; OP goes up to 3", {"min_op": 9}),
+        ("2 units fit .scene of a, scene of b.; choose", {"backbone": None}),
+        ("no backbone 'c'", {"backbone": "c"}),
+        ("no class 'dor' in the run", {"asprs": "wrong.yaml"}),
+        ("300 is no ASPRS code", {"asprs": "large.yaml"}),
+    ],
+)
+def test_bad_choices_are_told_in_one_line(fused, message, options, monkeypatch):
+    monkeypatch.chdir(fused)
+    (fused / "wrong.yaml").write_text("dor: 6")
+    (fused / "large.yaml").write_text("door: 300")
+    fails(ConfigError, message, written, fused, "never.las", **options)
+    assert not (fused / "never.las").exists()
+
+
+def test_other_bad_input(fused):
+    fails(ConfigError, "format '.lax' is not known; did you mean '.la", written, fused, "map.lax")
+    fails(DataError, "summary.json: cannot be read", export, fused / "empty", fused / "map.ply")
+    lonely = dataclasses.replace(as_voxels(voxels_by_hand((1, 1, [1, 0, 0]))), up=None)
+    fails(ConfigError, "set up_axis", seen_from_above, lonely)
+
+
+# --- A given cloud ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def points(table):
+    """In a voxel, a little outside the map, far away."""
+    above = table.centers[-1:] + np.array([0, 0, 0.26])
+    return np.concatenate([table.centers + 0.05, above, above + 50]) + OFFSET
+
+
+def las_cloud(path, points, point_format=7, crs=CRS):
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header.scales, header.offsets = [0.001] * 3, OFFSET
+    header.add_crs(pyproj.CRS(crs))
+    header.add_extra_dims([laspy.ExtraBytesParams("views", np.uint8)])
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.intensity, cloud.views = np.arange(len(points)), np.arange(len(points)) % 7
+    cloud.classification = np.full(len(points), 2)
+    cloud.write(path)
+    return path
+
+
+@pytest.mark.parametrize("point_format", [3, 7])
+def test_a_las_cloud_is_classified_and_keeps_its_fields(fused, table, points, point_format):
+    cloud = las_cloud(fused / f"cloud{point_format}.laz", points, point_format)
+    (done,) = export(fused / "run", fused / "onto.laz", backbone="a", onto=cloud, radius=0.3)
+    before, after = laspy.read(cloud), laspy.read(fused / "onto.laz")
+    for name in (*before.point_format.dimension_names,):
+        assert (after["classification_before" if name == "classification" else name] == before[name]).all(), name
+    expected = dominant(table) + 1
+    assert after["class"].tolist() == [*expected, expected[-1], 0]
+    assert np.array(after.classification).tolist() == [*[1] * (len(table) + 1), 0]
+    assert after.op.tolist() == [*table.op, table.op[-1], 0]
+    np.testing.assert_allclose(after.vss, [*vss(table), vss(table)[-1], 0], rtol=1e-6)
+    assert done.content == f"{len(points)} points, {(len(points) - 1) / len(points):.1%} of them classified"
+    export(fused / "run", fused / "none.laz", backbone="a", onto=fused / "onto.laz", radius=0)
+    again = laspy.read(fused / "none.laz")
+    assert again["class"].tolist() == [*expected, 0, 0]
+    assert (again["classification_before"] == 2).all()
+
+
+def ply_cloud(path, points, order="<"):
+    dtype = np.dtype([(name, f"{order}f8") for name in "xyz"] + [("gray", f"{order}i4")])
+    rows = np.zeros(len(points), dtype)
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    rows["gray"] = np.arange(len(points))
+    form = "little" if order == "<" else "big"
+    properties = "".join(f"property double {name}\n" for name in "xyz") + "property int gray\n"
+    head = (
+        f"ply\nformat binary_{form}_endian 1.0\ncomment of mine\nelement vertex {len(points)}\n{properties}end_header\n"
+    )
+    path.write_bytes(head.encode() + rows.tobytes())
+    return path
+
+
+def test_a_ply_cloud_is_classified_in_chunks(fused, table, points, monkeypatch):
+    from semstab.outputs.export import onto
+
+    monkeypatch.setattr(onto, "CHUNK", 7)
+    for order in "<>":
+        cloud = ply_cloud(fused / "cloud.ply", points, order)
+        export(fused / "run", fused / "onto.ply", backbone="a", onto=cloud, measures=["vss"], radius=0.3)
+        after = o3d.t.io.read_point_cloud(str(fused / "onto.ply"))
+        np.testing.assert_array_equal(after.point.positions.numpy(), points)
+        assert (after.point["gray"].numpy().ravel() == np.arange(len(points))).all()
+        expected = dominant(table) + 1
+        assert after.point["class"].numpy().ravel().tolist() == [*expected, expected[-1], 0]
+        assert b"comment of mine" in (fused / "onto.ply").read_bytes()
+
+
+def test_clouds_that_cannot_be_classified(fused, points):
+    def classify(cloud, to="never.laz"):
+        export(fused / "run", fused / to, backbone="a", onto=cloud)
+
+    there = las_cloud(fused / "there.laz", points[-1:] + 1000)
+    fails(DataError, "no point lies in the map: it spans .* m, the map .*; mend", classify, there)
+    fails(
+        DataError,
+        "is in EPSG:32616, the run in EPSG:32615",
+        classify,
+        las_cloud(fused / "z.laz", points, crs="EPSG:32616"),
+    )
+    fails(ConfigError, "stays what it is; write .*never.las", classify, las_cloud(fused / "c.las", points), "never.ply")
+    fails(ConfigError, "is the cloud itself", classify, fused / "c.las", "c.las")
+    fails(ConfigError, "a cloud is a .las", classify, fused / "cloud.e57")
+    damaged = fused / "damaged.laz"
+    damaged.write_bytes(there.read_bytes()[:300])
+    fails(DataError, "damaged.laz: cannot be read", classify, damaged)
+    short = ply_cloud(fused / "short.ply", points)
+    short.write_bytes(short.read_bytes()[:-30])
+    fails(DataError, "it is cut short", classify, short, "never.ply")
+    for text, message in (
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "save it as binary"),
+        (b"solid\n", "not a PLY file"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n", "does not end"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n", "no y, z"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nelement face 2\nend_header\n", "more than points"),
+    ):
+        short.write_bytes(text)
+        fails(DataError, message, classify, short, "never.ply")
+    assert not list(fused.glob("never*"))
+
+
+def test_the_command(fused):
+    done = bench("export", fused / "run", "--to", "a.ply", "--to", "a.las", "-m", "a", "--class", "door", cwd=fused)
+    assert "a.ply: " in done.stdout
+    assert "WGS 84 / UTM zone 15N (EPSG:32615)" in done.stdout
+    assert "without ASPRS code (--asprs): wall, door, window" in done.stdout
+    assert (fused / "a.las").exists()

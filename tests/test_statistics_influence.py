@@ -1,0 +1,91 @@
+"""Sums by frame and cube of space: they give back every number, add up, and know what a frame is worth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from simulated_events import grid, log_of, log_of_evidence, soft
+
+from semstab.errors import DataError
+from semstab.model.measures import dominant, entropy, vss
+from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
+from semstab.statistics.sampling.collect import influence_sums
+from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
+
+
+def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
+    """A floor of which each frame sees a strip, and the true class of each voxel."""
+    rng = np.random.default_rng(seed)
+    index = grid(side)
+    seen = np.abs(index[:, :1] - np.linspace(0, side, F)) <= 3
+    truth = rng.integers(0, K, len(index))
+    labels = np.where(rng.random(seen.shape) < 0.3, rng.integers(0, K, seen.shape), truth[:, None])
+    evidence = soft(rng, len(index), F, K) if soft_evidence else np.eye(K)[labels]
+    some = seen.any(axis=1)
+    log = log_of_evidence(evidence[some], seen[some], index=index[some])
+    return log.table(), log, truth[some]
+
+
+@pytest.mark.parametrize("soft_evidence", [False, True])
+def test_the_sums_give_every_number_back(soft_evidence):
+    table, log, truth = flight(soft_evidence=soft_evidence)
+    again, often = table.op >= 2, table.op >= 3
+    right = dominant(table) == truth
+    stable = often & (psa(table) >= 0.8)
+    expected = {
+        "psa": psa(table)[again].mean(),
+        "alpha": krippendorff_alpha(table),
+        "vss": vss(table)[often].mean(),
+        "entropy": entropy(table)[again].mean(),
+        "accuracy": right[again].mean(),
+        "look_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
+        "wrong_of_stable": (~right)[stable].mean() if stable.any() else np.nan,
+    }
+    for sums in (influence_sums(table, log, truth), influence_sums(table, None, truth)):
+        assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)
+    sums = influence_sums(table, log, truth)
+    by_class = [row.alpha for row in class_agreement(table, log)]
+    assert [value(sums, "alpha", k) for k in range(3)] == pytest.approx(by_class)
+    true_one = again & (truth == 1)
+    assert value(sums, "accuracy", 1) == pytest.approx(right[true_one].mean())
+
+
+def test_parts_of_a_map_add_up_and_a_file_holds_them(tmp_path):
+    table, log, truth = flight(side=16)
+    whole = influence_sums(table, log, truth)
+    coarse = whole.coarsened(4 * whole.edge, 2)
+    assert (coarse.edge, coarse.step, coarse.frames) == (4 * whole.edge, 2, 5)
+    assert coarse.cells < whole.cells
+    assert value(coarse, "alpha") == pytest.approx(value(whole, "alpha"))
+    parts = [flight(side=16, seed=seed) for seed in (0, 1)]
+    together = merged(*(influence_sums(*part) for part in parts))
+    assert together["observations"].sum() == sum(p[0].op[p[0].op >= 2].sum() for p in parts)
+    whole.save(tmp_path / "sums.parquet")
+    again = InfluenceSums.load(tmp_path / "sums.parquet")
+    assert np.array_equal(again.columns, whole.columns)
+    assert (again.edge, again.step, again.truth) == (whole.edge, 1, True)
+    assert aligned(again, coarse)[0].cells == coarse.cells
+    with pytest.raises(DataError, match="not a file of influence sums"):
+        InfluenceSums.load(__file__)
+
+
+def test_a_share_is_the_frames_own_quality():
+    """Frame 2 errs alone: all that agreement loses is its doing, though the others disagree with it as well."""
+    labels = np.zeros((50, 5), dtype=int)
+    labels[:25, 2] = 1
+    table = (log := log_of(labels, index=grid(8)[:50])).table()
+    sums = influence_sums(table, log)
+    share = np.bincount(sums.frame, weights=sums["agreeing"][:, 0]) / 50
+    assert share.sum() == pytest.approx((table.op * psa(table)).mean())
+    lost = share - share[0]
+    assert lost[[0, 1, 3, 4]] == pytest.approx(0)
+    assert lost[2] == pytest.approx(-2 * 25 / 50)
+
+
+def test_at_most_so_many_cubes_and_groups_of_frames():
+    labels = np.zeros((40 * 40, 150), dtype=int)
+    log = log_of(labels, index=grid(40))
+    sums = influence_sums(log.table(), log)
+    assert (sums.cells, sums.edge) == (256, 0.5)
+    assert (sums.frames, sums.step) == (38, 4)
+    assert merged(sums, sums).cells == sums.cells

@@ -1,0 +1,210 @@
+"""Agreement between frames and its ceiling: measures and verdicts that do not move with the size of the voxels."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated_events import grid, log_of, log_of_evidence, soft
+
+from semstab import backends
+from semstab.datasets import open_dataset
+from semstab.metrics.matching import shared_observations
+from semstab.model.frames import Frame, Intrinsics
+from semstab.statistics import Sampler, alpha_between, describe, disagreement, krippendorff_alpha, psa, reach_of
+
+K = 3
+DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
+
+
+# --- Alpha between frames ---------------------------------------------------------------------------------------------
+
+
+def test_alpha_between_frames_of_labels_is_krippendorffs():
+    table = log_of(np.random.default_rng(0).integers(-1, 3, size=(80, 5))).table()
+    assert alpha_between(table) == pytest.approx(krippendorff_alpha(table))
+
+
+def test_alpha_between_frames_is_its_definition():
+    evidence = soft(np.random.default_rng(1), 12, 4)
+    apart = ((evidence[:, :, None] - evidence[:, None]) ** 2).sum(axis=3) / 2
+    all_of_them = evidence.reshape(-1, 3)
+    expected = ((all_of_them[:, None] - all_of_them[None]) ** 2).sum(axis=2) / 2
+    n = len(all_of_them)
+    found = alpha_between(log_of_evidence(evidence).table())
+    assert found == pytest.approx(1 - apart.sum() / (12 * 4 * 3) / (expected.sum() / (n * (n - 1))))
+
+
+def test_frames_that_see_the_same_mixture_agree():
+    same = np.repeat(soft(np.random.default_rng(2), 30, 1), 5, axis=1)
+    table = log_of_evidence(same).table()
+    assert alpha_between(table) == pytest.approx(1)
+    assert krippendorff_alpha(table) < 0.5
+    within, between = disagreement(table)
+    np.testing.assert_allclose(within, 1 - psa(table))
+    assert between.max() < 1e-12
+
+
+def test_disagreement_is_within_a_frame_and_between_frames_whatever_the_number_of_frames():
+    rng = np.random.default_rng(3)
+    parts = []
+    for T in (2, 4, 30):
+        table = log_of_evidence(soft(rng, 4000, T)).table()
+        within, between = disagreement(table)
+        np.testing.assert_allclose(within + between, 1 - psa(table))
+        parts.append((within.mean(), between.mean()))
+    np.testing.assert_allclose(parts, np.broadcast_to(parts[-1], (3, 2)), atol=0.01)
+
+
+def test_weights_that_are_fixed_make_flights_comparable_that_linger_elsewhere():
+    """One model that errs in the left half; one flight lingers there, the other in the right half."""
+    rng = np.random.default_rng(4)
+    own, left = rng.integers(0, 3, size=(2000, 1)), np.arange(2000) < 1000
+    labels = np.where((rng.random((2000, 20)) < 0.5) & left[:, None], rng.integers(0, 3, size=(2000, 20)), own)
+    by_flight = [describe(log_of(np.where(np.arange(20) < seen[:, None], labels, -1)).table()).agreement for seen in
+                 (np.where(left, 20, 3), np.where(left, 3, 20))]  # fmt: skip
+    easy, hard = by_flight[1], by_flight[0]
+    assert easy.alpha_between.value - hard.alpha_between.value > 0.2
+    assert easy.each_place.value == pytest.approx(hard.each_place.value, abs=0.03)
+
+
+# --- The sample -------------------------------------------------------------------------------------------------------
+
+
+def flight(frames=8, flicker=0.0, coin=False, seed=0, step=0.11, patch=None):
+    """A camera that looks down from 4 m at a floor of stripes 0.9 m wide; labels err by pixel or patch."""
+    rng = np.random.default_rng(seed)
+    H, W, f = 60, 80, 50.0
+    down = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    for index in range(frames):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = down, (0.013 + step * index, 0.017, 4.0)
+        depth = np.full((H, W), 4.0 - 0.113, dtype=np.float32)
+        x = (np.arange(W) - W / 2) / f * depth + T[0, 3]
+        labels = (np.floor(x / 0.9) % K).astype(np.uint8)
+        size = patch or 1
+        wrong = np.kron(rng.random((H // size, W // size)) < (1.0 if coin else flicker), np.ones((size, size), bool))
+        drawn = np.kron(rng.integers(0, K, (H // size, W // size)), np.ones((size, size), int))
+        yield Frame(index, depth, Intrinsics(f, f, W / 2, H / 2), T, np.where(wrong, drawn, labels).astype(np.uint8))
+
+
+def sampled(frames, voxel_size=0.4, budget=1 << 19):
+    sampler = Sampler(voxel_size, K, budget)
+    for frame in frames:
+        sampler.add(frame)
+    return sampler.sample()
+
+
+def fused(frames, voxel_size):
+    backend = backends.create("numpy", voxel_size=voxel_size, num_classes=K)
+    for frame in frames:
+        backend.integrate(frame)
+    return backend
+
+
+def test_a_sample_of_all_voxels_is_the_log_where_every_cell_was_seen_twice():
+    frames = list(flight(3, flicker=0.3))
+    twice = [*frames, *(dataclasses.replace(frame, index=frame.index + 3) for frame in frames)]
+    seen, log = sampled(twice).seen, fused(twice, 0.4).events()
+    assert np.array_equal(seen.ix, log.ix)
+    np.testing.assert_allclose(seen.evidence, log.evidence)
+    np.testing.assert_array_equal(seen.frame, log.frame)
+    np.testing.assert_array_equal(seen.pixels, log.pixels)
+
+
+def test_scores_are_sampled_as_labels_are():
+    frames = list(flight(4, flicker=0.3))
+    soft_ones = [dataclasses.replace(f, labels=None, scores=np.eye(K, dtype=np.float32)[f.labels]) for f in frames]
+    by_labels, by_scores = sampled(frames), sampled(soft_ones)
+    np.testing.assert_allclose(by_labels.seen.evidence, by_scores.seen.evidence)
+    np.testing.assert_allclose(by_labels.limit.evidence, by_scores.limit.evidence)
+    assert (by_labels.soft, by_scores.soft) == (False, True)
+
+
+def test_a_bounded_sample_holds_some_voxels_whole_and_all_maps_the_same():
+    everything, some = sampled(flight(), 0.1), sampled(flight(), 0.1, budget=20000)
+    assert 0.2 < len(some.seen.ix) / len(everything.seen.ix) < 0.8
+    a, b = shared_observations(everything.seen, some.seen)
+    assert len(a) == len(b) == len(some.seen)
+    np.testing.assert_array_equal(a.evidence, b.evidence)
+    other = sampled(flight(flicker=0.2, seed=1), 0.1, budget=20000)
+    assert len(shared_observations(some.seen, other.seen)[0]) > 0.4 * len(some.seen)
+
+
+def test_no_frames_leave_an_empty_sample():
+    sample = sampled([])
+    assert (len(sample.seen), sample.views) == (0, ())
+
+
+# --- The ceiling ------------------------------------------------------------------------------------------------------
+
+SIZES = (0.15, 0.3, 0.6)
+
+
+def verdict_at(voxel_size, **options):
+    frames = list(flight(16, step=0.35, **options))
+    table = fused(frames, voxel_size).table()
+    return describe(table, sample=sampled(frames, voxel_size))
+
+
+def test_the_truth_reaches_its_ceiling_at_every_voxel_size_while_alpha_falls():
+    found = [verdict_at(size) for size in SIZES]
+    assert found[0].agreement.alpha.value - found[-1].agreement.alpha.value > 0.1
+    assert {summary.verdict.level for summary in found} == {"stable"}
+    assert min(summary.reach.reached.value for summary in found) > 0.93
+
+
+@pytest.mark.parametrize("patch", [None, 10])
+def test_a_coin_is_stable_at_no_voxel_size(patch):
+    found = [verdict_at(size, coin=True, patch=patch) for size in SIZES]
+    assert {"stable", "usable", "partly stable"}.isdisjoint(summary.verdict.level for summary in found)
+    assert max(summary.reach.reached.value for summary in found) < 0.2
+
+
+def test_the_ground_truths_ceiling_takes_the_place_of_the_maps_own():
+    wrong, right = sampled(flight(flicker=0.4, patch=5)), sampled(flight())
+    table = fused(flight(flicker=0.4, patch=5), 0.4).table()
+    own, against = reach_of(wrong, table), reach_of(wrong.against(right), table)
+    assert against.by == "the ground truth"
+    assert against.ceiling.value == pytest.approx(alpha_between(right.seen.table()))
+    assert own.alpha == against.alpha
+    assert own.reached.value == pytest.approx(against.reached.value, abs=0.1)
+
+
+def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
+    """Two of a hundred places flip between two rare classes: alpha hardly sees it."""
+    rng = np.random.default_rng(5)
+    n = 10404
+    own = rng.integers(0, 2, size=(n, 1))
+    rare = np.arange(n)[:, None] % 50 == 0
+    log = log_of(np.where(rare, rng.integers(2, 4, size=(n, 4)), own), K=4, index=grid(102))
+    steady = np.where(rare, rng.integers(2, 4, size=(n, 1)), own)
+    perfect = log_of(np.repeat(steady, 4, axis=1), K=4, index=grid(102))
+    sample = dataclasses.replace(sampled([]), seen=log, limit=perfect)
+    found = describe(log.table(), sample=sample)
+    assert found.agreement.alpha.value > 0.95
+    assert found.verdict.level == "partly stable"
+    assert found.reach.worst.name in ("2", "3")
+    assert found.reach.worst.reached.high < 0.6
+    assert describe(log.table(), sample=sample, critical=["0"]).verdict.level == "stable"
+
+
+@pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04, 0.08])
+def test_the_ground_truth_of_a_real_scene_is_stable_at_every_voxel_size(voxel_size, shelf):
+    sampler = Sampler(voxel_size, 5)
+    backend = backends.create("numba", voxel_size=voxel_size, num_classes=5)
+    for frame in shelf:
+        sampler.add(frame)
+        backend.integrate(frame)
+    assert describe(backend.table(), sample=sampler.sample()).verdict.level == "stable"
+
+
+@pytest.fixture(scope="module")
+def shelf():
+    if not (DATA / "apc_shelf").is_dir():
+        pytest.skip(f"no {DATA / 'apc_shelf'}; set SEMSTAB_DATA to the folder that holds apc_shelf/")
+    scene = open_dataset("posed_folder", {"root": DATA / "apc_shelf"}).scene("apc_shelf")
+    return [scene.frame(index, "gt") for index in range(15)]
