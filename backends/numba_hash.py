@@ -141,23 +141,25 @@ class NumbaHash:
     def table(self) -> VoxelTable:
         """The map so far."""
         order = self._order()
+        index = columns_of_keys(self._records["key"], order, self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
         values: dict[str, Any] = {name: self._records[name][order] for name in columns}
         starts = np.zeros(len(order) + 1, dtype=np.int64)
         count_chain(self._records, self._nodes, order, starts)
-        starts = np.cumsum(starts)
+        np.cumsum(starts, out=starts)
         label, weight = np.empty(starts[-1], dtype=np.uint16), np.empty(starts[-1])
         read_chain(self._records, self._nodes, order, starts, label, weight)
+        del order
         return VoxelTable(
-            **columns_of_keys(self._records["key"], order, self.origin),
+            **index,
             **values,
             evidence=Evidence(starts, label, weight, self.num_classes),
             voxel_size=self.voxel_size,
         )
 
-    def _order(self) -> Int64:
+    def _order(self) -> npt.NDArray[np.int32]:
         """The voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
-        return np.argsort(self._records["key"][: len(self)], kind="stable")
+        return np.argsort(self._records["key"][: len(self)], kind="stable").astype(np.int32)
 
     def column(self, name: str, rows: Int64 | slice = np.s_[:]) -> npt.NDArray[Any]:
         """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""

@@ -53,7 +53,7 @@ class History:
             )
         )
 
-    def events(self, order: Int64, index: dict[str, Any]) -> Events:
+    def events(self, order: npt.NDArray[np.int32], index: dict[str, Any]) -> Events:
         """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(len(order))

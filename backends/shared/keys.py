@@ -24,7 +24,7 @@ def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
     return index
 
 
-def columns_of_keys(keys: Int64, order: Int64, origin: npt.ArrayLike) -> dict[str, Any]:
+def columns_of_keys(keys: Int64, order: npt.NDArray[np.integer], origin: npt.ArrayLike) -> dict[str, Any]:
     """Voxel indices ix, iy, iz (n,) of the packed keys in that order."""
     ordered, mask = keys[order], 2 * HALF - 1
     shift = np.asarray(origin) - HALF

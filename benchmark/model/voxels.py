@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -94,9 +94,25 @@ class VoxelTable:
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
         return replace(self, **columns, evidence=self.evidence.take(rows))
 
-    def save(self, path: str | Path, extra: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
-        """Write Parquet, atomically; `extra` columns (n,) go along for other programs and are not read back."""
-        _write_parquet(self, _VOXEL_TYPES, path, self.evidence.chunks(), extra or {})
+    def save(
+        self,
+        path: str | Path,
+        extra: Mapping[str, npt.NDArray[Any]] | None = None,
+        computed: Mapping[str, Callable[[VoxelTable], npt.NDArray[Any]]] | None = None,
+    ) -> None:
+        """Write Parquet, atomically, some rows after the others.
+
+        `extra` columns (n,), and what is `computed` from the rows that are written, go along for other programs and are
+        not read back.
+        """
+
+        def columns(some: slice) -> Mapping[str, npt.NDArray[Any]]:
+            part = self.rows(some)
+            own = {name: np.asarray(getattr(part, name)) for name in _VOXEL_TYPES}
+            made = {name: of(part) for name, of in (computed or {}).items()}
+            return own | made | {name: values[some] for name, values in (extra or {}).items()}
+
+        _write_parquet(self, path, self.evidence.chunks(), columns)
 
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
@@ -211,8 +227,12 @@ class Events:
 
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
-        index = {name: getattr(self, name)[self.voxel] for name in _INDEX_TYPES}
-        _write_parquet(self, _EVENT_TYPES, path, self.evidence.chunks(), index)
+
+        def columns(some: slice) -> Mapping[str, npt.NDArray[Any]]:
+            own = {name: getattr(self, name)[some] for name in _EVENT_TYPES}
+            return own | {name: getattr(self, name)[self.voxel[some]] for name in _INDEX_TYPES}
+
+        _write_parquet(self, path, self.evidence.chunks(), columns)
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
@@ -263,21 +283,19 @@ def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
 
 def _write_parquet(
     table: VoxelTable | Events,
-    types: Types,
     path: str | Path,
     chunks: Iterable[slice],
-    extra: Mapping[str, npt.NDArray[Any]],
+    columns: Callable[[slice], Mapping[str, npt.NDArray[Any]]],
 ) -> None:
-    """Write row group by row group: no dense column is longer."""
+    """Write what `columns` says of each chunk of rows."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    columns = {name: getattr(table, name) for name in types} | dict(extra)
     about = {"schema": SCHEMA, "kind": type(table).__name__, "voxel_size": table.voxel_size, "classes": table.classes}
     with atomic_path(path) as temporary, contextlib.ExitStack() as open_files:
         writer = None
         for some in chunks:
-            part = pa.table({name: _to_arrow(values[some]) for name, values in columns.items()})
+            part = pa.table({name: _to_arrow(values) for name, values in columns(some).items()})
             part = part.replace_schema_metadata({"semstab": json.dumps(about)})
             writer = writer or open_files.enter_context(pq.ParquetWriter(temporary, part.schema, compression="zstd"))
             writer.write_table(part)

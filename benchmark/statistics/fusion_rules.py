@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.model.evidence import Evidence
+from semstab.model.evidence import Evidence, row_chunks
+from semstab.model.information import normalise
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
 
@@ -82,8 +83,12 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
     return Fused(Belief(first, label, belief, K, rest), np.diff(bounds).astype(np.int32), drift_sum)
 
 
-def labels(belief: Float64) -> npt.NDArray[np.int64]:
-    """Class (n,) of the largest belief, the lowest of those that tie: rounding decides none."""
+def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:
+    """Class (n,) of the largest belief of evidence (n, K), the lowest of those that tie: rounding decides none."""
+    return np.concatenate([_label(normalise(evidence[some])) for some in row_chunks(*evidence.shape)])
+
+
+def _label(belief: Float64) -> npt.NDArray[np.int64]:
     near: npt.NDArray[np.bool_] = belief >= belief.max(axis=1, keepdims=True) - ONE_HOT
     highest: npt.NDArray[np.int64] = near.argmax(axis=1)
     return highest
