@@ -27,10 +27,11 @@ from semstab.backends.numba_parts.loops import (
     unchain,
     update,
 )
-from semstab.backends.shared.aggregator import Aggregator, Observed
+from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import columns_of_keys, index_of_keys
+from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence

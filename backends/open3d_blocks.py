@@ -16,9 +16,10 @@ import open3d.core as o3c
 from open3d.t.geometry import VoxelBlockGrid
 
 from semstab.backends import FusionBackend
-from semstab.backends.shared.aggregator import Aggregator, Observed
+from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import Int64, check_frame, check_settings
 from semstab.backends.shared.columns import update_rows
+from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence

@@ -18,9 +18,10 @@ import open3d.core as o3c
 from open3d.t.geometry import PointCloud, VoxelBlockGrid
 
 from semstab.backends.open3d_blocks import Open3DBlocks
-from semstab.backends.shared.aggregator import Aggregator, Observed
+from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import Float64, Int64, check_frame
 from semstab.backends.shared.hashing import PARTITIONS
+from semstab.backends.shared.observed import Observed
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
     from semstab.outputs.export import export
+    from semstab.outputs.loaded import load
+    from semstab.outputs.relabel import relabel
     from semstab.settings import load_config, load_study
 
 __version__ = "0.2.0"
@@ -35,10 +37,12 @@ __all__ = [
     "datasets",
     "engine",
     "export",
+    "load",
     "load_config",
     "load_result",
     "load_study",
     "metrics",
+    "relabel",
     "run",
     "run_study",
     "statistics",
@@ -56,9 +60,11 @@ _HOMES = {
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
     "export": "outputs.export",
+    "load": "outputs.loaded",
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",
+    "relabel": "outputs.relabel",
     "run": "api",
     "run_study": "api",
 }

@@ -37,6 +37,7 @@ REGISTRY = Registry(
             "transforms.json of nerfstudio or instant-ngp, with depth maps",
         ),
         "colmap": Entry("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
+        "odm": Entry("semstab.datasets.odm:Odm", "projects of OpenDroneMap and OpenSfM, depth from their mesh or DSM"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },

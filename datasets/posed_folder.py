@@ -48,8 +48,8 @@ class PosedFolder(FileDataset[PosedOptions]):
     settings_file = SETTINGS_FILE
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether depth/ is there."""
-        return (folder / "depth").is_dir()
+        """Whether depth/ is there, or with a surface pose/."""
+        return (folder / ("depth" if self.options.surface is None else "pose")).is_dir()
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a name of a depth image or a pose. Raises DataError for two files of one frame."""

@@ -284,6 +284,36 @@ def write_model_binary(folder: Path, camera, poses, names) -> None:
     (folder / "images.bin").write_bytes(content)
 
 
+def write_odm(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """OpenDroneMap with undistorted images and depth files."""
+    names = [f"DJI_{k:04d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.npy", frame.depth)
+        save(folder / f"opensfm/undistorted/images/{name}.JPG.tif", frame.color)
+    shots = {f"{name}.JPG.tif": shot(frame, "c") for name, frame in zip(names, frames, strict=True)}
+    fx, fy, cx, cy = four(frames[0])
+    lens = {"focal_x": fx / W, "focal_y": fy / W, "c_x": (cx - (W - 1) / 2) / W, "c_y": (cy - (H - 1) / 2) / W}
+    write_reconstruction(folder / "opensfm/undistorted", [({"c": {"projection_type": "brown"} | lens}, shots)])
+    return names
+
+
+def shot(frame: Frame, camera: str) -> dict[str, object]:
+    T_cw = np.linalg.inv(frame.T_wc)
+    rotation = Rotation.from_matrix(T_cw[:3, :3]).as_rotvec().tolist()
+    return {"camera": camera, "rotation": rotation, "translation": T_cw[:3, 3].tolist()}
+
+
+def write_reconstruction(folder: Path, parts: Sequence[tuple[dict[str, dict], dict]], size=(W, H)) -> Path:
+    """OpenSfM's, of cameras and shots; cameras have that size."""
+    sized = [
+        ({name: {"width": size[0], "height": size[1]} | values for name, values in c.items()}, s) for c, s in parts
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "reconstruction.json"
+    path.write_text(json.dumps([{"cameras": c, "shots": s, "points": {}} for c, s in sized]))
+    return path
+
+
 Writer = Callable[[Path, Sequence[Frame]], list[str]]
 
 
@@ -315,6 +345,7 @@ FORMATS = {
     ),
     "colmap, text": Format("colmap", write_colmap, None),
     "colmap, binary": Format("colmap", functools.partial(write_colmap, binary=True, model="sparse/0"), None),
+    "odm": Format("odm", write_odm, None),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
 }
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import transformers
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,18 +14,18 @@ from model_folders import KINDS, folder_of, tiny
 from pictures import blobs
 
 from semstab.backbones import create
-from semstab.backbones.sam_heuristic import Range, look_of, read_rules
-from semstab.backbones.sam_proposals import (
+from semstab.backbones.sam.heuristic import Range, look_of, read_rules
+from semstab.backbones.sam.models import full_size
+from semstab.backbones.sam.proposals import (
     Proposals,
     SamOptions,
     SamProposer,
-    full_size,
     point_grid,
     region_map,
     stability_score,
     suppress,
 )
-from semstab.backbones.sam_vote import majority
+from semstab.backbones.sam.vote import majority
 from semstab.errors import ConfigError
 from semstab.testing import checks
 
@@ -81,7 +82,9 @@ def test_proposals_are_the_same_again_and_in_other_batches(options, proposer):
 def test_proposals_are_those_of_the_article(options, proposer):
     """All points at once, every mask at full size, the rules one after the other."""
     model, settings = proposer.model, proposer.options
-    inputs = proposer.processor(images=IMAGE, return_tensors="pt")
+    inputs = transformers.AutoImageProcessor.from_pretrained(options["model"], backend="pil")(
+        IMAGE, return_tensors="pt"
+    )
     height, width = inputs["reshaped_input_sizes"][0].tolist()
     side = settings.points_per_side
     points = [[(x + 0.5) / side * width, (y + 0.5) / side * height] for y in range(side) for x in range(side)]

@@ -13,11 +13,11 @@ from pictures import blobs
 from transformers import AutoTokenizer, CLIPModel
 
 from semstab.backbones import create
-from semstab.backbones.dense_clip import dense_features, self_self_attention
-from semstab.backbones.prompts import Prompts, read_prompts
-from semstab.backbones.segearth_ov import CLIP_MEAN, CLIP_STD, normalised
-from semstab.backbones.simfeatup import JointBilateralUpsampler, SimFeatUp
-from semstab.backbones.windows import padded, slide, starts
+from semstab.backbones.segearth.dense_clip import dense_features, self_self_attention
+from semstab.backbones.segearth.prompts import Prompts, read_prompts
+from semstab.backbones.segearth.segearth_ov import CLIP_MEAN, CLIP_STD, normalised
+from semstab.backbones.segearth.simfeatup import JointBilateralUpsampler, SimFeatUp
+from semstab.backbones.segearth.windows import padded, slide, starts
 from semstab.errors import ConfigError, DataError
 from semstab.testing import checks
 

@@ -11,9 +11,11 @@ from model_folders import KINDS, folder_of, tiny
 from pictures import blobs
 from torch.nn.functional import interpolate
 
-from semstab.backbones import create, segformer
-from semstab.backbones.checkpoint import bilinear
-from semstab.backbones.segformer import argmax_upsampled, label_space, working_size
+from semstab.backbones import create
+from semstab.backbones.pretrained import segmenter
+from semstab.backbones.pretrained.checkpoint import bilinear
+from semstab.backbones.pretrained.heads import working_size
+from semstab.backbones.pretrained.segmenter import label_space, largest_upsampled
 from semstab.errors import ConfigError
 
 IMAGES = [blobs(shift=k) for k in range(3)]
@@ -101,8 +103,8 @@ def test_the_image_keeps_its_shape(image, shorter, size):
 def test_the_size_that_the_model_sees(monkeypatch, image_size, seen):
     backbone = create("segformer", model=str(tiny("segformer")), image_size=image_size)
     sizes = []
-    logits = backbone.engine
-    monkeypatch.setattr(backbone, "engine", lambda pixels: sizes.append(tuple(pixels.shape[2:])) or logits(pixels))
+    logits = backbone.head.engine
+    monkeypatch.setattr(backbone.head, "engine", lambda pixels: sizes.append(tuple(pixels.shape[2:])) or logits(pixels))
     assert backbone.predict(IMAGES[:1])[0].labels.shape == (48, 80)
     assert sizes == [seen]
 
@@ -112,8 +114,8 @@ def test_upsampling_in_chunks_is_upsampling_at_once(monkeypatch):
     logits[4] = logits[2]  # a tie goes to the lower class, also across chunks
     whole = bilinear(logits, (20, 30)).argmax(dim=0)
     for classes in (1, 2, 3, 7):
-        monkeypatch.setattr(segformer, "CHUNK_BYTES", classes * 4 * 20 * 30)
-        torch.testing.assert_close(argmax_upsampled(logits, (20, 30)), whole)
+        monkeypatch.setattr(segmenter, "CHUNK_BYTES", classes * 4 * 20 * 30)
+        torch.testing.assert_close(largest_upsampled(logits, (20, 30))[1], whole)
 
 
 def test_more_than_255_classes_take_16_bits(tmp_path):

@@ -296,6 +296,8 @@ def test_every_figure_is_written_as_png_and_svg(drawn):
         "sensitivity_depth_noise",
         "sensitivity_frame_count",
         "temporal_agreement",
+        "correlogram__often",
+        "correlogram__rarely",
         "drift",
         "sensitivity_agreement_voxel_size",
         "sensitivity_agreement_depth_noise",

@@ -91,7 +91,7 @@ def test_a_name_from_a_file_cannot_lead_out_of_the_folder(tmp_path):
     place = ScenePlace("s", tmp_path, "s")
     (tmp_path / "labels/net").mkdir(parents=True)
     for name in ("../../../etc/passwd", "a\nb", "a\0b", "x" * 2000, "\ud800"):
-        fails(DataError, "leaves|cannot be the path", find_sources, FileOptions(root=tmp_path), place, [name])
+        fails(DataError, "leaves|cannot be the path", find_sources, FileOptions(root=tmp_path), place, {name: [name]})
 
 
 def test_labels_and_scores_side_by_side(scene):

@@ -16,7 +16,7 @@ from semstab.config import FrameSelection
 from semstab.datasets.selection import select_frames
 from semstab.errors import DataError
 
-IMAGES = {".png", ".jpg", ".npy"}
+IMAGES = {".png", ".jpg", ".npy", ".tif"}
 
 
 def is_image(path: Path) -> bool:

@@ -42,13 +42,44 @@ def test_a_missing_package_says_how_to_install_it():
         SHAPES.load("bare")
 
 
-def test_a_shared_library_that_is_missing_is_a_missing_dependency(monkeypatch):
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError("libGL.so.1: cannot open shared object file:\nNo such file"),
+        RuntimeError("operator torchvision::nms does not exist"),  # of packages that do not fit each other
+        ValueError("numpy.dtype size changed"),
+    ],
+)
+def test_an_import_that_fails_inside_is_a_missing_dependency(monkeypatch, error):
     def import_module(name):
-        raise OSError("libGL.so.1: cannot open shared object file:\nNo such file")
+        raise error
 
     monkeypatch.setattr(registry.importlib, "import_module", import_module)
-    with pytest.raises(MissingDependencyError, match=r"^shape 'engine' .*libGL[^\n]*; pip install the-engine$"):
+    with pytest.raises(
+        MissingDependencyError, match=r"^shape 'engine' cannot[^\n]*; pip install the-engine$"
+    ) as caught:
         SHAPES.load("engine")
+    assert str(error).splitlines()[0] in str(caught.value)
+
+
+def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
+    from semstab import backbones
+    from semstab.cli.listing import list_
+
+    original = registry.importlib.import_module
+
+    def import_module(name):
+        if "sam" in name:
+            raise RuntimeError("operator torchvision::nms does not exist")
+        return original(name)
+
+    monkeypatch.setattr(registry.importlib, "import_module", import_module)
+    monkeypatch.setenv("COLUMNS", "300")
+    assert "sam-raw" in backbones.REGISTRY.entries()
+    list_()
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "sam-raw" in line]
+    assert "torchvision::nms does not exist" in line
+    assert "ready" not in line
 
 
 def test_errors_are_what_they_look_like():

@@ -14,7 +14,17 @@ from semstab import backends
 from semstab.datasets import open_dataset
 from semstab.metrics.matching import shared_observations
 from semstab.model.frames import Frame, Intrinsics
-from semstab.statistics import Sampler, alpha_between, describe, disagreement, krippendorff_alpha, psa, reach_of
+from semstab.statistics import (
+    Sample,
+    Sampler,
+    View,
+    alpha_between,
+    describe,
+    disagreement,
+    krippendorff_alpha,
+    psa,
+    reach_of,
+)
 
 K = 3
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
@@ -183,7 +193,8 @@ def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
     log = log_of(np.where(rare, rng.integers(2, 4, size=(n, 4)), own), K=4, index=grid(102))
     steady = np.where(rare, rng.integers(2, 4, size=(n, 1)), own)
     perfect = log_of(np.repeat(steady, 4, axis=1), K=4, index=grid(102))
-    sample = dataclasses.replace(sampled([]), seen=log, limit=perfect)
+    views = tuple(View(frame, np.array([3.0, 3.0, 9.0]), float(frame)) for frame in range(4))
+    sample = Sample(log, perfect, views, soft=False)
     found = describe(log.table(), sample=sample)
     assert found.agreement.alpha.value > 0.95
     assert found.verdict.level == "partly stable"

@@ -71,6 +71,7 @@ def test_a_study_of_everything_has_every_table(walls):
         "persistence",
         "classes",
         "temporal_agreement",
+        "correlogram",
         "class_agreement",
         "drift",
         "uncertainty",

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.numba_parts.loops import place_observations
-from semstab.backends.shared.aggregator import Observed
+from semstab.backends.shared.observed import Observed
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 

@@ -9,10 +9,14 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import PARTITIONS, mix
+from semstab.backends.shared.prefetch import touch
 from semstab.model.results import RECURRENT
 from semstab.runtime.compiled import parallel, serial
 
 SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
+
+AHEAD = 16
+"""Voxels whose memory is asked for before its turn comes."""
 
 
 def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
@@ -32,18 +36,20 @@ def look_up(key, bounds, slots, row, slot, new):
     mask = np.uint64(slots.shape[1] - 1)
     for p in nb.prange(PARTITIONS):
         n = 0
-        for v in range(bounds[p], bounds[p + 1]):
+        mine, last = slots[p], bounds[p + 1]
+        for v in range(bounds[p], last):
+            touch(mine, np.int64(mix(key[min(v + AHEAD, last - 1)]) & mask))
             at = np.int64(mix(key[v]) & mask)
-            while slots[p, at].row != -1 and slots[p, at].key != key[v]:
+            while mine[at].row != -1 and mine[at].key != key[v]:
                 at = (at + 1) & np.int64(mask)
             slot[v] = at
-            if slots[p, at].row == -1:
+            if mine[at].row == -1:
                 n += 1
-                slots[p, at].key = key[v]
-                slots[p, at].row = -1 - n
+                mine[at].key = key[v]
+                mine[at].row = -1 - n
                 row[v] = -n
             else:
-                row[v] = slots[p, at].row
+                row[v] = mine[at].row
         new[p] = n
 
 
@@ -147,6 +153,10 @@ def update(
         vss = entropy = drift = 0.0
         reached = 0
         for v in range(bounds[p], bounds[p + 1]):
+            touch(records, max(row[min(v + AHEAD, bounds[p + 1] - 1)], 0))
+            following = records[max(row[min(v + AHEAD // 2, bounds[p + 1] - 1)], 0)].next
+            if following >= 0:
+                touch(nodes, np.int64(following))
             first, last = start[v], start[v + 1]
             r = row[v]
             if r < 0:

@@ -14,7 +14,9 @@ from semstab.backends.shared.entries import find_entries
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.merging import compact, group, merge_scores, scatter, sort_labels, sum_scores
+from semstab.backends.shared.observed import Observed, WorkSpace
 from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.tiles import Tiles
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, fixed
 
@@ -25,26 +27,6 @@ FIRST_ROOM = 1 << 13
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """The observations of a frame as sparse rows, grouped by partition; valid until the next frame is observed.
-
-    key     (n,) int64 packed voxel index, relative to the origin
-    pixels  (n,) int64 pixels in the voxel
-    start   (n + 1,) int64 first entry of each voxel
-    label   (m,) uint16 classes seen in the voxel, ascending
-    weight  (m,) float64 pixels of that class, or the sum of their normalised scores; s_bar = weight / pixels
-    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
-    """
-
-    key: Int64
-    pixels: Int64
-    start: Int64
-    label: npt.NDArray[np.uint16]
-    weight: Float64
-    bounds: Int64
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +57,8 @@ class Aggregator:
         self.num_classes = num_classes
         self.origin: Int64 | None = None
         self._band_room = FIRST_ROOM
-        self._space: dict[str, npt.NDArray[Any]] = {}
+        self._space = WorkSpace()
+        self._tiles = Tiles(voxel_size, num_classes)
 
     def observe(self, frame: Frame) -> Observed:
         """The frame's observations; the first frame's camera sets the origin.
@@ -83,13 +66,15 @@ class Aggregator:
         Raises DataError for a label outside the classes, or a voxel out of reach of the packed keys.
         """
         origin = self._origin_at(frame) if self.origin is None else self.origin
-        found = self._found(frame, origin)
+        seen = None if frame.scores is not None else self._tiles.observe(frame, origin)
+        if seen is None:  # soft evidence, or a frame that reaches too far for tiles
+            seen = self._merged(frame, self._found(frame, origin))
         self.origin = origin
-        return self._merged(frame, found)
+        return seen
 
     def _found(self, frame: Frame, origin: Int64) -> _Found:
         """The entries of each band of rows, with more room for them where the first attempt had too little."""
-        H, W = frame.shape
+        space, (H, W) = self._space, frame.shape
         rows = max(MIN_BAND_ROWS, -(-H // BANDS))
         bands = -(-H // rows)
         soft = frame.scores is not None
@@ -97,17 +82,17 @@ class Aggregator:
         ray_x = (np.arange(W) - camera.cx) / camera.fx
         ray_y = (np.arange(H) - camera.cy) / camera.fy
         labels = np.where(frame.valid, np.uint8(0), np.uint8(IGNORE_8BIT)) if soft else frame.labels
-        where = self._room("where", H * W if soft else 1, np.int32)
+        where = space.room("where", H * W if soft else 1, dtype=np.int32)
         threads = nb.get_num_threads()
         rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
-        row_keys = self._room("row_keys", threads * 2 * W, np.int64).reshape(threads, 2, W)
-        row_changes = self._room("row_changes", threads * W, np.uint8).reshape(threads, W)
-        row_runs = self._room("row_runs", threads * 4 * (W + 1), np.int32).reshape(threads, 4, W + 1)
+        row_keys = space.room("row_keys", threads, 2, W)
+        row_changes = space.room("row_changes", threads, W, dtype=np.uint8)
+        row_runs = space.room("row_runs", threads, 4, W + 1, dtype=np.int32)
         while True:
             room = min(self._band_room, rows * W)
-            key, label = self._room("key", bands * room, np.int64), self._room("label", bands * room, np.uint16)
-            count = self._room("count", bands * room, np.int32)
-            slots = self._room("slots", threads * slots_for(room), np.int32).reshape(threads, -1)
+            key, label = space.room("key", bands * room), space.room("label", bands * room, dtype=np.uint16)
+            count = space.room("count", bands * room, dtype=np.int32)
+            slots = space.room("slots", threads, slots_for(room), dtype=np.int32)
             entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
             highest = np.full(bands, -1, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
@@ -125,31 +110,31 @@ class Aggregator:
             self._band_room *= 4
 
     def _merged(self, frame: Frame, at: _Found) -> Observed:
-        K = self.num_classes
+        space, K = self._space, self.num_classes
         total = int(at.entries.sum())
         offset = np.zeros((PARTITIONS, len(at.entries)), dtype=np.int64)
         offset.reshape(-1)[1:] = np.cumsum(at.spread.T.reshape(-1))[:-1]
         edges = np.append(offset[:, 0], total)
-        order = self._room("order", total, np.int64)
+        order = space.room("order", total)
         scatter(at.key, at.room, at.entries, offset, order)
-        voxel = self._room("voxel", total, np.int64)
-        merged_key = self._room("merged_key", total, np.int64)
-        merged_pixels = self._room("merged_pixels", total, np.int64)
-        merged_size = self._room("merged_size", total, np.int64)
+        voxel = space.room("voxel", total)
+        merged_key = space.room("merged_key", total)
+        merged_pixels = space.room("merged_pixels", total)
+        merged_size = space.room("merged_size", total)
         found = np.zeros(PARTITIONS, dtype=np.int64)
         group(at.key, at.count, order, edges, voxel, merged_key, merged_pixels, merged_size, found)
         bounds = np.concatenate([[0], np.cumsum(found)])
         n = int(bounds[-1])
-        keys, pixels = self._room("keys", n, np.int64), self._room("pixels", n, np.int64)
+        keys, pixels = space.room("keys", n), space.room("pixels", n)
         if frame.scores is None:
-            out_label = self._room("out_label", total, np.uint16)
-            out_weight = self._room("out_weight", total, np.float64)
+            out_label = space.room("out_label", total, dtype=np.uint16)
+            out_weight = space.room("out_weight", total, dtype=np.float64)
             kept = np.zeros(PARTITIONS, dtype=np.int64)
             sort_labels(at.label, at.count, order, edges, voxel, merged_size, found, out_label, out_weight, kept)
             entry_bounds = np.concatenate([[0], np.cumsum(kept)])
             m = int(entry_bounds[-1])
-            start = self._room("start", n + 1, np.int64)
-            labels, weight = self._room("labels", m, np.uint16), self._room("weight", m, np.float64)
+            start = space.room("start", n + 1)
+            labels, weight = space.room("labels", m, dtype=np.uint16), space.room("weight", m, dtype=np.float64)
             compact(
                 edges, bounds, entry_bounds, merged_key, merged_pixels, merged_size, out_label, out_weight,
                 keys, pixels, start, labels, weight,
@@ -176,11 +161,6 @@ class Aggregator:
             voxel_index(frame.T_wc[:3, 3:], self.voxel_size, frame)
             raise out_of_reach(frame, origin, self.voxel_size)
         return origin.astype(np.int64)
-
-    def _room(self, name: str, size: int, dtype: Any) -> npt.NDArray[Any]:
-        if name not in self._space or len(self._space[name]) < size:
-            self._space[name] = np.empty(max(size, 1), dtype=dtype)
-        return self._space[name][:size]
 
 
 def _widened(scores: Any) -> Any:

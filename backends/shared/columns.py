@@ -8,9 +8,9 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.aggregator import Observed
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import PARTITIONS
+from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change
 from semstab.model.results import RECURRENT
 from semstab.runtime.compiled import parallel

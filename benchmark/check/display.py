@@ -40,6 +40,8 @@ def _heading(checked: SceneCheck) -> str:
     )
     if depth.valid:
         text += f", {depth.p5:.3g} to {depth.p95:.3g} m (5% to 95%)"
+    if checked.depth_from is not None:
+        text += f"; from {escape(checked.depth_from)}"
     if checked.motion is None:
         return text
     (least, most), (from_, to) = checked.motion.shift, checked.motion.turn
@@ -52,10 +54,11 @@ def _heading(checked: SceneCheck) -> str:
 def _tables(checked: SceneCheck) -> Iterator[tuple[str, Table]]:
     """Titles and tables."""
     verdict = checked.verdict
-    yield (
-        f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs",
-        _convention_table(checked),
-    )
+    if verdict.fits:
+        yield (
+            f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs",
+            _convention_table(checked),
+        )
     if checked.overlaps:
         yield "what frames share, by their distance among the selected ones", _overlap_table(checked)
     if checked.persistence:

@@ -38,8 +38,7 @@ def _edges(scene: Scene, views: Sequence[View]) -> Iterator[Edges]:
             yield view.depth, label_edges(view.labels, view.ignore_id)
             continue
         try:
-            color = scene.color(view.index)
-            grey = None if color is None else scene.predicted(view.index, labels=grey_levels(color)).labels
+            grey = scene.predicted(view.index, labels=grey_levels(scene.image(view.index))).labels
         except DataError:  # no image of the depth's view: whoever needs it says so
             continue
         if grey is not None:

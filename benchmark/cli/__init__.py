@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from semstab import __version__
 from semstab.cli.data import check, convert, predict
-from semstab.cli.exporting import export
+from semstab.cli.exporting import export, relabel
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
@@ -89,6 +89,7 @@ def root(
 for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
     app.command(name)(command)
 app.command("export")(export)
+app.command("relabel")(relabel)
 app.command("view")(view)
 app.command("list")(list_)
 

@@ -1,4 +1,4 @@
-"""The command export."""
+"""The commands export and relabel: what a finished run gives to others."""
 
 from __future__ import annotations
 
@@ -52,3 +52,38 @@ def export(
     for file in written:
         for line in (f"{file.path}: {file.content}", *(f"  {remark}" for remark in file.remarks)):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def relabel(
+    run: Run,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder above labels/; the scene's own, to run it at once.")],
+    scene: Scene = None,
+    backbone: Backbone = None,
+    backend: Backend = None,
+    name: Annotated[str | None, typer.Option(help="What the maps are called; BACKBONE-fused by default.")] = None,
+    min_op: Annotated[int, typer.Option(min=1, help="Ignore pixels of voxels that fewer frames saw.")] = 1,
+    min_psa: Annotated[float, typer.Option(help="Ignore pixels of voxels on which fewer pairs of frames agree.")] = 0.0,
+    category: Annotated[
+        list[str] | None, typer.Option(help="Keep pixels of voxels of this category alone; repeatable.")
+    ] = None,
+    leave_own_out: Annotated[
+        bool, typer.Option("--leave-own-out", help="What the other frames say, without the frame's own vote.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """The fused classes back in every frame: label maps of a new source, unstable places ignored."""
+    from rich.console import Console
+
+    from semstab.convert.display import frame_bar
+    from semstab.outputs.relabel import Belief
+    from semstab.outputs.relabel import relabel as write
+
+    belief = Belief(min_op, min_psa, tuple(category or ()), leave_own_out)
+    with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
+        report = write(
+            run, out, belief=belief, scene=scene, backbone=backbone, backend=backend, name=name, overwrite=overwrite,
+            progress=bar,
+        )  # fmt: skip
+    for line in report.lines():
+        Console(quiet=quiet).print(line, soft_wrap=True, markup=False, highlight=False)

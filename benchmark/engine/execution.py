@@ -96,6 +96,7 @@ def _execute(
         content = manifest(config, found.inputs(plan), found.watch.seconds, command)
         content |= {"units": found.counts() | {"executor": executor.name}}
         content |= {"geometry": {scene: verdict.summary() for scene, verdict in found.geometry.items()}}
+        content |= {"depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from}}
         result = dataclasses.replace(result, manifest=content)
         folder.save_result(result)
         told.tell(lambda observer: observer.run_finished(result))

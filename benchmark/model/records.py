@@ -6,16 +6,22 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.errors import ConfigError
+from semstab.model import tabular
 from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
+from semstab.model.measures import measures
 from semstab.model.results import Agreement, Unit, UnitSummary
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.json_form import INLINE
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
@@ -256,6 +262,30 @@ class Result:
         units = (*self.select(), *self.select(BACKENDS))
         groups = dict.fromkeys((record.unit.scene, record.unit.backbone) for record in units)
         return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.backbone) == group)
+
+    def to_arrow(self) -> pa.Table:
+        """One row a unit: what it is, how much there is, the mean of every measure, of recurrent voxels too."""
+        return tabular.to_arrow(self._columns())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The same as a data frame. Raises MissingDependencyError without pandas."""
+        return tabular.to_pandas(self._columns())
+
+    def _columns(self) -> dict[str, Any]:
+        rows = [run.row() for run in self.runs]
+        return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
+
+    def _repr_html_(self) -> str:
+        """The summary table, in a notebook."""
+        rows: list[list[tabular.Cell]] = []
+        for run in self.runs:
+            table, unit = run.table, run.unit
+            means = (tabular.number(table[measure], measure.digits[0]) for measure in measures())
+            seen = tabular.number(table.mean_op, 2), *means, tabular.number(100 * table.recurrent.share, 2)
+            rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen])
+        titles = [measure.title for measure in measures()]
+        headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %"]
+        return tabular.as_html(self.name, headers, rows)
 
     @property
     def agrees(self) -> bool:

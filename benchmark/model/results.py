@@ -165,6 +165,18 @@ class UnitSummary:
     frames_empty: int = 0
     statistics: MapStatistics | None = None
 
+    def row(self) -> dict[str, str | int | float]:
+        """What it is, how much there is, and the mean of every measure, of the recurrent voxels alone as well."""
+        table, unit = self.table, self.unit
+        return {
+            "scene": unit.scene, "backbone": unit.backbone, "backend": unit.backend, "taxonomy": self.taxonomy,
+            "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames, "points": table.points,
+            "observations": table.observations, "voxels": table.voxels, "mean_op": table.mean_op,
+            **table.means.value, "recurrent_share": table.recurrent.share,
+            **{f"recurrent_{key}": value for key, value in table.recurrent.means.value.items()},
+            "flicker_percent": self.flicker_percent, "fuse_ms_per_frame": self.fuse_ms_per_frame,
+        }  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Deviation:

@@ -137,6 +137,40 @@ class ClassReach:
 
 
 @dataclass(frozen=True)
+class LagBin:
+    """Pairs of looks at a place that are `low` to `high` apart, `mean` in the mean.
+
+    alpha    between frames, of these pairs and beyond their own chance
+    ceiling  the same of labels that do not depend on the view
+    """
+
+    low: float
+    high: float
+    mean: float
+    pairs: int
+    alpha: Estimate
+    ceiling: float
+
+
+@dataclass(frozen=True)
+class Correlogram:
+    """Agreement beyond chance by how far apart two looks are; bins with few pairs are left out.
+
+    time      frames
+    angle     degrees between the directions of view
+    range     ratio of the distances to the place, the larger one above
+    baseline  metres between the cameras
+    standard  the pairs with 5 to 15 degrees between them, for models and flights to be compared at
+    """
+
+    time: tuple[LagBin, ...]
+    angle: tuple[LagBin, ...]
+    range: tuple[LagBin, ...]
+    baseline: tuple[LagBin, ...]
+    standard: LagBin
+
+
+@dataclass(frozen=True)
 class Reach:
     """Alpha between frames beside its ceiling, that of labels which do not depend on the view, in sampled voxels.
 
@@ -331,6 +365,7 @@ class MapStatistics:
     verdict: StabilityVerdict
     agreement: FrameAgreement
     reach: Reach | None
+    correlogram: Correlogram | None
     drift: DriftStatistics
     uncertainty: EntropyParts
     geometry: Losses | None

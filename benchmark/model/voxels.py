@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError
+from semstab.model import parquet, tabular
 from semstab.model.evidence import Evidence
 from semstab.model.information import entropy_bits, js_divergence, normalise
-from semstab.runtime.files import atomic_path
+from semstab.model.measures import MeasureMeans, dominant, measures
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
 
-SCHEMA = 1
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -94,6 +93,37 @@ class VoxelTable:
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
         return replace(self, **columns, evidence=self.evidence.take(rows))
 
+    def to_arrow(self) -> pa.Table:
+        """Columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
+        return tabular.to_arrow(self._columns())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The same as a data frame. Raises MissingDependencyError without pandas."""
+        return tabular.to_pandas(self._columns())
+
+    def _columns(self) -> dict[str, Any]:
+        names = self.classes or tuple(str(k) for k in range(self.K))
+        x, y, z = self.centers.T
+        evidence = self.evidence[:]
+        return {
+            "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
+            "class": tabular.named(dominant(self), names),
+            **{measure.key: measure.of(self) for measure in measures()},
+            "pixels": self.pixels, "first_frame": self.first_frame, "last_frame": self.last_frame,
+            **{f"evidence_{name}": evidence[:, k] for k, name in enumerate(names)},
+        }  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        """The means of all voxels and of the recurrent ones, in a notebook."""
+        values = {measure: measure.of(self) for measure in measures()}
+        rows: list[list[tabular.Cell]] = []
+        for name, where in (("all", self.op > 0), ("OP >= 3", self.op >= 3)):
+            means = MeasureMeans.over(values, self.op, where)
+            numbers = (tabular.number(means[measure], measure.digits[0]) for measure in measures())
+            rows.append([name, int(np.count_nonzero(where)), *numbers])
+        title = f"{len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes"
+        return tabular.as_html(title, ["", "voxels", *(measure.title for measure in measures())], rows)
+
     def save(
         self,
         path: str | Path,
@@ -106,19 +136,20 @@ class VoxelTable:
         not read back.
         """
 
-        def columns(some: slice) -> Mapping[str, npt.NDArray[Any]]:
+        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
             part = self.rows(some)
             own = {name: np.asarray(getattr(part, name)) for name in _VOXEL_TYPES}
             made = {name: of(part) for name, of in (computed or {}).items()}
             return own | made | {name: values[some] for name, values in (extra or {}).items()}
 
-        _write_parquet(self, path, self.evidence.chunks(), columns)
+        parts = map(columns, self.evidence.chunks())
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
 
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
-        with _reading(path):
-            return cls(**_read_parquet(path, _VOXEL_TYPES))
+        with parquet.reading(path):
+            return cls(**parquet.read(path, _VOXEL_TYPES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,17 +259,18 @@ class Events:
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
 
-        def columns(some: slice) -> Mapping[str, npt.NDArray[Any]]:
+        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
             own = {name: getattr(self, name)[some] for name in _EVENT_TYPES}
             return own | {name: getattr(self, name)[self.voxel[some]] for name in _INDEX_TYPES}
 
-        _write_parquet(self, path, self.evidence.chunks(), columns)
+        parts = map(columns, self.evidence.chunks())
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
-        with _reading(path):
-            content = _read_parquet(path, _EVENT_TYPES | _INDEX_TYPES)
+        with parquet.reading(path):
+            content = parquet.read(path, _EVENT_TYPES | _INDEX_TYPES)
             first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
             return cls(**content | {name: content[name][first] for name in _INDEX_TYPES})
 
@@ -279,73 +311,3 @@ def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
     if len(shape) != 2:
         raise DataError(f"{type(table).__name__}: evidence of shape {shape}, expected one row of K classes each")
     return Evidence.of(given)
-
-
-def _write_parquet(
-    table: VoxelTable | Events,
-    path: str | Path,
-    chunks: Iterable[slice],
-    columns: Callable[[slice], Mapping[str, npt.NDArray[Any]]],
-) -> None:
-    """Write what `columns` says of each chunk of rows."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    about = {"schema": SCHEMA, "kind": type(table).__name__, "voxel_size": table.voxel_size, "classes": table.classes}
-    with atomic_path(path) as temporary, contextlib.ExitStack() as open_files:
-        writer = None
-        for some in chunks:
-            part = pa.table({name: _to_arrow(values) for name, values in columns(some).items()})
-            part = part.replace_schema_metadata({"semstab": json.dumps(about)})
-            writer = writer or open_files.enter_context(pq.ParquetWriter(temporary, part.schema, compression="zstd"))
-            writer.write_table(part)
-
-
-def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
-    import pyarrow as pa
-
-    if values.ndim == 1:
-        return pa.array(values)
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
-
-
-@contextlib.contextmanager
-def _reading(path: str | Path) -> Iterator[None]:
-    """Whatever is wrong with a file's content is a DataError of one line that names the file."""
-    import pyarrow as pa
-
-    try:
-        yield
-    except (OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
-
-
-def _read_parquet(path: str | Path, types: Types) -> dict[str, Any]:
-    import pyarrow.parquet as pq
-
-    with pq.ParquetFile(path) as content:
-        about = json.loads((content.schema_arrow.metadata or {})[b"semstab"])
-        if about["schema"] != SCHEMA:
-            raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
-        parts: dict[str, list[Any]] = {name: [] for name in types}
-        for group in range(content.num_row_groups):
-            rows = content.read_row_group(group, columns=list(types))
-            for name, values in parts.items():
-                values.append(_to_numpy(rows.column(name)))
-    columns = {name: _joined(values) for name, values in parts.items()}
-    return columns | {"voxel_size": float(about["voxel_size"]), "classes": tuple(about["classes"])}
-
-
-def _joined(parts: list[Any]) -> Any:
-    return Evidence.joined(parts) if isinstance(parts[0], Evidence) else np.concatenate(parts)
-
-
-def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:
-    import pyarrow as pa
-
-    if column.null_count:
-        raise DataError("a column has missing values")
-    if pa.types.is_fixed_size_list(column.type):
-        return Evidence.of(column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size))
-    values: npt.NDArray[Any] = column.to_numpy()
-    return values

@@ -39,6 +39,9 @@ class ProgressBar(Observer):
         units = plan.distinct()
         if kept:
             self.bar.console.print(f"kept from before: {len(kept)} of {len(units)} units", style="dim")
+        for scene in plan.scenes.values():
+            if scene.depth_from is not None:
+                self.notes.append(f"{scene.name}: depth from {scene.depth_from}")
         missing = units.keys() - {each.identity for each in kept}
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
         if self.bar.console.is_interactive:
@@ -60,7 +63,7 @@ class ProgressBar(Observer):
             )
 
     def run_finished(self, result: Result) -> None:
-        """Take the bar away, and say what could not be told."""
+        """Take the bar away, and say what is to be known of the scenes."""
         self.close()
         for note in self.notes if not result.failures else ():
             self.bar.console.print(note, style="dim", soft_wrap=True, markup=False)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import Estimate, MapStatistics, Reach, RuleOutcome
+from semstab.model.statistics import Estimate, LagBin, MapStatistics, Reach, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -71,6 +71,7 @@ def _agreement(found: MapStatistics) -> list[Row]:
         ("alpha between frames", found.agreement.alpha_between, ""),
         ("  each place counting once", found.agreement.each_place, ""),
         *([] if found.reach is None else _reach(found.reach)),
+        *([] if found.correlogram is None else _standard(found.correlogram.standard)),
     ]
 
 
@@ -81,6 +82,11 @@ def _reach(reach: Reach) -> list[Row]:
         ("  share reached", reach.reached, ""),
         *((f"  {row.name}"[:34], row.reached, f"{row.places:.0f} places") for row in reach.classes if row.matters),
     ]
+
+
+def _standard(found: LagBin) -> list[Row]:
+    ceiling = "" if math.isnan(found.ceiling) else f"ceiling {found.ceiling:.2f}; {found.pairs} pairs"
+    return [(f"alpha b.f., views {found.low:g} to {found.high:g} deg.", found.alpha, ceiling)]
 
 
 def _drift(found: MapStatistics) -> list[Row]:

@@ -127,6 +127,8 @@ class PredictedScene(Scene):
         self.ground_truth = inner.ground_truth
         self.up = inner.up
         self.georeference = inner.georeference
+        self.surface = inner.surface
+        self.depth_from = inner.depth_from
         self.folder = inner.folder
         self.settings_file = inner.settings_file
         self.skips_incomplete = inner.skips_incomplete
@@ -207,7 +209,8 @@ class PredictedScene(Scene):
         labels = prediction.labels if prediction.scores is None else None
         frame = self._inner.predicted(index, labels=labels, scores=prediction.scores)
         self._digests[index] = _digest(image, frame)
-        return dataclasses.replace(frame, color=image if color else None)
+        shown = self._inner.color(index) if color and self._inner.on_photographs else image
+        return dataclasses.replace(frame, color=shown if color else None)
 
     def digest(self, indices: list[int], backbone: str) -> str:
         """A hash of the model, its settings, and the image, depth and pose of those frames.

@@ -53,13 +53,14 @@ class Registry:
     def load(self, name: str) -> Any:
         """Import the class behind a name.
 
-        Raises ConfigError where the name is not known, MissingDependencyError where its packages are not installed.
+        Raises ConfigError where the name is not known, MissingDependencyError where its packages are not installed, or
+        fail when they are imported, as those of versions that do not fit each other do.
         """
         entry = self.entry(name)
         module, _, attribute = entry.target.partition(":")
         try:
             return getattr(importlib.import_module(module), attribute)
-        except (ImportError, OSError, AttributeError) as error:  # OSError: a shared library is missing
+        except Exception as error:  # RuntimeError: torchvision of another torch; OSError: a shared library is missing
             hint = entry.install or "install what it needs"
             raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({one_line(error)}); {hint}") from error
 

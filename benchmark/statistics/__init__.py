@@ -47,7 +47,7 @@ from semstab.statistics.drift import (
     voxel_drift,
 )
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
-from semstab.statistics.looks import Sample, Sampler, View, reach_of
+from semstab.statistics.looks import Sample, Sampler, View, correlogram, reach_of
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.verdict import verdict
 
@@ -81,6 +81,7 @@ __all__ = [
     "class_agreement",
     "compare_backbones",
     "correctness",
+    "correlogram",
     "coverage",
     "decompose",
     "describe",

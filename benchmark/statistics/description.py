@@ -63,7 +63,7 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
-from semstab.statistics.looks import Sample, reach_of
+from semstab.statistics.looks import Sample, correlogram, reach_of
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 
@@ -163,6 +163,7 @@ def analyse(
         verdict=judged,
         agreement=agreement,
         reach=reach,
+        correlogram=None if sample is None else correlogram(sample),
         drift=drift,
         uncertainty=uncertainty,
         geometry=None if limit is None else losses(table, limit, seed=seed),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,6 +24,9 @@ DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": 
 REGIONS = "regions/{backbone}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
 """In a folder of label maps or scores: their classes, where they are not the scene's; a taxonomy file."""
+
+FileNames = Mapping[str, Sequence[str]]
+"""By a frame's name the names that its files may have, its own first."""
 
 SEPARATE = "{scene}/{backbone}/{name}"
 """The template of label maps in a folder of their own."""
@@ -54,7 +57,7 @@ class ScenePlace:
     below_root: str
 
 
-def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> dict[str, LabelSource]:
+def find_sources(options: FileOptions, place: ScenePlace, names: FileNames) -> dict[str, LabelSource]:
     """The label sources of a scene whose frames have these names; `gt` is the ground truth.
 
     labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
@@ -75,11 +78,13 @@ def find_sources(options: FileOptions, place: ScenePlace, names: Sequence[str]) 
             if source.files:
                 found[name] = source
             elif names:
-                logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(names[0])[0])
+                logger.warning(
+                    "%s: no file of any frame, such as %s; left out", name, source.missing(next(iter(names)))[0]
+                )
     if not found and (options.labels or options.scores or options.labels_root):
         logger.warning(
             "%s: no label maps in %s fit the options labels and scores; looked for %s",
-            place.name, base, ", ".join(label_paths(options, place, names)),
+            place.name, base, ", ".join(label_paths(options, place, [*names])),
         )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in found:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
@@ -101,7 +106,7 @@ def label_paths(options: FileOptions, place: ScenePlace, names: Sequence[str]) -
 
 
 def find_regions(
-    options: FileOptions, place: ScenePlace, names: Sequence[str], sources: Collection[str]
+    options: FileOptions, place: ScenePlace, names: FileNames, sources: Collection[str]
 ) -> dict[str, LabelSource]:
     """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none.
 
@@ -119,7 +124,7 @@ def find_regions(
     return {backbone: source for backbone, source in found.items() if source.files}
 
 
-def find_masks(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> Mapping[str, Path]:
+def find_masks(options: FileOptions, place: ScenePlace, names: FileNames) -> Mapping[str, Path]:
     """The mask of each frame that has one, by the frame's name; none without the option."""
     if options.masks is None:
         return {}
@@ -149,11 +154,18 @@ def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) 
     return matching_folders(base, template, "backbone", scene=place.below_root)
 
 
-def _source(kind: Kind, base: Path, template: str, names: Iterable[str], folders: Folders) -> LabelSource:
+def _source(kind: Kind, base: Path, template: str, names: FileNames, folders: Folders) -> LabelSource:
     """The files of one source, by the frames' names."""
-    expected = {name: inside(base, base, template.replace("{name}", name), str(base)) for name in names}
-    found = ((name, folders.one_of(path, SUFFIXES[kind])) for name, path in expected.items())
-    return LabelSource(kind, expected, {name: path for name, path in found if path is not None})
+    paths = {
+        name: [inside(base, base, template.replace("{name}", each), str(base)) for each in known]
+        for name, known in names.items()
+    }
+    found = {
+        name: next((path for each in known if (path := folders.one_of(each, SUFFIXES[kind])) is not None), None)
+        for name, known in paths.items()
+    }
+    expected = {name: known[0] for name, known in paths.items()}
+    return LabelSource(kind, expected, {name: path for name, path in found.items() if path is not None})
 
 
 def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:

@@ -118,6 +118,15 @@ class FileSettings(Settings):
         return self
 
 
+Surface = Annotated[
+    Path | None,
+    Field(description="mesh, cloud (LAS, LAZ, PLY) or height raster (GeoTIFF) that depth is cast from, not from files"),
+]
+SurfaceCell = Annotated[
+    Positive | None, Field(description="metres of a cell of the grid that a cloud or a raster becomes, seen from above")
+]
+
+
 class FileOptions(FileSettings):
     """What can be said of any dataset of files: where they are, and how they are read."""
 
@@ -127,4 +136,9 @@ class FileOptions(FileSettings):
     )
     labels_root: Path | None = Field(
         None, description="folder of label maps and scores; the scene's own where not given"
+    )
+    surface: Surface = None
+    surface_cell: SurfaceCell = None
+    casts: Path | Literal[False] | None = Field(
+        None, description="folder where cast depth is kept, or false; semstab/casts in the user's cache by default"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -20,6 +20,8 @@ from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.scene import Dataset
+from semstab.datasets.surfaces.casts import usual_folder
+from semstab.datasets.surfaces.surface import Surface
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError, DataError
@@ -48,8 +50,7 @@ class FileDataset(Dataset, Generic[Options]):
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        places = find_scenes(options.root, self.is_scene, self.looks_like)
-        self._places = {place.name: place for place in places}
+        self._places = {place.name: place for place in self.find_scenes(options.root)}
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -65,11 +66,16 @@ class FileDataset(Dataset, Generic[Options]):
         frames = self.frames(place.folder)
         if not frames:
             raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
-        scene = FileScene(place, frames, options, self.class_ids())
-        scene.georeference = self.georeference(place.folder, options)
+        georeference = self.georeference(place.folder, options)
+        scene = FileScene(place, frames, options, self.class_ids(), _surface(options, georeference))
+        scene.georeference = georeference
         scene.labels_like_depth = self.labels_like_depth
         scene.settings_file = None if self.settings_file is None else place.folder / self.settings_file
         return scene
+
+    def find_scenes(self, root: Path) -> Iterable[ScenePlace]:
+        """The scenes below the root, in natural order; raises what `find_scenes` raises."""
+        return find_scenes(root, self.is_scene, self.looks_like)
 
     def settled(self, folder: Path) -> FileOptions:
         """The options with which a scene's folder is read."""
@@ -166,6 +172,14 @@ def frames_of(
         )
         for k, (name, path) in enumerate(depth.items())
     ]
+
+
+def _surface(options: FileOptions, georeference: Georeference | None) -> Surface | None:
+    """What depth is cast from, where the options say so."""
+    if options.surface is None:
+        return None
+    casts = None if options.casts is False else options.casts or usual_folder()
+    return Surface(options.surface, options.surface_cell, georeference, casts)
 
 
 def _below(folder: Path, is_scene: Callable[[Path], bool], levels: int) -> Iterator[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.label_ids import translated, without_labels, without_scores
 from semstab.datasets.files.label_source import (
@@ -28,20 +29,24 @@ from semstab.datasets.files.messages import listed, nearest
 from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.templates import Folders, inside
 from semstab.datasets.formats import disk
-from semstab.datasets.formats.colmap_depth import read_depth_map
-from semstab.datasets.formats.images import MILLIMETRES, read_color, read_depth, read_labels, read_mask, read_scores
+from semstab.datasets.formats.images import read_color, read_labels, read_mask, read_scores
 from semstab.datasets.formats.text_files import read_pose
 from semstab.datasets.scene import GROUND_TRUTH, Scene
+from semstab.datasets.surfaces.casting import View
+from semstab.datasets.surfaces.surface import Surface
 from semstab.datasets.views.cameras import Camera
+from semstab.datasets.views.lenses import undistorted
 from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
-from semstab.datasets.views.ray_depth import planar
 from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
 from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 
-PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset"}
+PLACES = {
+    "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",
+    "casts", "images",
+}  # fmt: skip
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
 
 
@@ -59,6 +64,7 @@ class FileScene(Scene):
         frames: Sequence[FrameSource],
         options: FileOptions,
         class_ids: Mapping[str, npt.NDArray[np.uint16]] | None = None,
+        surface: Surface | None = None,
     ) -> None:
         names = [frame.name for frame in frames]
         if len(set(names)) < len(names):
@@ -73,17 +79,24 @@ class FileScene(Scene):
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
         self._class_ids = class_ids or {}
-        labels = find_sources(options, place, names)
-        regions = find_regions(options, place, names, labels)
+        aliases = {frame.name: (frame.name, *frame.aliases) for frame in frames}
+        labels = find_sources(options, place, aliases)
+        regions = find_regions(options, place, aliases, labels)
         self._sources = {**labels, **regions}
         self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
         self.label_paths = tuple(label_paths(options, place, names))
-        self._masks = find_masks(options, place, names)
+        self._masks = find_masks(options, place, aliases)
         self._folders = Folders()
         self._spaces: dict[str, LabelSpace | None] = {}
         self._digests: dict[Path, bytes] = {}
+        self._depth: DepthSource = (
+            StoredDepth(options, self._read) if surface is None else CastDepth(surface, options, self._views)
+        )
+        self.surface = None if surface is None else surface.path
+        self.depth_from = None if surface is None else f"rays cast at {surface.path}"
+        self.on_photographs = any(frame.label_lens is not None for frame in frames)
 
     def __len__(self) -> int:
         """Number of frames of the sequence, those that lack a file or a pose among them."""
@@ -104,11 +117,13 @@ class FileScene(Scene):
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
-        files = [frame.depth, *([frame.pose_file] if frame.pose is None else [])]
+        files = [self._depth.path(frame), *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._source(name).missing(frame.name)]
         if color and self._color_file(frame) is None:
             lost.append(f"{self.folder}: the colour of {frame.name}" if frame.color is None else str(frame.color))
+        if color and frame.label_lens is not None and not self._folders.has(frame.photograph or Path()):
+            lost.append(f"{self.folder}: the photograph of {frame.name}")
         return lost
 
     @property
@@ -117,9 +132,9 @@ class FileScene(Scene):
         return self.options.model_dump()
 
     @property
-    def depth_scale(self) -> float:
+    def depth_scale(self) -> float | None:
         """Units of its stored depth in a metre: what is said, else what its kind of file means."""
-        return self._scale(self._frames[0])
+        return self._depth.scale(self._frames[0])
 
     def label_space(self, backbone: str) -> LabelSpace:
         """The classes of that label source.
@@ -170,6 +185,11 @@ class FileScene(Scene):
     def view(self, index: int, shape: tuple[int, int]) -> Frame:
         """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0."""
         source = self._frame(index)
+        if source.label_lens is not None:
+            raise DataError(
+                f"{self.folder}: no pinhole has the depth of distorted photographs, which a model wants; set labels_on:"
+                " undistorted"
+            )
         camera = source.label_camera
         K = None if camera is None else camera.at(shape, self.options.pixel_centre or 0.0)
         return at_image(self.geometry(index), shape, str(source.color or source.name), K)
@@ -177,24 +197,30 @@ class FileScene(Scene):
     def depth(self, index: int) -> npt.NDArray[np.float32]:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
         source = self._frame(index)
-        scale = self.options.depth_scale or source.depth_scale
-        read = read_depth_map if source.depth.suffix.lower() == ".bin" else read_depth
-        depth = read(source.depth, scale, self._read)
-        if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
-            depth = np.zeros_like(depth)
-        for value in self.options.invalid_depth:
-            with np.errstate(over="ignore"):
-                depth[depth == np.float32(value) / np.float32(self._scale(source))] = 0
-        if self.options.max_depth is not None:
-            depth[depth >= self.options.max_depth] = 0
-        if self.options.depth_kind == "ray":
-            return planar(depth, self.intrinsics(index, depth.shape))
-        return depth
+        return self._depth.depth(source, lambda shape: self.intrinsics(index, shape), lambda: self.T_wc(index))
 
     def color(self, index: int) -> npt.NDArray[np.uint8] | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
-        path = self._color_file(self._frame(index))
-        return None if path is None else read_color(path)
+        source = self._frame(index)
+        path = self._color_file(source)
+        if path is None or source.color_lens is None:
+            return None if path is None else read_color(path)
+        size = source.camera.size or source.color_lens.camera.size
+        assert size is not None
+        shape = (size[1], size[0])
+        return undistorted(read_color(path), source.color_lens, self.intrinsics(index, shape), shape, str(path))
+
+    def image(self, index: int) -> npt.NDArray[np.uint8]:
+        """What models predict on: the colour image, or the distorted photograph where label maps belong to that."""
+        source = self._frame(index)
+        if source.label_lens is None:
+            return super().image(index)
+        if source.photograph is None or not self._folders.has(source.photograph):
+            raise DataError(
+                f"{self.folder}: the photograph of {source.name} is not there, on which labels are predicted; add it"
+                " to images/, or set labels_on: undistorted"
+            )
+        return read_color(source.photograph)
 
     def image_name(self, index: int) -> str:
         """What path templates call the frame."""
@@ -232,13 +258,18 @@ class FileScene(Scene):
             source = self._frame(index)
             digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
             mask = [self._masks[source.name]] if source.name in self._masks else []
-            for path in (source.depth, self._label_file(source, backbone), *mask):
+            depth = self._depth.digest(source)
+            paths = [*([source.depth] if depth is None else []), self._label_file(source, backbone), *mask]
+            digest.update(depth or b"")
+            for path in paths:
                 digest.update(self._digests.get(path) or disk.file_digest(path))
         return digest.hexdigest()
 
-    def _scale(self, source: FrameSource) -> float:
-        usual = MILLIMETRES if source.depth.suffix.lower() == ".png" else 1.0
-        return self.options.depth_scale or source.depth_scale or usual
+    def _views(self) -> Iterator[View]:
+        """Those of the frames that have a pose."""
+        for index in filter(self.tracked, range(len(self))):
+            shape = shape_of(self._frame(index), self.options)
+            yield View(self.intrinsics(index, shape), self.T_wc(index), shape)
 
     def _framed(
         self,
@@ -254,7 +285,9 @@ class FileScene(Scene):
         source, timestamps = self._frame(index), self.timestamps
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
         mask = self._masks.get(source.name)
-        known = {"depth": source.depth, "pose": source.pose_file, "color": image, "mask": mask} | dict(files or {})
+        shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
+        known = {"depth": self._depth.path(source), "pose": source.pose_file, "color": shown, "mask": mask}
+        known |= dict(files or {})
         return Frame(
             index=int(index),
             depth=depth,
@@ -262,7 +295,7 @@ class FileScene(Scene):
             T_wc=self.T_wc(index),
             labels=labels,
             scores=scores,
-            color=read_color(image) if color and image is not None else None,
+            color=self.color(index) if color else None,
             mask=None if mask is None else self._mask(index, mask, depth.shape),
             timestamp=None if timestamps is None else float(timestamps[index]),
             files={what: str(path) for what, path in known.items() if path is not None},
@@ -291,13 +324,18 @@ class FileScene(Scene):
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
         """What a file holds, at the depth's pixels; where it must have them, `Frame` says that it has not."""
-        return values if self.labels_like_depth else self._fitted(index, values, shape, str(path), what)
+        as_they_are = self.labels_like_depth and self._frame(index).label_lens is None
+        return values if as_they_are else self._fitted(index, values, shape, str(path), what)
 
     def _fitted(
         self, index: int, values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is"
     ) -> Pixels:
         """Labels (H', W') or scores (H', W', K) as the depth's camera sees them."""
-        camera = self._frame(index).label_camera
+        source = self._frame(index)
+        if source.label_lens is not None:
+            K = self.intrinsics(index, shape)
+            return undistorted(values, source.label_lens, K, (shape[0], shape[1]), where, what)
+        camera = source.label_camera
         if camera is None:
             return fitted(values, shape, where, what)
         K = camera.at(values.shape, self.options.pixel_centre or 0.0)
@@ -305,7 +343,7 @@ class FileScene(Scene):
 
     def _geometry_bytes(self, source: FrameSource) -> bytes:
         """The pose and the cameras of a frame, as bytes that are equal where they are."""
-        cameras = (source.camera, source.label_camera, source.depth_scale)
+        cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
         return self._stored_pose(source).tobytes() + repr(cameras).encode()
 
     def _read(self, path: Path) -> bytes:

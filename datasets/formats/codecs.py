@@ -150,14 +150,17 @@ def decode_jpeg(path: Path, data: bytes) -> npt.NDArray[np.uint8]:
         raise DataError(f"{path}: not a whole JPEG image ({one_line(error)}); {AGAIN}") from error
 
 
+def decode_color_tiff(path: Path, data: bytes) -> npt.NDArray[np.uint8]:
+    """RGB (H, W, 3) of an 8-bit image, or of a deeper one its upper bits."""
+    channels = _checked_tags(path, data, pixel_bytes=3).get(277, 1)
+    if channels not in (1, 3, 4):
+        raise DataError(f"{path}: {channels} channels are no colour; save RGB")
+    return np.ascontiguousarray(_imdecode(path, data, "IMREAD_COLOR")[..., ::-1])
+
+
 def decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
     """One channel (H, W), of the type it was stored in."""
-    try:
-        tags = _tiff_tags(data)
-        width, height = tags[256], tags[257]
-    except (struct.error, KeyError) as error:
-        raise DataError(f"{path}: not a whole TIFF image; {AGAIN}") from error
-    _check_pixels(path, width, height)
+    tags = _checked_tags(path, data)
     bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
     if channels != 1:
         raise DataError(f"{path}: expected one channel of 32-bit float, found {channels} channels")
@@ -165,6 +168,17 @@ def decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
         kind = {1: "unsigned", 2: "signed", 3: "float"}.get(sample, "other")
         raise DataError(f"{path}: expected 32-bit float metres, found {bits}-bit {kind}; convert it")
     return _imdecode(path, data, "IMREAD_UNCHANGED")
+
+
+def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, int]:
+    """The tags of a TIFF whose size can be read."""
+    try:
+        tags = _tiff_tags(data)
+        width, height = tags[256], tags[257]
+    except (struct.error, KeyError) as error:
+        raise DataError(f"{path}: not a whole TIFF image; {AGAIN}") from error
+    _check_pixels(path, width, height, pixel_bytes)
+    return tags
 
 
 def _tiff_tags(data: bytes) -> dict[int, int]:

@@ -11,16 +11,23 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.formats.arrays import MAX_SCORE_BYTES, decode_array
-from semstab.datasets.formats.codecs import Png, decode_exr, decode_jpeg, decode_tiff, parse_png
+from semstab.datasets.formats.codecs import (
+    Png,
+    decode_color_tiff,
+    decode_exr,
+    decode_jpeg,
+    decode_tiff,
+    parse_png,
+)
 from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.views.resampling import Labels
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 SCORE_SUFFIXES = (".npz", ".npy")
-COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
@@ -109,9 +116,23 @@ def read_mask(path: Path, read: Read = read_bytes) -> npt.NDArray[np.bool_]:
 
 
 def read_color(path: Path) -> npt.NDArray[np.uint8]:
-    """Colour (H, W, 3) uint8 RGB from PNG or JPEG, not rotated by EXIF. Raises DataError for a damaged file."""
+    """Colour (H, W, 3) uint8 RGB from PNG, JPEG or TIFF, not rotated by EXIF. Raises DataError for a damaged file."""
     data = read_bytes(path)
-    return parse_png(path, data).rgb() if path.suffix.lower() == ".png" else decode_jpeg(path, data)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        return parse_png(path, data).rgb()
+    return decode_color_tiff(path, data) if suffix in (".tif", ".tiff") else decode_jpeg(path, data)
+
+
+def color_size(path: Path) -> Size:
+    """(width, height) of a colour image, from its header. Raises DataError where that is damaged."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: not an image ({one_line(error)})") from error
 
 
 def _depth_png(path: Path, data: bytes) -> Png:

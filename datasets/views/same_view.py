@@ -21,7 +21,7 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
     if values.shape[:2] == shape:
         return values
     _require_one_view(values.shape, shape, where, what)
-    h, w = shape
+    h, w = shape[:2]
     target = Intrinsics(1, 1, (w - 1) / 2, (h - 1) / 2)
     return fit(values, Camera(target, (w, h)).at(values.shape), target, (h, w))
 
@@ -41,6 +41,11 @@ def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | N
 
 
 def _require_one_view(image: tuple[int, ...], depth: tuple[int, ...], where: str, what: str) -> None:
-    (H, W), (h, w) = image[:2], depth
+    require_same_view(image, depth, where, f"{what} {{}} but depth is {{}}")
+
+
+def require_same_view(shape: tuple[int, ...], other: tuple[int, ...], where: str, what: str) -> None:
+    """Raise DataError with `where` and `what`, which has two places for sizes, unless the shapes are of one view."""
+    (H, W), (h, w) = shape[:2], other[:2]
     if abs(W * h / (H * w) - 1) > SHAPE_TOLERANCE:
-        raise DataError(f"{where}: {what} {W}x{H} but depth is {w}x{h}, another view; register one to the other")
+        raise DataError(f"{where}: {what.format(f'{W}x{H}', f'{w}x{h}')}, another view; register one to the other")

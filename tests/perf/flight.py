@@ -1,4 +1,4 @@
-"""Frames for the benchmarks: a UAV at 45 m over blocks of houses; of its labels 2 % err, anew in each frame."""
+"""Frames for the benchmarks: a UAV at 45 m over blocks of houses, of whose labels 2 % err; or in a noisy street."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 import semstab
 
@@ -35,6 +36,72 @@ def frame(index: int, width: int, height: int, K: int) -> semstab.Frame:
         index=index,
         depth=z.astype(np.float32),
         labels=np.where(wrong, (label + 1) % K, label).astype(np.uint8),
+        intrinsics=semstab.Intrinsics(f, f, width / 2, height / 2),
+        T_wc=T_wc,
+    )
+
+
+STREET, EAVES, TREES = 14.0, 12.0, 40
+"""Half the width of the street, the height of its houses (metres), and how many trees stand in each of two rows."""
+
+
+def street(
+    index: int, width: int, height: int, K: int, *, noise: float = 0.0, salt: float = 0.0, clean: bool = False
+) -> semstab.Frame:
+    """Frame `index` of a flight along a street: facades with windows, trees, roofs, ground, and sky without depth.
+
+    noise  standard deviation of depth, as a share of it
+    salt   share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
+    """
+    rng = np.random.default_rng(index)
+    f = width / (2 * np.tan(np.radians(35)))
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    pitch = np.radians(12)
+    R = np.array([[1, 0, 0], [0, -np.sin(pitch), np.cos(pitch)], [0, -np.cos(pitch), -np.sin(pitch)]])
+    dx, dy, dz = ((R[i, 0] * (u - width / 2) + R[i, 1] * (v - height / 2)) / f + R[i, 2] for i in range(3))
+    start = np.array([0.5 * np.sin(index), 1.5 * index, 22.0])
+    z = np.full((height, width), np.inf, dtype=np.float32)
+    label = np.zeros((height, width), dtype=np.int64)
+
+    def hit(at: npt.NDArray[np.float32], where: npt.NDArray[np.bool_], name: int) -> None:
+        nearer = where & (at > 0.5) & (at < 150) & (at <= z)
+        z[nearer], label[nearer] = at[nearer], name % K
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = (-start[2] / dz).astype(np.float32)
+        x = start[0] + dx * at
+        hit(at, np.abs(x) <= STREET, 0)
+        hit(at, np.abs(x) <= STREET / 3, 1)
+        at = (EAVES - start[2]) / dz
+        hit(at, np.abs(start[0] + dx * at) > STREET, 2)
+        for side in (-STREET, STREET):
+            at = (side - start[0]) / dx
+            up, along = start[2] + dz * at, start[1] + dy * at
+            window = (np.mod(along, 3.0) > 1.4) & (np.mod(up, 3.0) > 1.2)
+            at = (at + np.where(window, 0.25 / np.abs(dx), 0)).astype(np.float32)
+            hit(at, (up > 0) & (up < EAVES), 3)
+            hit(at, (up > 0) & (up < EAVES) & window, 4)
+        for k in range(2 * TREES):
+            center = np.array([(-9.0, 9.0)[k % 2], 8.0 + (k // 2) * 7.0, 5.0]) - start
+            along = (dx * center[0] + dy * center[1] + dz * center[2]) / (dx * dx + dy * dy + dz * dz)
+            miss = (dx * along - center[0]) ** 2 + (dy * along - center[1]) ** 2 + (dz * along - center[2]) ** 2
+            if center[1] > 0:
+                leaf = (np.floor(u / 7) * 31 + np.floor(v / 5) * 17 + k) % 11 / 11  # leaves before and behind others
+                hit(along - np.sqrt(np.maximum(6.0 - miss, 0)) + 0.8 * leaf, miss < 6.0 - 2 * leaf, 5)
+    if noise:
+        z *= 1 + noise * rng.standard_normal(z.shape, dtype=np.float32)
+    z[~np.isfinite(z)] = 0
+    if not clean:
+        wrong = rng.random((-(-height // 24), -(-width // 24))) < 0.12
+        label = np.where(np.kron(wrong, np.ones((24, 24), dtype=bool))[:height, :width], (label + 1) % K, label)
+    if salt:
+        label = np.where(rng.random(z.shape) < salt, rng.integers(0, K, z.shape), label)
+    T_wc = np.eye(4)
+    T_wc[:3, :3], T_wc[:3, 3] = R, start
+    return semstab.Frame(
+        index=index,
+        depth=z,
+        labels=label.astype(np.uint8),
         intrinsics=semstab.Intrinsics(f, f, width / 2, height / 2),
         T_wc=T_wc,
     )

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import voxel_keys
-from semstab.outputs.export.voxels import Voxels
+from semstab.model.voxels import VoxelTable
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -22,10 +22,10 @@ NONE = -1
 
 
 class VoxelLookup:
-    """Finds voxels by coordinates, those of the export; a radius of 0 takes no neighbours. Its memory is the map's."""
+    """Finds voxels of a map by coordinates, those of the scene and an offset; a radius of 0 takes no neighbours."""
 
-    def __init__(self, voxels: Voxels, radius: float) -> None:
-        self._table, self._offset, self._radius = voxels.table, voxels.offset, radius
+    def __init__(self, table: VoxelTable, offset: npt.ArrayLike = (0.0, 0.0, 0.0), radius: float = 0.0) -> None:
+        self._table, self._offset, self._radius = table, np.asarray(offset, dtype=np.float64), radius
         index = self._table.index.astype(np.int64)
         self._low, self._high = index.min(axis=0), index.max(axis=0)
         (self._keys,) = voxel_keys(index)

@@ -70,7 +70,7 @@ def classify(voxels: Voxels, cloud: Path, out: Path, radius: float, asprs: Path 
         raise ConfigError(f"{out}: {cloud.name} stays what it is; write {out.with_suffix(cloud.suffix)}")
     if out.exists() and out.samefile(cloud):
         raise ConfigError(f"{out}: is the cloud itself; choose another file")
-    lookup, tally = VoxelLookup(voxels, radius), Tally()
+    lookup, tally = VoxelLookup(voxels.table, voxels.offset, radius), Tally()
     with atomic_path(out) as temporary:
         write(voxels, cloud, temporary, _finder(lookup, tally))
         if not tally.classified:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from semstab.model.records import Record, Result
 from semstab.model.results import Unit, slug
-from semstab.model.statistics import Estimate, MapStatistics, Reliability
+from semstab.model.statistics import Correlogram, Estimate, MapStatistics, Reliability
 from semstab.outputs.averages import by_backbone, levels, swept
+from semstab.outputs.plots.looks import draw_correlogram
 from semstab.outputs.plots.maps import draw_uncertainty, right_or_wrong
 from semstab.outputs.plots.statistics import (
     DriftByOP,
@@ -38,6 +39,7 @@ def statistics_figures(result: Result, kept: Sequence[Record], views: Views) -> 
     judged = [(record.unit, record.statistics) for record in result.select() if record.statistics is not None]
     return [
         *_agreement(judged),
+        *_correlograms(judged),
         *_drift([record for record in kept if record.statistics is not None], views),
         *_reliability(judged),
         *_comparison(result),
@@ -62,6 +64,24 @@ def _agreement(judged: Judged) -> Iterator[Figure]:
                 },
                 {ALPHA.word: (TENTATIVE, RELIABLE)},
             ),
+        )
+
+
+def _correlograms(judged: Judged) -> Iterator[Figure]:
+    scenes: dict[str, dict[str, Correlogram]] = {}
+    for unit, found in judged:
+        if found.correlogram is not None and found.correlogram.time:
+            scenes.setdefault(unit.scene, {})[unit.backbone] = found.correlogram
+    for scene, backbones in scenes.items():
+        yield Figure(
+            slug("correlogram", scene),
+            f"Agreement by distance of the looks: {scene}",
+            "Alpha between frames of pairs of looks at a place, by how far apart they are in time, angle, range and"
+            " baseline, with bands at 95% over blocks of space, for these frames. Dashed: the same of labels that do"
+            " not depend on the view; the gap is the model's. Bins with few pairs are left out.",
+            f"Four panels of {scene}, one curve a backbone with its band and a dashed ceiling: agreement against frames"
+            " apart, degrees between the views, ratio of the ranges, and metres between the cameras.",
+            partial(draw_correlogram, backbones),
         )
 
 

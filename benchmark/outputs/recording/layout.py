@@ -150,8 +150,15 @@ def _below(scene: str, tasks: list[Task]) -> rrb.Container:
     more = [_plot(scene, name, tasks) for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
     times = [_plot(scene, name, tasks) for name in SERIES if name.endswith("_ms")]
     notes = rrb.TextLogView(origin=path(scene, "log"), name="Notes")
+    agreement = [
+        rrb.TextDocumentView(origin=path(scene, "agreement", task.backbone), name=task.backbone) for task in tasks
+    ]
     return rrb.Tabs(
-        first, rrb.Horizontal(*more, name="More series"), rrb.Horizontal(*times, name="Milliseconds"), notes
+        first,
+        rrb.Horizontal(*agreement, name="Agreement of frames"),
+        rrb.Horizontal(*more, name="More series"),
+        rrb.Horizontal(*times, name="Milliseconds"),
+        notes,
     )
 
 

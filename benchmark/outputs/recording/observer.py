@@ -28,6 +28,7 @@ from semstab.model.records import RECORDING_PARTS, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import drift_colors, legend, series
+from semstab.outputs.recording.agreement import looks_report
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
     CameraLog,
@@ -244,6 +245,9 @@ class Recording(Observer):
     def _log_numbers(self, stream: rr.RecordingStream, group: GroupLog, summary: UnitSummary) -> None:
         text = _final(summary) + group.remarks.get(summary.unit.backend, "")
         stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
+        if summary.statistics is not None:
+            document = rr.TextDocument(looks_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
+            stream.log(path(summary.unit.scene, "agreement", summary.unit.backbone), document, static=True)
 
     def _send_blueprint(self, stream: rr.RecordingStream) -> None:
         layout = blueprint(self._plan, self._known)

@@ -174,9 +174,10 @@ TOPICS = (
     Topic(
         "agreement_of_frames",
         "Do the frames agree about a place?",
-        "These measures do not depend on how often a place was seen. Read alpha: 1 is perfect, 0 is what chance gives;"
-        " where its interval is wide, the data do not decide. Agreement is not truth.",
-        ("temporal_agreement", "class_agreement"),
+        "These measures are unchanged by random thinning of the frames. Read alpha between frames beside its ceiling: 1"
+        " is perfect, 0 is what chance gives; where its interval is wide, the data do not decide. How much frames agree"
+        " depends on how far apart they look from. Agreement is not truth.",
+        ("temporal_agreement", "correlogram", "class_agreement"),
     ),
     Topic(
         "drift",

@@ -10,6 +10,7 @@ from semstab.outputs.tables.correctness import ceiling, correctness, rules
 from semstab.outputs.tables.fusion import agreement, fusion
 from semstab.outputs.tables.glance import glance
 from semstab.outputs.tables.image_space import flicker
+from semstab.outputs.tables.looks import correlogram
 from semstab.outputs.tables.sensitivity import sensitivity
 from semstab.outputs.tables.stability import classes, cross_backbone, persistence, scenes
 from semstab.outputs.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
@@ -31,8 +32,8 @@ __all__ = [
 ]
 
 BUILDERS = (
-    glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, class_agreement, drift, uncertainty,
-    ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, agreement,
+    glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
+    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, agreement,
 )  # fmt: skip
 """In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
 

@@ -1,6 +1,9 @@
 """Single looks at sampled voxels: what tells the model from geometry, near looks from far ones, for every run."""
 
+from semstab.statistics.looks.common import Common, common
+from semstab.statistics.looks.correlogram import correlogram
+from semstab.statistics.looks.entries import Looks, Sample, View
 from semstab.statistics.looks.reach import reach_of
-from semstab.statistics.looks.sampler import Sample, Sampler, View
+from semstab.statistics.looks.sampler import Sampler
 
-__all__ = ["Sample", "Sampler", "View", "reach_of"]
+__all__ = ["Common", "Looks", "Sample", "Sampler", "View", "common", "correlogram", "reach_of"]

@@ -6,9 +6,7 @@ import numpy as np
 
 from semstab.backends.shared.hashing import mix
 from semstab.runtime.compiled import serial
-
-CELLS = 4
-"""Cells along a voxel's edge; two bits an axis."""
+from semstab.statistics.looks.entries import CELLS
 
 
 @serial

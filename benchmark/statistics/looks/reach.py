@@ -17,7 +17,7 @@ from semstab.model.statistics import ClassReach, Estimate, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import alpha_columns, between_of, class_columns, class_of
 from semstab.statistics.blocks import BlockBootstrap, Statistic, spatial_blocks
-from semstab.statistics.looks.sampler import Sample
+from semstab.statistics.looks.entries import Sample
 
 Float64 = npt.NDArray[np.float64]
 

@@ -6,9 +6,7 @@ pixels go to cells a quarter as wide. Memory is bounded: whenever there is too m
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,52 +14,16 @@ import numpy.typing as npt
 
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.model.voxels import Events, index_columns
+from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
 
-LEAST_FRAMES = 2
-"""What a cell shows counts where so many frames saw it: its label is to be more than one frame's own."""
-
 REACH = 1 << 18
 """Voxels from the first camera within which there is a sample."""
 
-OWN, TRUTH = "its own labels in finer cells", "the ground truth"
-
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """Where a frame was taken: its index, camera centre (3,) in metres, and time stamp in seconds or NaN."""
-
-    frame: int
-    centre: Float64
-    timestamp: float
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """What was seen of the sampled voxels, and what would have been had their labels not depended on the view.
-
-    seen   observations (s_bar of a voxel in a frame), of the cells that LEAST_FRAMES or more saw
-    limit  the same rows, each cell having the dominant label of all frames in each of them
-    views  of all frames, in order of integration
-    soft   whether the evidence is scores
-    by     whose labels the limit has: the map's own in finer cells, or those of the ground truth
-    """
-
-    seen: Events
-    limit: Events
-    views: tuple[View, ...]
-    soft: bool
-    by: str = OWN
-
-    def against(self, truth: Sample) -> Sample:
-        """The same with the ground truth's labels as the limit, of a sample of the same frames."""
-        return dataclasses.replace(self, limit=truth.seen, by=TRUTH)
 
 
 class Sampler:
@@ -103,33 +65,17 @@ class Sampler:
             self._halve()
 
     def sample(self) -> Sample:
-        """What is there so far."""
-        key, frame, label, weight = self._joined()
-        F = max(len(self._views), 1)
-        cells, cell = np.unique(key, return_inverse=True)
-        looks, look = np.unique(cell * F + frame, return_inverse=True)
-        pixels = np.bincount(look, weights=weight)
-        often = np.bincount(looks // F, minlength=len(cells)) >= LEAST_FRAMES
-        shown = _dominant(cell, label, weight / pixels[look], self.K, len(cells))
-        kept = often[cell]
-        voxels, voxel = np.unique(key[kept] >> 6, return_inverse=True)
-        rows, row = np.unique(voxel * F + frame[kept], return_inverse=True)
-        index, order = self._index(voxels), np.array([view.frame for view in self._views], dtype=np.int32)
+        """What is there so far, as observations of the sampled voxels."""
+        return self.looks().sample()
 
-        def log(labels: Int64) -> Events:
-            sums = np.bincount(row * self.K + labels, weights=weight[kept], minlength=len(rows) * self.K)
-            sums = sums.reshape(len(rows), self.K)
-            total = sums.sum(axis=1)
-            return Events(
-                **index_columns(index),
-                voxel=rows // F,
-                frame=order[rows % F],
-                evidence=sums / total[:, None],
-                pixels=np.rint(total).astype(np.int64),
-                voxel_size=self.voxel_size,
-            )
-
-        return Sample(log(label[kept]), log(shown[cell[kept]]), tuple(self._views), self._soft)
+    def looks(self, classes: tuple[str, ...] = ()) -> Looks:
+        """What is there so far, cell by cell."""
+        nothing = [np.zeros(0, dtype) for dtype in (np.int64, np.int64, np.int64, np.float64, np.int64)]
+        key, view, label, weight, drawn = (np.concatenate(column) for column in zip(nothing, *self._parts, strict=True))
+        return Looks(
+            self._cells(key), view, label, weight, drawn, tuple(self._views), self.voxel_size, self.K, self._share,
+            self._soft, classes,
+        )  # fmt: skip
 
     def _labels(self, frame: Frame, cell: Int64, pixel: Int64) -> tuple[Int64, Int64, Float64, Int64]:
         """Entries (cell, class, pixels) of a frame's labels, and a pixel of each."""
@@ -158,30 +104,9 @@ class Sampler:
         self._parts = kept
         self._entries = sum(len(part[0]) for part in kept)
 
-    def _joined(self) -> tuple[Int64, Int64, Int64, Float64]:
-        """Cell, frame, class and weight of all entries."""
-        nothing = (
-            np.zeros(0, np.int64),
-            np.zeros(0, np.int64),
-            np.zeros(0, np.int64),
-            np.zeros(0),
-            np.zeros(0, np.int64),
-        )
-        key, frame, label, weight, _ = (np.concatenate(column) for column in zip(nothing, *self._parts, strict=True))
-        return key, frame, label, weight
-
-    def _index(self, key: Int64) -> Int64:
-        """Voxel indices (n, 3) of voxel keys."""
-        mask = 2 * REACH - 1
-        relative = np.stack([key >> 38, (key >> 19) & mask, key & mask], axis=1) - REACH
-        return relative if self._origin is None else relative + self._origin
-
-
-def _dominant(cell: Int64, label: Int64, share: Float64, K: int, cells: int) -> Int64:
-    """The class (cells,) of the largest sum of shares of each cell, the lowest on ties."""
-    pairs, pair = np.unique(cell * K + label, return_inverse=True)
-    evidence = np.bincount(pair, weights=share)
-    order = np.lexsort((pairs % K, -evidence, pairs // K))
-    first = np.searchsorted(pairs[order] // K, np.arange(cells))
-    classes: Int64 = pairs[order][first] % K
-    return classes
+    def _cells(self, key: Int64) -> Int64:
+        """Indices (n, 3) of cells by their keys: three voxel indices of 19 bits, three digits of 2 bits."""
+        of_voxel = np.stack([key >> 44, (key >> 25) & (2 * REACH - 1), (key >> 6) & (2 * REACH - 1)], axis=1) - REACH
+        child = np.stack([(key >> 4) & 3, (key >> 2) & 3, key & 3], axis=1)
+        origin = np.zeros(3, dtype=np.int64) if self._origin is None else self._origin
+        return CELLS * (of_voxel + origin) + child

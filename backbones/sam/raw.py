@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from semstab.backbones import Backbone, Image, Prediction
-from semstab.backbones.sam_proposals import SamOptions, SamProposer, region_map
+from semstab.backbones.sam.proposals import SamOptions, SamProposer, region_map
 
 
 class SamRaw(Backbone):

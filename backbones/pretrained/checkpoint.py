@@ -19,6 +19,9 @@ from pydantic import Field
 from semstab.config import Settings
 from semstab.errors import ConfigError, DataError, one_line
 
+if not transformers.is_torch_available():  # else its classes are stand-ins that fail when they are used
+    raise ImportError(f"transformers {transformers.__version__} does not work with torch {torch.__version__}")
+
 HUB_ID = re.compile(r"[\w-][\w.-]*(/[\w-][\w.-]*)?")
 WEIGHTS = ("*.safetensors", "*.bin")
 """Suffixes of weights, the preferred first."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from semstab.backbones.checkpoint import ModelOptions
+from semstab.backbones.pretrained.checkpoint import ModelOptions
 from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
 
 INSTALL = "pip install 'semstab[onnx]'"

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field, model_validator
 
 from semstab.backbones import Backbone, Image, Prediction
-from semstab.backbones.sam_proposals import Mask, SamOptions, SamProposer
+from semstab.backbones.sam.proposals import Mask, SamOptions, SamProposer
 from semstab.config import Settings, read_yaml, validated
 from semstab.model.labels import LabelSpace
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-import transformers
 from pydantic import Field
 
 from semstab.backbones import UNASSIGNED, Image, image_digest
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
-from semstab.errors import DataError
+from semstab.backbones.pretrained.checkpoint import Checkpoint
+from semstab.backbones.pretrained.preprocessing import ImageModelOptions
+from semstab.backbones.sam.models import Seen, load_model
 from semstab.runtime.files import atomic_path, content_key
 
 Mask = npt.NDArray[np.bool_]
@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 MOST_REGIONS = 65535
 
 
-class SamOptions(ModelOptions):
+class SamOptions(ImageModelOptions):
     """Which checkpoint, and which of its masks are kept."""
 
     points_per_side: int = Field(32, ge=1, le=256, description="the image is asked at a grid of so many points a side")
@@ -89,13 +89,7 @@ class SamProposer:
     def __init__(self, options: SamOptions) -> None:
         self.options = options
         self.checkpoint = Checkpoint.find(options)
-        self.processor = self.checkpoint.load(transformers.AutoImageProcessor)
-        self.model = self.checkpoint.load_model(transformers.AutoModelForMaskGeneration, options)
-        if not isinstance(self.model, transformers.SamModel):
-            kind = self.model.config.model_type
-            raise DataError(
-                f"{self.checkpoint.folder}: a '{kind}' model; name one of the first Segment Anything ('sam')"
-            )
+        self.model, self._eye = load_model(self.checkpoint, options)
 
     def identity(self) -> dict[str, Any]:
         """The checkpoint's revision and the settings."""
@@ -122,27 +116,23 @@ class SamProposer:
 
     @torch.inference_mode()
     def _propose(self, image: Image) -> Proposals:
-        inputs = self.processor(images=image, input_data_format="channels_last", return_tensors="pt")
-        resized = tuple(int(side) for side in inputs["reshaped_input_sizes"][0])
-        pixels = inputs["pixel_values"].to(self.model.device, self.model.dtype)
-        embedding = self.model.get_image_embeddings(pixels)
-        points = point_grid(self.options.points_per_side) * np.array(resized[::-1])
-        sizes = (tuple(pixels.shape[-2:]), resized, image.shape[:2])
+        seen = self._eye.see(image)
+        points = point_grid(self.options.points_per_side) * np.array(seen.extent[::-1])
         kept = [
             found
             for start in range(0, len(points), self.options.points_per_batch)
-            for found in self._ask(embedding, points[start : start + self.options.points_per_batch], sizes)
+            for found in self._ask(seen, points[start : start + self.options.points_per_batch])
         ]
         return _without_duplicates(kept, (image.shape[0], image.shape[1]), self.options.nms_iou)
 
-    def _ask(self, embedding: torch.Tensor, points: Array, sizes: Any) -> Iterator[_Found]:
+    def _ask(self, seen: Seen, points: Array) -> Iterator[_Found]:
         """The masks at these points that the model rates well and that are stable."""
-        where = torch.as_tensor(points, dtype=embedding.dtype, device=embedding.device)
-        found = self.model(image_embeddings=embedding, input_points=where[None, :, None, :], multimask_output=True)
+        where = torch.as_tensor(points, dtype=self.model.dtype, device=self.model.device)
+        found = self.model(**seen.embedding, input_points=where[None, :, None, :], multimask_output=True)
         scores = found.iou_scores[0].flatten().float()
         masks = found.pred_masks[0].flatten(0, 1)
         for k in torch.nonzero(scores > self.options.pred_iou).flatten().tolist():
-            logits = full_size(masks[k].float(), *sizes)
+            logits = seen.full_size(masks[k].float())
             if stability_score(logits, self.options.stability_offset) >= self.options.stability:
                 mask = (logits > 0).cpu().numpy()
                 if mask.any():
@@ -171,12 +161,6 @@ def point_grid(side: int) -> Array:
     centres = (np.arange(side) + 0.5) / side
     x, y = np.meshgrid(centres, centres)
     return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-def full_size(logits: torch.Tensor, padded: Any, resized: Any, image: Any) -> torch.Tensor:
-    """Mask logits (h, w) of the padded square, without the padding, at the image's size; bilinear each time."""
-    square = bilinear(logits[None], padded)
-    return bilinear(square[..., : resized[0], : resized[1]], image)[0]
 
 
 def stability_score(logits: torch.Tensor, offset: float) -> float:

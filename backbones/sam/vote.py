@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from semstab.backbones import Image, Labels, Prediction, create
 from semstab.backbones.outside.border import Checked
-from semstab.backbones.sam_proposals import Proposals, SamOptions, SamProposer
+from semstab.backbones.sam.proposals import Proposals, SamOptions, SamProposer
 from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame

@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-import transformers
 from pydantic import BaseModel, Field
 from torch import nn
+from transformers import AutoTokenizer, CLIPModel
 
 from semstab.backbones import Backbone, Image, Prediction, narrowed
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
-from semstab.backbones.dense_clip import dense_features
-from semstab.backbones.prompts import Prompts, read_prompts
-from semstab.backbones.simfeatup import SimFeatUp
-from semstab.backbones.windows import padded, slide
+from semstab.backbones.pretrained.checkpoint import Checkpoint, ModelOptions, bilinear
+from semstab.backbones.segearth.dense_clip import dense_features
+from semstab.backbones.segearth.prompts import Prompts, read_prompts
+from semstab.backbones.segearth.simfeatup import SimFeatUp
+from semstab.backbones.segearth.windows import padded, slide
 from semstab.errors import ConfigError, DataError
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
@@ -56,12 +56,12 @@ class SegEarthOV(Backbone):
         self.prompts = read_prompts(options.prompts)
         self.label_space = self.prompts.label_space()
         self.checkpoint = Checkpoint.find(options)
-        self._model = self.checkpoint.load_model(transformers.CLIPModel, options)
+        self._model = self.checkpoint.load_model(CLIPModel, options)
         self.window = options.window or int(self._model.vision_model.config.image_size)
         self.stride = options.stride or max(1, self.window // 2)
         if self.stride > self.window:
             raise ConfigError(f"segearth-ov: stride {self.stride} leaves gaps between windows of {self.window} pixels")
-        self.queries = self._text_features(self.checkpoint.load(transformers.AutoTokenizer), self.prompts)
+        self.queries = self._text_features(self.checkpoint.load(AutoTokenizer), self.prompts)
         self._class_of_query = torch.tensor([k for k, _ in self.prompts.queries], device=self._model.device)
         self._upsampler = _load_upsampler(options.upsampler, self._model)
 

@@ -1,0 +1,1 @@
+"""Checkpoints of transformers for segmentation: found, loaded whole, asked for labels and scores."""

@@ -1,0 +1,1 @@
+"""Segment Anything: its proposals, and what is made of them."""

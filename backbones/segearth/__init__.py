@@ -1,0 +1,1 @@
+"""SegEarth-OV, and what it is made of."""

@@ -1,0 +1,45 @@
+"""What compiled backends take from a frame: its observations as sparse rows, and the space to work them out in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Int64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """The observations of a frame as sparse rows, grouped by partition; valid until the next frame is observed.
+
+    key     (n,) int64 packed voxel index, relative to the origin
+    pixels  (n,) int64 pixels in the voxel
+    start   (n + 1,) int64 first entry of each voxel
+    label   (m,) uint16 classes seen in the voxel, ascending
+    weight  (m,) float64 pixels of that class, or the sum of their normalised scores; s_bar = weight / pixels
+    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
+    """
+
+    key: Int64
+    pixels: Int64
+    start: Int64
+    label: npt.NDArray[np.uint16]
+    weight: npt.NDArray[np.float64]
+    bounds: Int64
+
+
+class WorkSpace:
+    """Arrays that are kept from frame to frame, by name."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, npt.NDArray[Any]] = {}
+
+    def room(self, name: str, *shape: int, dtype: Any = np.int64) -> npt.NDArray[Any]:
+        """An array of that shape with whatever is in it."""
+        size = int(np.prod(shape))
+        if name not in self._arrays or len(self._arrays[name]) < size:
+            self._arrays[name] = np.empty(max(size, 1), dtype=dtype)
+        return self._arrays[name][:size].reshape(shape)

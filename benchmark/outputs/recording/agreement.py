@@ -1,0 +1,29 @@
+"""What the statistics say of a finished map, as the viewer shows it beside the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from semstab.model.statistics import LagBin, MapStatistics
+
+AXES = (("angle", "degrees"), ("time", "frames"), ("baseline", "metres"), ("range", "times the range"))
+
+
+def looks_report(found: MapStatistics) -> str:
+    """The verdict, and agreement by how far apart two looks at a place are, in Markdown."""
+    return "\n".join([f"**{found.verdict.level}**: {found.verdict.line}", "", *_correlogram(found)])
+
+
+def _correlogram(found: MapStatistics) -> Iterator[str]:
+    if found.correlogram is None:
+        return
+    yield "Alpha between frames, by how far apart two looks at a place are:"
+    for axis, unit in AXES:
+        bins: Sequence[LagBin] = getattr(found.correlogram, axis)
+        if bins:
+            yield from ("", f"| {unit} apart | alpha | 95% | ceiling |", "|---|---|---|---|")
+            for row in bins:
+                alpha = row.alpha
+                yield (
+                    f"| {row.mean:.3g} | {alpha.value:.2f} | {alpha.low:.2f} to {alpha.high:.2f} | {row.ceiling:.2f} |"
+                )

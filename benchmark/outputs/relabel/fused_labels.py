@@ -1,0 +1,112 @@
+"""The class that the map has where a frame looks: one a pixel, where the voxel can be believed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.shared.association import back_project, observe
+from semstab.config import nearest
+from semstab.errors import ConfigError
+from semstab.metrics import CATEGORIES, categories
+from semstab.metrics.matching import rows_of
+from semstab.model.evidence import Evidence
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.model.measures import dominant
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.export.lookup import NONE, VoxelLookup
+from semstab.statistics import psa
+
+Int64 = npt.NDArray[np.int64]
+
+UNSEEN, UNSTABLE = -1, -2
+"""Instead of a class: no depth or no voxel there; a voxel that is not believed."""
+
+DECIMALS = 9
+"""Of evidence from which a vote was taken: what rounding left decides no tie."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Which voxels are believed.
+
+    min_op         seen by so many frames
+    min_psa        their pairs of frames agree so often; a voxel seen once has no pair
+    categories     of these categories, of any where none is named
+    leave_own_out  without the frame's own vote, and seen by another frame. Drift is that of all votes: it depends on
+                   their order
+
+    Raises ConfigError for a category that there is not, and values out of range.
+    """
+
+    min_op: int = 1
+    min_psa: float = 0.0
+    categories: tuple[str, ...] = ()
+    leave_own_out: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_psa <= 1:
+            raise ConfigError(f"min_psa = {self.min_psa:g}: agreement lies between 0 and 1")
+        for name in self.categories:
+            if name not in CATEGORIES:
+                raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
+
+    def of(self, table: VoxelTable) -> npt.NDArray[np.bool_]:
+        """(n,) whether each voxel is."""
+        believed = table.op >= max(self.min_op, 1)
+        if self.min_psa > 0:
+            believed &= np.nan_to_num(psa(table), nan=-1.0) >= self.min_psa
+        if self.categories:
+            with np.errstate(invalid="ignore"):  # the belief of no vote
+                believed &= np.isin(categories(table), [CATEGORIES.index(name) for name in self.categories])
+        return believed
+
+
+class FusedLabels:
+    """A map, to be asked for the classes that a frame sees."""
+
+    def __init__(self, table: VoxelTable, belief: Belief) -> None:
+        self._table, self._belief = table, belief
+        self._lookup = VoxelLookup(table)
+
+    def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
+        """(H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
+
+        The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.
+        """
+        everywhere = dataclasses.replace(frame, labels=np.zeros(frame.shape, np.uint8), scores=None)
+        found = self._lookup.rows(back_project(everywhere).T)
+        met = found != NONE
+        rows, inverse = np.unique(found[met], return_inverse=True)
+        seen = rows_of(self._table, rows)
+        if self._belief.leave_own_out:
+            seen = self._without(frame.every(pixel_stride), seen, rows)
+        label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
+        found[met], found[~met] = label[inverse], UNSEEN
+        fused = np.full(frame.shape, UNSEEN)
+        fused[everywhere.valid] = found
+        return fused
+
+    def _without(self, frame: Frame, seen: VoxelTable, rows: Int64) -> VoxelTable:
+        """The voxels that a frame sees, those rows of the map, without its own vote."""
+        own = observe(frame, self._table.voxel_size, self._table.K)
+        centers = np.add(own.index, 0.5, dtype=np.float64) * self._table.voxel_size
+        at = np.searchsorted(rows, self._lookup.rows(centers))
+        evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
+        evidence[at] = np.abs(np.round(evidence[at] - own.s_bar, DECIMALS))
+        op[at] -= 1
+        self_sum[at] -= (own.s_bar**2).sum(axis=1)
+        return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
+
+
+def labels_of(fused: Int64, ids: Sequence[int]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """The label map of fused rows: the ids of the classes, or the ignore id of its type."""
+    at = np.where(fused < 0, len(ids), fused)
+    if max(ids) < IGNORE_8BIT:
+        return np.array([*ids, IGNORE_8BIT], np.uint8)[at]
+    return np.array([*ids, IGNORE_16BIT], np.uint16)[at]

@@ -1,0 +1,77 @@
+"""A finished run in a notebook: data frames, Arrow, and what objects show of themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import tiny_scene
+from posed_config import configure
+from posed_scene import fails
+from records import record, study, voxels
+
+import semstab
+from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.metrics import dominant, sbd, vss
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("loaded")
+    tiny_scene.write(folder / "scene")
+    semstab.run(configure(folder / "scene", check=None, events=True), out=folder / "run", report=False)
+    return semstab.load(folder / "run")
+
+
+def test_the_summary_has_a_row_a_unit(run):
+    assert list(run.summary["backbone"]) == ["a", "b"]
+    for (_, row), summary in zip(run.summary.iterrows(), run.result.runs, strict=True):
+        assert row["vss"] == summary.table.means.value["vss"]
+        assert row["recurrent_entropy"] == summary.table.recurrent.means.value["entropy"]
+        assert row["voxels"] == summary.table.voxels
+
+
+def test_a_table_has_every_voxel_and_its_classes_by_name(run):
+    table = run.table(backbone="a")
+    frame = table.to_pandas()
+    np.testing.assert_array_equal(frame[["x", "y", "z"]], table.centers)
+    np.testing.assert_array_equal(frame["sbd"], sbd(table))
+    assert list(frame["class"]) == [table.classes[k] for k in dominant(table)]
+    np.testing.assert_array_equal(frame[["evidence_wall", "evidence_door", "evidence_window"]], table.evidence)
+    arrow = table.to_arrow()
+    np.testing.assert_array_equal(arrow.column("vss"), vss(table))
+    assert arrow.column("sbd").null_count == np.count_nonzero(table.op < 2) > 0
+    assert "evidence_0" in dataclasses.replace(table, classes=()).to_arrow().column_names
+
+
+def test_series_and_events_of_a_unit(run):
+    assert list(run.series(backbone="b")["frame"]) == [0, 1, 2]
+    assert len(run.events(backbone="b")) == run.table(backbone="b").op.sum()
+    fails(ConfigError, "2 units fit", run.table)
+
+
+def test_what_a_notebook_shows(run):
+    shown = run._repr_html_()
+    assert "<td>scene</td><td>a</td><td>numpy</td>" in shown
+    assert shown == run.result._repr_html_()
+    table = run.table(backbone="a")
+    assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()
+    assert f"<td>all</td><td>{len(table)}</td><td>{vss(table).mean():.3f}</td>" in table._repr_html_()
+
+
+def test_names_are_shown_as_they_are():
+    shown = study(record(voxels((1, 1, [1, 0, 0])), scene="<b>&"))._repr_html_()
+    assert "&lt;b&gt;&amp;" in shown
+    assert "<td>-</td>" in shown  # SBD of a voxel seen once
+
+
+def test_what_is_missing_is_told(run, tmp_path, monkeypatch):
+    fails(DataError, "summary.json: cannot be read", semstab.load, tmp_path)
+    kept = record(voxels((1, 1, [1, 0, 0])), voxels_file=tmp_path / "v/x.parquet")
+    bare = dataclasses.replace(run, result=study(kept))
+    fails(ConfigError, "with --events", bare.events)
+    fails(DataError, "s__m__numpy.csv: cannot be read", bare.series)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    fails(MissingDependencyError, "pip install pandas", run.table(backbone="a").to_pandas)

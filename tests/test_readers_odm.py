@@ -1,0 +1,451 @@
+"""Projects of OpenDroneMap and OpenSfM: poses, names, sources of depth, distorted photographs, what is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from pathlib import Path
+
+import cv2
+import looking_down as down
+import numpy as np
+import pytest
+from dataset_writers import save, shot, write_reconstruction
+from posed_scene import fails
+
+from semstab.datasets import open_dataset
+from semstab.errors import ConfigError, DataError
+from semstab.model.georeference import Georeference, wkt
+
+pytest.importorskip("pyproj")
+
+NAMES = ["DJI_0002", "DJI_0010", "DJI_0001"]
+"""Neither in natural nor in alphabetical order, as shots may be."""
+
+PINHOLE = {"projection_type": "perspective", "focal": down.K.fx / down.W, "k1": 0.0, "k2": 0.0}
+CLASSES = ["a", "b", "c"]
+SIZE = (down.W, down.H)
+
+
+def write_project(folder: Path, camera=PINHOLE, *, undistorted=True, depth: str | None = "mesh", **extra) -> Path:
+    """Three shots that look down at the plane, their images, labels, and one source of depth."""
+    frames = [down.frame(k) for k in range(3)]
+    shots = {f"{name}.JPG": shot(frame, "c") for name, frame in zip(NAMES, frames, strict=True)}
+    place = folder / ("opensfm/undistorted" if undistorted else "opensfm")
+    write_reconstruction(place, [({"c": camera}, shots)], SIZE)
+    for name, frame in zip(NAMES, frames, strict=True):
+        image = f"opensfm/undistorted/images/{name}.JPG.tif" if undistorted else f"images/{name}.JPG"
+        save(folder / image, frame.color)
+        save(folder / f"labels/net/{name}.JPG.png", frame.labels)
+    if depth is not None:
+        DEPTHS[depth](folder, frames)
+    return folder
+
+
+def write_georeference(folder: Path, shift: float = 0.0) -> None:
+    place = folder / "odm_georeferencing"
+    place.mkdir()
+    positions = [" ".join(f"{value + shift:.6f}" for value in down.pose(k)[:3, 3]) for k in range(3)]
+    (place / "coords.txt").write_text("\n".join(["WGS84 UTM 15N", "576714 5188162", *positions]) + "\n")
+    (place / "proj.txt").write_text("+proj=utm +zone=15 +datum=WGS84 +units=m +no_defs +type=crs")
+
+
+def mvei(depth: np.ndarray) -> bytes:
+    return b"\x89MVE_IMAGE\n" + struct.pack("<4i", *depth.shape[::-1], 1, 9) + depth.astype("<f4").tobytes()
+
+
+def dmap(depth: np.ndarray, image: str, halves: bool = False) -> bytes:
+    magic, exponent = (b"D2", 3) if halves else (b"DR", 0)
+    head = magic + struct.pack("<Bb4I2f", 1, exponent, *SIZE, *depth.shape[::-1], 1, 99)
+    head += struct.pack("<f", 1) if halves else b""
+    head += struct.pack("<H", len(image)) + image.encode() + struct.pack("<3I", 2, 0, 7) + bytes(21 * 8)
+    return head + ((depth / 2**exponent).astype("<f2") if halves else depth.astype("<f4")).tobytes()
+
+
+def along_rays(frame) -> np.ndarray:
+    v, u = np.mgrid[: down.H, : down.W]
+    K = frame.intrinsics
+    return frame.depth * np.sqrt(((u - K.cx) / K.fx) ** 2 + ((v - K.cy) / K.fy) ** 2 + 1)
+
+
+def put(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+def write_mve(folder, frames) -> None:
+    for k, frame in enumerate(frames):
+        put(folder / f"mve/views/view_{k:04d}.mve/depth-L0.mvei", mvei(along_rays(frame)))
+
+
+def write_openmvs(folder, frames, halves=False) -> None:
+    """In another order than the shots."""
+    for k, (name, frame) in enumerate(reversed([*zip(NAMES, frames, strict=True)])):
+        image = f"/code/opensfm/undistorted/images/{name}.JPG.tif"
+        put(folder / f"opensfm/undistorted/openmvs/depthmaps/depth{k:04d}.dmap", dmap(frame.depth, image, halves))
+
+
+def write_files(folder, frames) -> None:
+    for name, frame in zip(NAMES, frames, strict=True):
+        save(folder / f"depth/{name}.npy", frame.depth)
+
+
+DEPTHS = {
+    "mesh": lambda folder, frames: down.write_mesh(folder / "odm_meshing/odm_25dmesh.ply"),
+    "dsm": lambda folder, frames: down.write_raster(folder / "odm_dem/dsm.tif"),
+    "mve": write_mve,
+    "openmvs": write_openmvs,
+    "files": write_files,
+}
+
+
+def opened(folder: Path, name: str | None = None, **options):
+    dataset = open_dataset("odm", {"root": folder, "classes": CLASSES, "casts": False} | options)
+    return dataset.scene(name or dataset.scenes[0])
+
+
+def test_poses_names_labels_and_images(tmp_path) -> None:
+    scene = opened(write_project(tmp_path / "field"))
+    assert [scene.image_name(k) for k in range(3)] == ["DJI_0001", "DJI_0002", "DJI_0010"]
+    for at, k in enumerate((2, 0, 1)):
+        expected, found = down.frame(k), scene.frame(at, "net")
+        np.testing.assert_allclose(found.T_wc, expected.T_wc, atol=1e-12)
+        np.testing.assert_array_equal(found.labels, expected.labels)
+        np.testing.assert_array_equal(found.color, expected.color)
+        assert found.intrinsics == expected.intrinsics
+    assert scene.up.tolist() == [0, 0, 1]
+    assert scene.georeference is None
+
+
+@pytest.mark.parametrize("kind", DEPTHS)
+def test_depth_of_every_source_which_is_said(tmp_path, kind) -> None:
+    folder = write_project(tmp_path / "field", depth=kind)
+    write_georeference(folder)
+    scene = opened(folder)
+    assert scene.depth_from.startswith(f"{kind}, ")
+    assert scene.settings["depth_from"] == kind
+    for at, k in enumerate((2, 0, 1)):
+        np.testing.assert_allclose(scene.depth(at), down.plane_depth(down.pose(k)), atol=2e-5)
+
+
+def test_the_first_source_is_taken_or_the_one_that_is_asked_for(tmp_path) -> None:
+    folder = write_project(tmp_path / "field", depth="files")
+    frames = [down.frame(k) for k in range(3)]
+    for kind in ("openmvs", "mve", "mesh"):
+        DEPTHS[kind](folder, frames)
+        assert opened(folder).settings["depth_from"] == kind
+    assert opened(folder, depth_from="openmvs").depth_from == ("openmvs, opensfm/undistorted/openmvs/depthmaps/*.dmap")
+    down.write_mesh(folder / "odm_meshing/odm_mesh.ply", shift=(0, 0, 1))
+    assert opened(folder).depth_from.endswith("odm_meshing/odm_mesh.ply")
+    fails(DataError, r"field: has no depth: no dsm \(odm_dem/dsm.tif\); set surface", opened, folder, depth_from="dsm")
+
+
+def test_depth_maps_of_halves_are_those_of_floats(tmp_path) -> None:
+    folder = write_project(tmp_path / "field", depth=None)
+    write_openmvs(folder, [down.frame(k) for k in range(3)], halves=True)
+    np.testing.assert_allclose(opened(folder).depth(0), down.plane_depth(down.pose(2)), rtol=1e-3)
+
+
+def test_submodels_are_scenes_of_their_own(tmp_path) -> None:
+    for k in range(2):
+        write_project(tmp_path / f"field/submodels/submodel_000{k}")
+    below = open_dataset("odm", {"root": tmp_path / "field"}).scenes
+    assert below == ("submodels-submodel_0000", "submodels-submodel_0001")
+    write_project(tmp_path / "field")
+    dataset = open_dataset("odm", {"root": tmp_path / "field", "classes": CLASSES, "casts": False})
+    assert dataset.scenes == ("field", "field-submodels-submodel_0000", "field-submodels-submodel_0001")
+    assert dataset.scene("field-submodels-submodel_0001").frame(0, "net").depth.all()
+
+
+def test_a_project_of_opensfm_alone_and_a_mesh_beside_it(tmp_path) -> None:
+    write_project(tmp_path / "all")
+    folder = (tmp_path / "all/opensfm").rename(tmp_path / "sfm")
+    scene = opened(
+        folder,
+        surface=tmp_path / "all/odm_meshing/odm_25dmesh.ply",
+        labels_root=tmp_path / "all/labels",
+        labels="{backbone}/{name}",
+    )
+    assert scene.depth_from.startswith("rays cast at")
+    np.testing.assert_allclose(scene.frame(1, "net").depth, down.plane_depth(down.pose(0)), atol=2e-5)
+
+
+# --- georeference -----------------------------------------------------------------------------------------------------
+
+
+def test_the_georeference_of_a_project(tmp_path) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    expected = Georeference(wkt(down.UTM, "x"), down.OFFSET)
+    assert opened(folder).georeference == expected
+    (folder / "odm_georeferencing/proj.txt").unlink()
+    assert opened(folder).georeference == expected
+
+
+def test_topocentric_cameras_lie_about_the_reference_of_opensfm(tmp_path) -> None:
+    from pyproj import CRS, Transformer
+
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder, shift=700)
+    (folder / "opensfm/reference_lla.json").write_text('{"latitude": 46.84, "longitude": -91.99, "altitude": 180.0}')
+    georeference = opened(folder).georeference
+    assert georeference.offset == (0, 0, 180)
+    crs = "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84"
+    topocentric = Transformer.from_pipeline(f"{crs} +lat_0=46.84 +lon_0=-91.99 +h_0=180")
+    places = np.array([[0.0, 0, 0], [500, -300, 20], [-900, 900, 45]])
+    longitude, latitude = Transformer.from_crs(CRS.from_wkt(georeference.crs), 4326, always_xy=True).transform(
+        places[:, 0], places[:, 1]
+    )
+    found = np.stack(topocentric.transform(longitude, latitude, places[:, 2] + 180), axis=1)
+    np.testing.assert_allclose(found, places, atol=0.15)  # of which 0.13 m are the Earth's curvature, up
+    np.testing.assert_allclose(found[:, :2], places[:, :2], atol=0.05)
+
+
+def test_cameras_far_from_the_positions_of_the_project_are_pointed_out(tmp_path, caplog) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder, shift=700)
+    assert opened(folder).georeference.offset == down.OFFSET
+    assert "coords.txt: the cameras lie 990 m from its positions" in caplog.text
+
+
+# --- lenses -----------------------------------------------------------------------------------------------------------
+
+LENSES = {
+    "perspective": {"projection_type": "perspective", "focal": 0.8, "k1": -0.12, "k2": 0.03},
+    "brown": {
+        "projection_type": "brown", "focal_x": 0.82, "focal_y": 0.78, "c_x": 0.02, "c_y": -0.01, "k1": -0.1, "k2": 0.05,
+        "p1": 0.004, "p2": -0.003, "k3": -0.01,
+    },
+    "fisheye": {"projection_type": "fisheye", "focal": 0.8, "k1": 0.05, "k2": -0.02},
+}  # fmt: skip
+BIG = (96, 64)
+
+
+def distort(camera, x, y):
+    """Where OpenSfM's models see the ray (x, y, 1), in pixels of an image of `BIG`."""
+    get = lambda key: camera.get(key, 0.0)  # noqa: E731
+    r2 = x**2 + y**2
+    if camera["projection_type"] == "fisheye":
+        r = np.sqrt(r2)
+        angle = np.arctan(r)
+        scale = np.where(r > 0, angle * (1 + get("k1") * angle**2 + get("k2") * angle**4) / np.maximum(r, 1e-12), 1)
+        x, y = x * scale, y * scale
+    else:
+        radial = 1 + get("k1") * r2 + get("k2") * r2**2 + get("k3") * r2**3
+        x, y = (
+            x * radial + 2 * get("p1") * x * y + get("p2") * (r2 + 2 * x**2),
+            y * radial + 2 * get("p2") * x * y + get("p1") * (r2 + 2 * y**2),
+        )
+    fx, fy = (camera.get(key, camera.get("focal")) for key in ("focal_x", "focal_y"))
+    W, H = BIG
+    return W * (fx * x + get("c_x")) + (W - 1) / 2, W * (fy * y + get("c_y")) + (H - 1) / 2
+
+
+def write_distorted(folder: Path, camera, undistorted: bool) -> Path:
+    """A project with photographs of a lens, the ids of whose labels are random."""
+    frames = [down.frame(k) for k in range(3)]
+    shots = {f"{name}.JPG": shot(frame, "c") for name, frame in zip(NAMES, frames, strict=True)}
+    write_reconstruction(folder / "opensfm", [({"c": camera}, shots)], BIG)
+    if undistorted:
+        write_reconstruction(folder / "opensfm/undistorted", [({"c": PINHOLE | {"focal": 0.8}}, shots)], BIG)
+    rng = np.random.default_rng(0)
+    for name in NAMES:
+        ids = rng.integers(0, 3, BIG[::-1]).astype(np.uint8)
+        save(folder / f"labels/net/{name}.png", ids)
+        save(folder / f"images/{name}.JPG.png", np.stack([ids * 100] * 3, axis=-1))
+    down.write_mesh(folder / "odm_meshing/odm_mesh.ply")
+    return folder
+
+
+def seen_by_pinhole(folder: Path, camera, K, shape) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest label of the distorted map at each pixel, and which pixels are far enough from a tie."""
+    ids = cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), cv2.IMREAD_UNCHANGED)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    x, y = distort(camera, (u - K.cx) / K.fx, (v - K.cy) / K.fy)
+    column, row = np.rint(x).astype(int), np.rint(y).astype(int)
+    inside = (column >= 0) & (column < BIG[0]) & (row >= 0) & (row < BIG[1])
+    clear = (np.abs(x - column) < 0.47) & (np.abs(y - row) < 0.47)
+    return np.where(inside, ids[row.clip(0, BIG[1] - 1), column.clip(0, BIG[0] - 1)], 255), clear
+
+
+@pytest.mark.parametrize("kind", LENSES)
+@pytest.mark.parametrize("undistorted", [False, True])
+def test_labels_of_distorted_photographs_land_where_they_belong(tmp_path, kind, undistorted) -> None:
+    camera = LENSES[kind]
+    folder = write_distorted(tmp_path / "field", camera, undistorted)
+    scene = opened(folder, **({"labels_on": "original"} if undistorted else {}))
+    frame = scene.frame(0, "net", color=False)
+    assert frame.shape == BIG[::-1]
+    assert frame.intrinsics.fx == pytest.approx(BIG[0] * 0.8)
+    expected, clear = seen_by_pinhole(folder, camera, frame.intrinsics, frame.shape)
+    assert clear.mean() > 0.8
+    np.testing.assert_array_equal(frame.labels[clear], expected[clear])
+    assert (frame.labels != cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), -1)).mean() > 0.2
+
+
+def test_models_predict_on_the_photograph_and_its_colour_is_shown_undistorted(tmp_path) -> None:
+    folder = write_distorted(tmp_path / "field", LENSES["brown"], undistorted=False)
+    scene = opened(folder)
+    photograph = cv2.imread(str(folder / f"images/{NAMES[2]}.JPG.png"))
+    np.testing.assert_array_equal(scene.image(0), photograph)
+    frame = scene.frame(0, "net")
+    inner = (slice(20, 40), slice(30, 60))
+    assert np.abs(frame.color[inner].astype(int) - photograph[inner]).mean() > 20
+    live = scene.predicted(0, labels=cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), -1))
+    np.testing.assert_array_equal(live.labels, frame.labels)
+    assert "color" not in frame.files
+    flat = opened(folder, labels_on="undistorted")
+    np.testing.assert_array_equal(flat.image(0), frame.color)
+    np.testing.assert_array_equal(
+        flat.frame(0, "net").labels, cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), -1)
+    )
+
+
+def test_scores_of_distorted_photographs_are_mixed_with_any_number_of_classes(tmp_path) -> None:
+    folder = write_distorted(tmp_path / "field", LENSES["fisheye"], undistorted=False)
+    scores = np.random.default_rng(1).dirichlet(np.ones(9), BIG[::-1]).astype(np.float16)
+    for name in NAMES:
+        path = folder / f"scores/soft/{name}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, scores.transpose(2, 0, 1))
+    scene = opened(folder, classes=[f"c{k}" for k in range(9)])
+    found = scene.frame(0, "soft-scores").scores
+    assert found.shape == (*BIG[::-1], 9)
+    np.testing.assert_allclose(found.astype(float).sum(axis=2)[20:40, 30:60], 1, atol=5e-3)
+
+
+def test_what_a_lens_folds_over_has_no_label(tmp_path) -> None:
+    camera = {"projection_type": "perspective", "focal": 0.5, "k1": -0.4, "k2": 0.0}
+    labels = opened(write_distorted(tmp_path / "field", camera, undistorted=False)).frame(0, "net").labels
+    assert labels[0, 0] == labels[-1, -1] == 255
+    assert (labels[20:40, 30:60] < 3).all()
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def test_a_project_without_reconstruction_says_so(tmp_path) -> None:
+    (tmp_path / "field/opensfm").mkdir(parents=True)
+    match = "field: no scene here, nor 3 folders deep; one holds opensfm/undistorted/reconstruction.json or opensfm/rec"
+    fails(DataError, match, opened, tmp_path / "field")
+
+
+def test_several_reconstructions_are_named_and_one_can_be_chosen(tmp_path) -> None:
+    folder = write_project(tmp_path / "field")
+    path = folder / "opensfm/undistorted/reconstruction.json"
+    (whole,) = json.loads(path.read_text())
+    small = whole | {"shots": {"DJI_0010.JPG": whole["shots"]["DJI_0010.JPG"]}}
+    path.write_text(json.dumps([whole, small]))
+    match = (
+        r"2 reconstructions, .*\(0: 3 shots from DJI_0002.JPG; 1: 1 shots from DJI_0010.JPG\); choose one with recon"
+    )
+    fails(DataError, match, opened, folder)
+    assert len(opened(folder, reconstruction=1)) == 1
+    fails(DataError, "there is no reconstruction 2; it has 2, counted from 0", opened, folder, reconstruction=2)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (
+            {"projection_type": "spherical"},
+            "camera 'c': the camera model 'spherical' is not known; there is perspective",
+        ),
+        ({"width": 0}, "camera 'c': 'width' is 0; expected a number of pixels"),
+        ({"focal": None}, "camera 'c': 'focal' is missing"),
+        ({"focal": 0.0}, "camera 'c': intrinsics: fx = 0; focal lengths must be positive"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_named(tmp_path, change, match) -> None:
+    fails(DataError, match, opened, write_project(tmp_path / "field", camera=PINHOLE | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"camera": "other"}, "shot 'DJI_0002.JPG': its camera 'other' is not in the file"),
+        ({"rotation": [0, 1]}, "'rotation' must be three numbers"),
+        ({"translation": [0, 1, "x"]}, "'translation' is 'x'; expected a number"),
+    ],
+)
+def test_a_shot_that_cannot_be_used_is_named(tmp_path, change, match) -> None:
+    folder = write_project(tmp_path / "field")
+    path = folder / "opensfm/undistorted/reconstruction.json"
+    content = json.loads(path.read_text())
+    content[0]["shots"]["DJI_0002.JPG"] |= change
+    path.write_text(json.dumps(content))
+    fails(DataError, match, opened, folder)
+
+
+@pytest.mark.parametrize("kind", ["mve", "openmvs"])
+def test_a_truncated_depth_map_is_named(tmp_path, kind) -> None:
+    folder = write_project(tmp_path / "field", depth=kind)
+    for path in [*folder.rglob("*.mvei"), *folder.rglob("*.dmap")]:
+        path.write_bytes(path.read_bytes()[:-4])
+    match = r"\.(mvei|dmap): truncated: 24x16 pixels need \d+ bytes, it has \d+"
+    fails(DataError, match, opened(folder).depth, 0)
+    for path in [*folder.rglob("*.mvei"), *folder.rglob("*.dmap")]:
+        path.write_bytes(path.read_bytes()[:20])
+    fails(DataError, r"\.(mvei|dmap): (not an MVE image|not an OpenMVS)", lambda: opened(folder).depth(0))
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "kind", "match"),
+    [
+        ("proj.txt", "+proj=nowhere", ConfigError, r"proj.txt: '\+proj=nowhere' is no reference system"),
+        ("coords.txt", "WGS84 UTM 15N\n576714\n", DataError, "coords.txt: expected a projection, 'EAST NORTH'"),
+        ("coords.txt", "WGS84 UTM 15N\n", DataError, "coords.txt: expected a projection, 'EAST NORTH'"),
+    ],
+)
+def test_a_damaged_georeference_is_named(tmp_path, file, text, kind, match) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    (folder / "odm_georeferencing" / file).write_text(text)
+    fails(kind, match, opened, folder)
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, LENSES["brown"]])
+def test_label_maps_of_another_view_are_named(tmp_path, lens) -> None:
+    folder = write_project(tmp_path / "field", lens, undistorted=lens is PINHOLE)
+    save(folder / "labels/net/DJI_0001.JPG.png", np.zeros((16, 16), np.uint8))
+    fails(DataError, "DJI_0001.JPG.png: labels are 16x16 but .* 24x16, another view", opened(folder).frame, 0, "net")
+
+
+def test_original_labels_need_the_cameras_of_the_photographs(tmp_path) -> None:
+    folder = write_project(tmp_path / "field")
+    match = "opensfm/reconstruction.json: does not say how the photograph DJI_0002 is distorted, which labels_on"
+    fails(DataError, match, opened, folder, labels_on="original")
+    write_distorted(folder, LENSES["brown"], undistorted=True)
+    for path in (folder / "images").iterdir():
+        path.unlink()
+    scene = opened(folder, labels_on="original")
+    fails(DataError, "the photograph of DJI_0001 is not there, .* set labels_on: undistorted", scene.image, 0)
+    assert scene.missing(0, color=True) != []
+
+
+# --- the real flight --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def brighton() -> Path:
+    data = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
+    if not (data / "brighton").is_dir():
+        pytest.skip(f"no {data / 'brighton'}; set SEMSTAB_DATA to the folder that holds brighton/")
+    return data / "brighton"
+
+
+def test_the_project_of_a_real_flight_is_its_posed_folder(brighton) -> None:
+    casts = {"casts": False, "images": brighton / "color"}
+    project = open_dataset("odm", {"root": brighton / "odm"} | casts).scene("odm")
+    folder = open_dataset("posed_folder", {"root": brighton}).scene("brighton")
+    assert project.georeference.offset == down.OFFSET
+    assert [project.image_name(k) for k in range(18)] == [folder.image_name(k) for k in range(18)]
+    for index in (0, 11):
+        ours, theirs = project.geometry(index, color=True), folder.geometry(index, color=True)
+        np.testing.assert_allclose(ours.T_wc, theirs.T_wc, atol=1e-12)
+        assert ours.intrinsics == theirs.intrinsics
+        np.testing.assert_array_equal(ours.color, theirs.color)
+        both = (ours.depth > 0) & (theirs.depth > 0)
+        assert np.abs(ours.depth - theirs.depth)[both].max() < 0.002
+        assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4  # rays along the surface's own border

@@ -1,0 +1,108 @@
+"""Agreement by how far apart two looks are: against its definition, and on errors that are tied to the view."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from simulated_events import grid, log_of
+
+from semstab.outputs.plots.looks import draw_correlogram
+from semstab.outputs.recording.agreement import looks_report
+from semstab.statistics import Sample, View, correlogram, describe, krippendorff_alpha
+from semstab.statistics.looks.correlogram import band
+
+SIDE = 20
+
+
+def sample_of(labels, centres, limit=None, K=3):
+    """Labels (n, F) of a floor of voxels of 0.2 m, seen from cameras at (F, 3)."""
+    log = log_of(labels, K=K, index=grid(SIDE))
+    views = tuple(View(frame, np.asarray(centre, float), math.nan) for frame, centre in enumerate(centres))
+    return Sample(log, log if limit is None else log_of(limit, K=K, index=grid(SIDE)), views, soft=False)
+
+
+def flown(step, frames=8, height=10.0):
+    return [(2.0 + step * frame, 2.0, height) for frame in range(frames)]
+
+
+def tied_to_the_view(rng, frames=8, lasts=2):
+    """Each place's label is drawn anew every `lasts` frames, but half of the places are always right."""
+    own = rng.integers(0, 3, size=(SIDE**2, 1))
+    drawn = np.repeat(rng.integers(0, 3, size=(SIDE**2, frames // lasts)), lasts, axis=1)
+    return np.where(rng.random((SIDE**2, 1)) < 0.5, drawn, own)
+
+
+def test_alpha_of_two_frames_is_krippendorffs():
+    labels = np.random.default_rng(0).choice(3, size=(SIDE**2, 2), p=[0.6, 0.3, 0.1])
+    (row,) = correlogram(sample_of(labels, flown(1.0, 2))).time
+    assert (row.mean, row.pairs) == (1, SIDE**2)
+    assert row.alpha.value == pytest.approx(krippendorff_alpha(log_of(labels).table()))
+
+
+def test_errors_that_last_show_as_agreement_that_falls_with_distance():
+    labels = tied_to_the_view(np.random.default_rng(1), frames=32, lasts=4)
+    found = correlogram(sample_of(labels, flown(0.5, 32)))
+    alphas = {round(row.mean): row.alpha for row in found.time}
+    assert alphas[1].value > alphas[2].value + 0.1 > alphas[8].value + 0.2
+    assert alphas[1].value == pytest.approx(0.5 + 0.5 * 3 / 4, abs=0.05)
+    assert alphas[16].low < 0.5 < alphas[16].high
+    angles = [row.alpha.value for row in found.angle]
+    assert angles[0] > angles[-1] + 0.2
+
+
+def test_distances_are_those_of_the_cameras():
+    found = correlogram(sample_of(np.zeros((SIDE**2, 2), int), [(2, 2, 10), (2, 7, 20)]))
+    (baseline,), (ratio,) = found.baseline, found.range
+    assert baseline.mean == pytest.approx(math.hypot(5, 10))
+    assert ratio.mean == pytest.approx(2, abs=0.15)
+    assert 300 < sum(row.pairs for row in found.angle) <= SIDE**2
+    assert math.isnan(found.time[0].alpha.value)  # one class: chance alone always agrees
+
+
+def errs_by_view(rng, centres, sector=20.0):
+    """Half of the places change their label, at random, each time the direction of view has turned by that much."""
+    place = 0.2 * (grid(SIDE)[:, 0] + 0.5)
+    angle = np.degrees(np.arctan2(np.array(centres)[:, 0] - place[:, None], 10.0)) + rng.uniform(
+        0, sector, (SIDE**2, 1)
+    )
+    labels = rng.integers(0, 3, size=(SIDE**2, 12))
+    by_sector = np.take_along_axis(labels, (np.floor(angle / sector) + 5).astype(int), axis=1)
+    return np.where(rng.random((SIDE**2, 1)) < 0.5, by_sector, labels[:, :1])
+
+
+def test_at_the_stated_angle_two_flights_say_the_same_of_one_model():
+    """One flight is dense and short, the other one far: over all of their pairs alpha differs."""
+    rng = np.random.default_rng(2)
+    flights = [flown(step, 16) for step in (0.3, 2.0)]
+    samples = [sample_of(errs_by_view(rng, centres), centres) for centres in flights]
+    near, far = (krippendorff_alpha(sample.seen.table()) for sample in samples)
+    assert near - far > 0.15
+    at_angle = [correlogram(sample).standard.alpha for sample in samples]
+    assert at_angle[0].value == pytest.approx(at_angle[1].value, abs=0.05)
+
+
+def test_frames_of_one_look_have_no_correlogram_and_all_outputs_take_it():
+    once = np.where(np.arange(2) == 0, np.zeros((SIDE**2, 1), int), -1)
+    found = correlogram(sample_of(once, flown(1.0, 2)))
+    assert found.time == found.angle == ()
+    assert (found.standard.pairs, math.isnan(found.standard.alpha.value)) == (0, True)
+    summary = describe(log_of(once).table(), sample=sample_of(once, flown(1.0, 2)))
+    assert "no verdict" in looks_report(summary)
+    labels = tied_to_the_view(np.random.default_rng(3))
+    many = correlogram(sample_of(labels, flown(1.0)))
+    assert len(draw_correlogram({"net": many}).axes) == 4
+    report = looks_report(describe(log_of(labels).table(), sample=sample_of(labels, flown(1.0))))
+    assert report.count("| ceiling |") == 4
+
+
+def test_bands_cover_where_blocks_are_independent():
+    rng = np.random.default_rng(4)
+    held = 0
+    for _ in range(300):
+        weight = rng.integers(1, 5, size=30)
+        sums = np.stack([rng.binomial(20, 0.3, size=30) * weight, 20.0 * weight], axis=1)
+        found = band(sums, lambda total: 1 - total[..., 0] / total[..., 1])
+        held += found.low <= 0.7 <= found.high
+    assert 0.91 <= held / 300 <= 0.98
