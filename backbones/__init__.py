@@ -143,17 +143,18 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
 
 
 def backbone_class(name: str) -> Any:
-    """What makes backbones of that name: a registered class, or a user's, as FILE.py:NAME or package.module:NAME.
+    """What makes backbones of that name: a registered class, a user's (FILE.py:NAME, package.module:NAME), a network's
+    file (net.onnx).
 
     It has `Options` and is called with them. Raises ConfigError, DataError, MissingDependencyError.
     """
     from semstab.backbones.outside.code import is_code
-
-    if not is_code(name):
-        return REGISTRY.load(name)
+    from semstab.backbones.outside.network import NetworkMaker, is_network
     from semstab.backbones.outside.own import Own
 
-    return Own(name)
+    if is_network(name):
+        return NetworkMaker(name)
+    return Own(name) if is_code(name) else REGISTRY.load(name)
 
 
 def options_model(name: str) -> type[BaseModel]:

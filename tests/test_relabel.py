@@ -138,6 +138,7 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     done = bench("relabel", tmp_path / "run", "--out", tmp_path / "scene", "--category", "stable", cwd=tmp_path)
     assert "a-fused: 4 frames" in done.stdout
     assert "accuracy 0." in done.stdout
+    assert "the stability of these maps says nothing" in done.stdout
     assert LabelSpace.load(tmp_path / "scene/labels/a-fused/label_space.yaml").classes == ("wall", "door", "window")
     again = semstab.run(configure(tmp_path / "scene", check=None, backbones=["a-fused"]))
     assert again.record().summary.table.means.value["vss"] == 1.0

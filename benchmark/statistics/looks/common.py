@@ -91,8 +91,9 @@ def _filled(looks: Looks, places: Looks, ignored: Float64) -> Looks:
 
 def decided(log: Events) -> Events:
     """Each look reduced to its largest class, the lowest on ties: what labels and scores have in common."""
-    label, n = log.evidence.argmax(axis=1).astype(np.uint16), len(log)
-    return dataclasses.replace(log, evidence=Evidence(np.arange(n + 1), label, np.ones(n), log.K))
+    label = log.evidence.rowwise(lambda s: s.round(9).argmax(axis=1))  # sums in another order are equal still
+    one_hot = Evidence(np.arange(len(log) + 1), label.astype(np.uint16), np.ones(len(log)), log.K)
+    return dataclasses.replace(log, evidence=one_hot)
 
 
 def psa_bounds(log: Events) -> tuple[float, float]:
