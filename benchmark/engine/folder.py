@@ -24,6 +24,7 @@ from semstab.model.records import (
     EVENTS,
     FRAMES,
     INFLUENCE,
+    LOOKS,
     OVERVIEW,
     RECORDING_PARTS,
     TRUTH,
@@ -53,7 +54,7 @@ LAYOUT = "# semstab, folder layout 2"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, FRAMES, INFLUENCE, OVERVIEW, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, "tables", "figures")
 """Folders into which files are written."""
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
 from semstab.model.statistics import Interval
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.blocks import Blocks
 from semstab.statistics.sampling.collect import cell_edge, cells_of
 from semstab.statistics.sampling.influence import Scale, Statistic
 from semstab.statistics.sampling.intervals import of_places
@@ -18,7 +22,8 @@ class Places:
 
     def __init__(self, index: npt.NDArray[np.int32], voxel_size: float, edge: float | None = None) -> None:
         self.edge = cell_edge(index, voxel_size) if edge is None else edge
-        self.cell, self.of = cells_of(index, voxel_size, self.edge)
+        self.cell, of = cells_of(index, voxel_size, self.edge)
+        self._blocks = Blocks(of, len(self.cell), self.edge)
 
     @property
     def count(self) -> int:
@@ -36,7 +41,20 @@ class Places:
 
         Where no scale is given, what goes from 0 to 1 is a share.
         """
-        by_column = [np.bincount(self.of, weights=own, minlength=self.count) for own in columns.T]
-        sums = np.stack(by_column, axis=1).astype(np.float64)
+        return self._of(self._blocks.sums(columns.astype(np.float64)), statistic, bounds, scale)
+
+    def estimate_of(
+        self,
+        table: VoxelTable,
+        rows: npt.NDArray[np.int64],
+        formula: Callable[[VoxelTable], Float64],
+        statistic: Statistic,
+        bounds: tuple[float, float] = (0.0, 1.0),
+        scale: Scale | None = None,
+    ) -> Interval:
+        """The same of the columns that a formula makes of these rows of a table, which are the voxels."""
+        return self._of(self._blocks.sums_of(table, rows, formula), statistic, bounds, scale)
+
+    def _of(self, sums: Float64, statistic: Statistic, bounds: tuple[float, float], scale: Scale | None) -> Interval:
         kind: Scale = scale or ("share" if bounds == (0.0, 1.0) else "plain")
         return of_places(self.cell, self.edge, sums, statistic, kind, bounds)
