@@ -50,7 +50,7 @@ class SemanticHead:
         model = checkpoint.load_model(AutoModelForSemanticSegmentation, options)
         self.names: Mapping[int, str] = model.config.id2label
         self._size = _square(kind, model.config, self._processor, options) if kind in SQUARE else options.image_size
-        self.engine = _engine(model, options)
+        self.engine = _engine(model, options, checkpoint.revision)
         self._kind = kind
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
@@ -212,12 +212,12 @@ def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
     return height, width
 
 
-def _engine(model: Any, options: SegmenterOptions) -> Logits:
+def _engine(model: Any, options: SegmenterOptions, revision: str) -> Logits:
     """What turns pixels (N, 3, h, w) into logits (N, K, h', w')."""
     if options.engine == "onnx":
         from semstab.backbones.pretrained.onnx_engine import OnnxEngine
 
-        return OnnxEngine(model, options)
+        return OnnxEngine(model, options, revision)
     return lambda pixels: torch.as_tensor(model(pixel_values=pixels.to(model.device, model.dtype)).logits)
 
 

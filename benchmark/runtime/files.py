@@ -104,6 +104,13 @@ def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
         temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
+def cache_folder() -> Path:
+    """Where what can be made again is kept: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
+    if own := os.environ.get("SEMSTAB_CACHE"):
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab"
+
+
 def content_key(settings: Mapping[str, Any]) -> str:
     """A hash of settings that JSON holds, in any order."""
     return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
