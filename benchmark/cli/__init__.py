@@ -16,7 +16,7 @@ from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
 from semstab.cli.running import run, study, view
-from semstab.errors import OUT_OF_MEMORY, SemstabError
+from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
 
 INTERRUPTED = 130
@@ -54,6 +54,10 @@ class Group(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
+            raise typer.Exit(2) from error
+        except ImportError as error:
+            what = f"{error.name or 'a package'} cannot be loaded ({one_line(error)})"
+            say(f"error: {what}; install semstab again, or give the process more memory (ulimit -v)")
             raise typer.Exit(2) from error
         except MemoryError as error:
             say(f"error: {OUT_OF_MEMORY}")
