@@ -122,7 +122,7 @@ def test_backbones_beside_each_other():
     assert to_json(from_json(BackboneComparison, read, "summary.json")) == read
     by_alpha = next(row for row in content.paired.rankings if row.measure == "alpha")
     assert by_alpha.ranks[-1].backbone == "flickering"
-    assert len(content.paired.differences) == 3 * 7
+    assert len(content.paired.differences) == 3 * 8
     assert content.standardised.of(PSA, "steady").value > 0.8
     rules = content.fusion_rules
     assert rules.orders["accuracy"]["averaging"][0] == "steady"

@@ -23,6 +23,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.records import (
     EVENTS,
     FRAMES,
+    LOOKS,
     OVERVIEW,
     RECORDING_PARTS,
     TRUTH,
@@ -52,7 +53,7 @@ LAYOUT = "# semstab, folder layout 2"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, OVERVIEW, "tables", "figures")
 """Folders into which files are written."""
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
+LOOKS = "looks"
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
@@ -114,6 +115,11 @@ class Record:
     def series(self) -> Path | None:
         """File of its time series, beside that of its voxels."""
         return None if self.voxels_file is None else self.voxels_file.parents[1] / FRAMES / f"{self.unit.slug}.csv"
+
+    @property
+    def looks_file(self) -> Path | None:
+        """File of its sampled looks, which is there where the statistics judged its map."""
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / LOOKS / self.voxels_file.name
 
     @property
     def events_file(self) -> Path | None:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
 from semstab.runtime.files import atomic_path
-from semstab.statistics.agreement import alpha_of, ratio_of
+from semstab.statistics.agreement import alpha_of, between_of, ratio_of
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
@@ -212,6 +212,7 @@ def class_alpha_of(sums: Float64) -> Float64:
 FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, agreement=True),
     "alpha": Functional(("agreeing", "observations", "own", "evidence"), alpha_of, low=-1.0, agreement=True),
+    "alpha_between": Functional(("agreeing", "observations", "own", "evidence"), between_of, low=-1.0, agreement=True),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
