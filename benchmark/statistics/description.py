@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics import strata
-from semstab.metrics.matching import require_same_map, rows_of
+from semstab.metrics.matching import require_same_map
 from semstab.metrics.summary import STRATA
-from semstab.model.information import normalise
 from semstab.model.measures import MeasureMeans, dominant, mean, measures, sbd, vss
 from semstab.model.statistics import (
     UNDEFINED,
@@ -197,23 +196,31 @@ class _Means:
         """Of a statistic of the sums of columns (m, C) of the m voxels with OP >= 2."""
         return self.bootstrap.estimate(columns, statistic, bounds)
 
+    def of_table(
+        self,
+        table: VoxelTable,
+        columns: Callable[[VoxelTable], Float64],
+        statistic: Callable[[Float64], Float64],
+    ) -> Estimate:
+        """Of a statistic of the sums of the columns that are made of these voxels, in -1 to 1."""
+        return self.bootstrap.estimate_of(table, np.flatnonzero(self.again), columns, statistic, (-1.0, 1.0))
+
 
 def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> FrameAgreement:
-    repeated = rows_of(table, means.again)
-    T = repeated.op.astype(np.float64)
+    T = table.op[means.again].astype(np.float64)
     parts = dict(zip(("disagreement_within", "disagreement_between"), disagreement(table), strict=True))
     within, between = (T * part[means.again] for part in parts.values())
     maps |= parts
     return FrameAgreement(
         psa=means.mean(maps["psa"]),
-        kappa=means.function(kappa_columns(repeated), kappa_of, (-1.0, 1.0)),
-        alpha=means.function(alpha_columns(repeated), alpha_of, (-1.0, 1.0)),
+        kappa=means.of_table(table, kappa_columns, kappa_of),
+        alpha=means.of_table(table, alpha_columns, alpha_of),
         vss=means.mean(vss(table)),
         within=means.function(np.stack([within, T], axis=1), ratio_of, (0.0, 1.0)),
         between=means.function(np.stack([between, T], axis=1), ratio_of, (0.0, 1.0)),
-        alpha_between=means.function(alpha_columns(repeated), between_of, (-1.0, 1.0)),
-        each_place=means.function(alpha_columns(repeated, np.ones(len(repeated))), between_of, (-1.0, 1.0)),
-        classes=class_agreement(repeated) if events is None else class_agreement(table, events),
+        alpha_between=means.of_table(table, alpha_columns, between_of),
+        each_place=means.of_table(table, lambda some: alpha_columns(some, np.ones(len(some))), between_of),
+        classes=class_agreement(table, events),
     )
 
 
@@ -285,12 +292,12 @@ def _correctness(
 ) -> CorrectnessStatistics:
     maps |= {"true_label": truth.label, "stable_wrong": stable_wrong(table, truth)}
     right = np.where(truth.known, dominant(table) == truth.label, np.nan)
-    belief, counted = normalise(table.evidence), truth.known & means.again
+    counted = truth.known & means.again
     everywhere = spatial_blocks(table.index, table.voxel_size, size=means.bootstrap.blocks.size)
     return CorrectnessStatistics(
         accuracy=means.mean(right),
         strata=by_stratum(table, truth, edges),
-        reliability=reliability(belief[counted], truth.label[counted]),
+        reliability=reliability(table.evidence.take(counted), truth.label[counted]),
         quadrants=quadrants(table, truth, BlockBootstrap(everywhere, seed=seed)),
     )
 
@@ -298,11 +305,11 @@ def _correctness(
 def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
     """Means over the voxels with OP >= 2 under each rule."""
     again = table.op >= 2
-    usual = fusion_rules.labels(normalise(table.evidence))
+    usual = fusion_rules.labels(table.evidence)
     rows = []
     for rule in fusion_rules.RULES:
         fused = fusion_rules.fuse(events, rule)
-        relabelled = fusion_rules.labels(fused.belief) != usual
+        relabelled = fusion_rules.labels(fused.evidence) != usual
         rows.append(RuleOutcome(rule, rule_means(fused, again, truth), mean(relabelled[again])))
     return tuple(rows)
 

@@ -149,8 +149,8 @@ def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]
 
 def save_voxels(table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
-    own = {measure.key: measure.of(table) for measure in measures()}
-    table.save(path, {**own, "label": dominant(table), **(columns or {})})
+    own = {measure.key: measure.of for measure in measures()}
+    table.save(path, columns, {**own, "label": dominant})
 
 
 def _save_text(text: str, path: Path) -> None:
