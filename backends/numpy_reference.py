@@ -18,6 +18,7 @@ from semstab.backends.shared.association import (
     voxel_index,
 )
 from semstab.backends.shared.total import Change, MapTotal
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable, index_columns
@@ -83,7 +84,7 @@ class NumpyReference:
             **index_columns(voxels[order]),
             voxel=voxel[by_voxel],
             frame=frame[by_voxel].astype(np.int32),
-            evidence=s_bar[by_voxel],
+            evidence=Evidence.of(s_bar[by_voxel]),
             pixels=pixels[by_voxel],
             voxel_size=self.voxel_size,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 
 import laspy
 import numpy as np
@@ -21,9 +22,10 @@ from posed_scene import fails
 from records import voxels as voxels_by_hand
 
 import semstab
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.metrics import categories, dominant, vss
-from semstab.outputs.export import export
+from semstab.outputs.export import export, mesh
+from semstab.outputs.export.las import codes
 from semstab.outputs.export.raster import seen_from_above
 from semstab.outputs.export.voxels import Column, Voxels
 
@@ -70,8 +72,6 @@ def test_las_has_the_voxels_to_the_millimetre_with_their_measures_and_projection
 
 def test_codes_of_a_shipped_taxonomy(fused, table):
     voxels = as_voxels(table, classes=("building", "road", "static car"), taxonomy="uavid7")
-    from semstab.outputs.export.las import codes
-
     assert codes(voxels).tolist() == [0, 6, 11, 64]
 
 
@@ -194,6 +194,19 @@ def test_other_bad_input(fused):
     fails(DataError, "summary.json: cannot be read", export, fused / "empty", fused / "map.ply")
     lonely = dataclasses.replace(as_voxels(voxels_by_hand((1, 1, [1, 0, 0]))), up=None)
     fails(ConfigError, "set up_axis", seen_from_above, lonely)
+
+
+def test_packages_that_are_missing_are_named_with_their_extra(fused, monkeypatch):
+    for package, file in (("laspy", "never.laz"), ("lazrs", "never.las"), ("rasterio", "never.tif")):
+        monkeypatch.setitem(sys.modules, package, None)
+        fails(MissingDependencyError, r"pip install .semstab\[geo\].", written, fused, file)
+
+
+def test_voxels_that_span_too_much_are_refused(tmp_path):
+    far = voxels_by_hand((2, 1, [1, 0, 0]))
+    far = as_voxels(dataclasses.replace(far, ix=np.array([0, 2**22]), iy=np.array([0, 2**22])))
+    fails(ConfigError, "choose larger ones with --cell", seen_from_above, far)
+    fails(ConfigError, "too much for a mesh", mesh.write, far, tmp_path / "far.glb")
 
 
 # --- A given cloud ----------------------------------------------------------------------------------------------------

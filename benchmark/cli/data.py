@@ -67,6 +67,9 @@ def predict(
         str | None, typer.Option(help="strict, or lenient: near classes count as well.", show_default="strict")
     ] = None,
     scores: Annotated[bool, typer.Option("--scores", metavar="", help="Also keep soft scores.")] = False,
+    top_k: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.options.KEY=VALUE."),
@@ -107,6 +110,7 @@ def predict(
         batch=batch,
         overwrite=overwrite,
         quiet=quiet,
+        top_k=top_k,
     )
 
 
