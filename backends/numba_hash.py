@@ -17,17 +17,27 @@ import numpy.typing as npt
 
 from semstab.backends import Changes
 from semstab.backends.numba_parts.history import History
-from semstab.backends.numba_parts.loops import SLOT, look_up, record_types, rehash, unchain, update
+from semstab.backends.numba_parts.loops import (
+    SLOT,
+    count_chain,
+    look_up,
+    read_chain,
+    record_types,
+    rehash,
+    unchain,
+    update,
+)
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
-from semstab.backends.shared.keys import index_of_keys
+from semstab.backends.shared.keys import columns_of_keys, index_of_keys
 from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Events, VoxelTable, index_columns
+from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.compiled import is_kept, settings
 
 Int64 = npt.NDArray[np.int64]
@@ -99,7 +109,7 @@ class NumbaHash:
             observed = time.perf_counter()
             change = self._add(seen, frame.index)
             if self._history is not None:
-                self._history.append(seen, frame.index)
+                self._history.append(seen, self.changes.row, frame.index)
             return self._total.add(frame.index, change, started, observed)
         finally:
             nb.set_num_threads(threads)
@@ -131,16 +141,26 @@ class NumbaHash:
 
     def table(self) -> VoxelTable:
         """The map so far."""
-        order = np.argsort(self._records["key"][: len(self)], kind="stable")
-        records = self._records[order]
+        order = self._order()
+        index = columns_of_keys(self._records["key"], order, self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
-        values: dict[str, Any] = {name: records[name] for name in columns}
+        values: dict[str, Any] = {name: self._records[name][order] for name in columns}
+        starts = np.zeros(len(order) + 1, dtype=np.int64)
+        count_chain(self._records, self._nodes, order, starts)
+        np.cumsum(starts, out=starts)
+        label, weight = np.empty(starts[-1], dtype=np.uint16), np.empty(starts[-1])
+        read_chain(self._records, self._nodes, order, starts, label, weight)
+        del order
         return VoxelTable(
-            **index_columns(self.index_of(order)),
+            **index,
             **values,
-            evidence=self.evidence_of(order),
+            evidence=Evidence(starts, label, weight, self.num_classes),
             voxel_size=self.voxel_size,
         )
+
+    def _order(self) -> npt.NDArray[np.int32]:
+        """The voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
+        return np.argsort(self._records["key"][: len(self)], kind="stable").astype(np.int32)
 
     def column(self, name: str, rows: Int64 | slice = np.s_[:]) -> npt.NDArray[Any]:
         """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""
@@ -164,7 +184,10 @@ class NumbaHash:
 
     def events(self) -> Events | None:
         """Every observation in order of integration within a voxel, where `history` is kept; else None."""
-        return None if self._history is None else self._history.events(self.origin)
+        if self._history is None:
+            return None
+        order = self._order()
+        return self._history.events(order, columns_of_keys(self._records["key"], order, self.origin))
 
     def _make_slots(self, needed: int) -> None:
         size = self._slots.shape[1]

@@ -8,6 +8,7 @@ import numpy as np
 
 from semstab.backends.shared.association import Int64, Observations, check_frame, check_settings, observe
 from semstab.backends.shared.total import Change, MapTotal
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable, index_columns
@@ -66,7 +67,7 @@ class NumpyReference:
             **index_columns(voxels[order]),
             voxel=voxel[by_voxel],
             frame=frame[by_voxel].astype(np.int32),
-            evidence=s_bar[by_voxel],
+            evidence=Evidence.of(s_bar[by_voxel]),
             pixels=pixels[by_voxel],
             voxel_size=self.voxel_size,
         )

@@ -22,6 +22,7 @@ from semstab.backends.shared.columns import update_rows
 from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
@@ -91,8 +92,9 @@ class Open3DBlocks(FusionBackend):
         index = self._index_of(rows)
         order = np.lexsort(index.T[::-1])
         rows = rows[order]
-        values: dict[str, Any] = {name: self._read(name, rows) for name in self.attributes}
-        return VoxelTable(**index_columns(index[order]), **values, voxel_size=self.voxel_size)
+        values: dict[str, Any] = {name: self._read(name, rows) for name in self.attributes if name != "evidence"}
+        evidence = Evidence.read(len(rows), self.num_classes, lambda some: self._read("evidence", rows[some]))
+        return VoxelTable(**index_columns(index[order]), **values, evidence=evidence, voxel_size=self.voxel_size)
 
     def _new_grid(self, blocks: int) -> VoxelBlockGrid:
         """An empty grid with room for that many blocks."""

@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from semstab.model.voxels import Events, VoxelTable
     from semstab.outputs.export import export
     from semstab.outputs.loaded import load
-    from semstab.outputs.relabel import relabel
+    from semstab.outputs.relabel import Belief, relabel
     from semstab.settings import load_config, load_study
 
 __version__ = "0.2.0"
 
 __all__ = [
+    "Belief",
     "Config",
     "ConfigError",
     "DataError",
@@ -49,6 +50,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Belief": "outputs.relabel",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",

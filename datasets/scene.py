@@ -39,6 +39,7 @@ class Scene(ABC):
     label_paths        where label maps are looked for, of the first frame, with BACKBONE for any name
     settings_file      the file that says what no option says, or None where there is no such file
     labels_like_depth  whether its label maps have the pixels of the depth, not those of the colour images
+    surface            the file of the surface that depth is cast at, or None where it is not cast
     depth_from         where depth comes from, in words, where that is not a file a frame
     on_photographs     whether `image` is a distorted photograph, which `color` shows undistorted
     skips_incomplete   whether selected frames that lack a file are left out; else they are an error
@@ -54,6 +55,7 @@ class Scene(ABC):
     label_paths: tuple[str, ...] = ()
     settings_file: Path | None = None
     labels_like_depth: bool = True
+    surface: Path | None = None
     depth_from: str | None = None
     on_photographs: bool = False
     skips_incomplete: bool = False

@@ -59,7 +59,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
     def frames(self, folder: Path) -> list[FrameSource]:
         """One an entry of 'frames'. Raises what `read_transforms` raises."""
         path = inside(self.options.root, folder, self.options.transforms, "option transforms")
-        depth = self.options.depth
+        depth = self.options.depth or ("depth/{name}" if self.options.surface is not None else None)
         template = None if depth is None else Template("depth", depth, ("name",), ("name",))
         return read_transforms(path, self.options.root, folder, template)
 

@@ -36,11 +36,17 @@ def plane_depth(T: np.ndarray, K: Intrinsics = K, shape: tuple[int, int] = (H, W
     return -(T[:3, 3] @ normal) / (rays @ normal)
 
 
-def frame(k: int) -> Frame:
-    T = pose(k)
-    ids = ((np.arange(W) + 3 * np.arange(H)[:, None] + k) // 4 % 3).astype(np.uint8)
-    color = np.stack([ids * 60, ids * 20, 200 - ids * 30], axis=-1).astype(np.uint8)
-    return Frame(k, plane_depth(T).astype(np.float32), K, T, labels=ids, color=color)
+def frame(k: int, K: Intrinsics = K, shape: tuple[int, int] = (H, W), detail: float = 1.0) -> Frame:
+    """What a camera sees of the plane, on which there are spots, metres large where detail is 1."""
+    T, depth = pose(k), plane_depth(pose(k), K, shape)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(shape)], axis=-1)
+    x, y, _ = np.moveaxis((rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3], -1, 0)
+    x, y = detail * x, detail * y
+    spots = sum(np.sin(a * x + b * y + c) for a, b, c in ((1.1, 0.3, 0), (-0.4, 1.7, 1), (2.3, 1.1, 2), (0.9, -2.1, 3)))
+    grey = (128 + 30 * spots).astype(np.uint8)
+    ids = ((np.arange(shape[1]) + 3 * np.arange(shape[0])[:, None] + k) // 4 % 3).astype(np.uint8)
+    return Frame(k, depth.astype(np.float32), K, T, labels=ids, color=np.stack([grey, grey // 2, 255 - grey], axis=-1))
 
 
 def height(x, y):

@@ -31,7 +31,7 @@ from semstab.outputs.tables import tables
 from semstab.outputs.tables import to_json as table_content
 from semstab.outputs.terminal import print_summary
 from semstab.runtime.json_form import to_json
-from semstab.statistics import Estimate, Reliability, analyse, describe
+from semstab.statistics import Estimate, Looks, Reliability, Sample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
 BACKBONES = ("a", "b", "gt")
@@ -53,19 +53,20 @@ def ran(tmp_path_factory):
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
-def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events]:
+def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, Sample]:
     name = f"wall__{backbone}__numpy.parquet"
-    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name)
+    looks = Looks.load(run / "looks" / name).sample()
+    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), looks
 
 
 def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
     run, _, summary = ran
-    truth = saved(run, "gt")[0]
+    truth, _, of_truth = saved(run, "gt")
     for entry in summary["runs"]:
         name = entry["backbone"]
-        table, events = saved(run, name)
-        true = None if name == "gt" else truth
-        expected = analyse(table, events, true, limit=true, name=name, edges=(1, 3))
+        table, events, sample = saved(run, name)
+        true, sample = (None, sample) if name == "gt" else (truth, sample.against(of_truth))
+        expected = analyse(table, events, true, limit=true, sample=sample, name=name, edges=(1, 3))
         assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
         for column, values in expected.maps.items():
@@ -101,7 +102,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    assert to_json(entry.statistics) == to_json(describe(table, name="a"))
+    sample = Looks.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
+    assert to_json(entry.statistics) == to_json(describe(table, sample=sample, name="a"))
     assert entry.statistics.drift.tests is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept

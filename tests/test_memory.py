@@ -14,9 +14,10 @@ from semstab.backends import create, expected_bytes
 from semstab.config import Config
 from semstab.engine.units import make_plan
 from semstab.engine.work import memory
-from semstab.engine.work.memory import available_bytes, estimate, require_memory
+from semstab.engine.work.memory import estimate, require_memory
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
+from semstab.runtime.memory import available_bytes
 from semstab.task import Task, read
 
 FRAMES = 30

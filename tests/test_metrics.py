@@ -322,7 +322,7 @@ def test_a_map_agrees_with_itself():
     ],
 )
 def test_a_difference_in_any_quantity_is_disagreement(column, row, value, quantities):
-    values = getattr(TABLE, column).copy()
+    values = np.array(getattr(TABLE, column))
     values[row] = value
     result = compare(TABLE, dataclasses.replace(TABLE, **{column: values}), UNITS)
     assert not result.agrees

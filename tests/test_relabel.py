@@ -12,7 +12,7 @@ import pytest
 import tiny_scene
 from command_line import bench
 from dataset_writers import write_labels, write_scannet
-from posed_config import configure
+from posed_config import configure, dataset_of
 from posed_scene import fails
 
 import semstab
@@ -133,16 +133,17 @@ def test_pixels_of_voxels_that_are_not_believed_are_ignored(fused):
 
 
 def test_a_run_reads_what_was_relabelled(fused, tmp_path):
-    shutil.copytree(fused / "scene", tmp_path / "scene")
-    semstab.run(configure(tmp_path / "scene", check=None), out=tmp_path / "run", report=False)
-    done = bench("relabel", tmp_path / "run", "--out", tmp_path / "scene", "--category", "stable", cwd=tmp_path)
+    done = bench("relabel", fused / "run", "--out", tmp_path, "--category", "stable", cwd=tmp_path)
     assert "a-fused: 4 frames" in done.stdout
     assert "accuracy 0." in done.stdout
-    assert LabelSpace.load(tmp_path / "scene/labels/a-fused/label_space.yaml").classes == ("wall", "door", "window")
-    again = semstab.run(configure(tmp_path / "scene", check=None, backbones=["a-fused"]))
+    assert "the stability of these maps says nothing" in done.stdout
+    assert LabelSpace.load(tmp_path / "labels/a-fused/label_space.yaml").classes == ("wall", "door", "window")
+    found = dataset_of(fused / "scene", labels_root=tmp_path, labels="labels/{backbone}/{name}")
+    again = semstab.run(configure(fused / "scene", dataset=found, check=None))
+    assert again.backbones == ("a-fused",)
     assert again.record().summary.table.means.value["vss"] == 1.0
     other = "holds predictions with other settings .min_op: 1 there, 2 here."
-    fails(ConfigError, other, relabel, tmp_path / "run", tmp_path / "scene", backbone="a", belief=Belief(min_op=2))
+    fails(ConfigError, other, relabel, fused / "run", tmp_path, belief=Belief(min_op=2))
 
 
 def test_what_cannot_be_relabelled(fused, tmp_path):
@@ -152,9 +153,9 @@ def test_what_cannot_be_relabelled(fused, tmp_path):
     taken.mkdir(parents=True)
     (taken / "0000.png").write_bytes(b"mine")
     fails(ConfigError, "holds maps that were not predicted here", relabel, fused / "run", tmp_path)
-    shutil.copytree(fused / "scene", tmp_path / "scene")
-    semstab.run(configure(tmp_path / "scene", check=None), out=tmp_path / "run", report=False)
-    (tmp_path / "scene/labels/a/0000.png").write_bytes((tmp_path / "scene/labels/a/0001.png").read_bytes())
+    shutil.copytree(fused / "run", tmp_path / "run")
+    manifest = tmp_path / "run/manifest.json"
+    manifest.write_text(manifest.read_text().replace('"scene/a": "', '"scene/a": "other'))
     fails(DataError, "is not what was fused; run it again", relabel, tmp_path / "run", tmp_path / "out")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -15,7 +14,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import vss
 from semstab.metrics.matching import shared_rows
 from semstab.model.measures import VSS
-from semstab.statistics import coverage, paired, psa, sign_flip_test, standardised
+from semstab.statistics import coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
 from semstab.statistics.comparison import EDGES, holm, standard_weights
 
@@ -127,17 +126,17 @@ def two_backbones(rng, gap, side=32, F=4):
 
 
 def test_paired_differences_cover_and_their_test_keeps_its_level():
-    """Two backbones of the same quality, 100 times: the interval holds 0, and the test says so, 95 times."""
+    """Two backbones of the same quality, 60 times: the interval holds 0, and the test says so, 57 times."""
     rng = np.random.default_rng(1)
     held, rejected = 0, 0
-    for _ in range(100):
+    for _ in range(60):
         tables = two_backbones(rng, 0.0)
-        result = paired(tables, replicates=150, flips=199)
-        (psa_difference,) = (row for row in result.differences if row.measure == "psa")
-        held += psa_difference.difference.low <= 0 <= psa_difference.difference.high
-        rejected += psa_difference.p_value <= 0.05
-    assert held >= 88
-    assert rejected <= 12
+        result = paired(tables, replicates=150)
+        by_measure = {row.measure: row for row in result.differences}
+        held += by_measure["psa"].difference.low <= 0 <= by_measure["psa"].difference.high
+        rejected += by_measure["alpha_between"].p_value <= 0.05
+    assert held >= 52
+    assert rejected <= 8
 
 
 def test_a_worse_backbone_is_found_by_difference_test_and_rank():
@@ -147,7 +146,8 @@ def test_a_worse_backbone_is_found_by_difference_test_and_rank():
     assert by_measure["psa"].difference.low > 0
     assert by_measure["alpha"].difference.low > 0
     assert by_measure["entropy"].difference.high < 0
-    assert by_measure["psa"].p_value < 0.001
+    assert by_measure[result.primary].p_value < 0.001
+    assert math.isnan(by_measure["psa"].p_value)  # it describes
     for ranking in result.rankings:
         assert [rank.backbone for rank in ranking.ranks] == ["a", "b"]
         assert ranking.ranks[0].best > 0.95
@@ -162,10 +162,8 @@ def test_backbones_are_compared_by_accuracy_where_there_is_a_truth():
     (accuracy,) = (row for row in result.differences if row.measure == "accuracy")
     assert accuracy.difference.value == pytest.approx(wrong.mean())
     assert accuracy.difference.low <= 0.2 <= accuracy.difference.high
-    assert accuracy.p_value < 0.001
     (agreement,) = (row for row in result.differences if row.measure == "psa")
     assert agreement.difference.value == 0
-    assert agreement.p_value == 1
 
 
 def test_only_voxels_that_all_saw_twice_are_compared():
@@ -200,16 +198,6 @@ def test_maps_without_a_common_voxel_leave_everything_undefined():
 
 
 # --- Tests ------------------------------------------------------------------------------------------------------------
-
-
-def test_the_sign_flip_test_is_that_over_all_signs():
-    differences = np.array([0.5, 1.0, -0.2, 0.7, 0.9, 0.1, -0.3])
-    sums = [abs(np.dot(signs, differences)) for signs in itertools.product((-1, 1), repeat=7)]
-    exact = np.mean(np.array(sums) >= abs(differences.sum()) - 1e-9)
-    assert sign_flip_test(differences) == pytest.approx(exact, abs=4 * math.sqrt(exact / 9999))
-    assert sign_flip_test(np.zeros(5)) == 1
-    assert sign_flip_test(np.ones(20)) == pytest.approx(1e-4)
-    assert math.isnan(sign_flip_test(np.zeros(0)))
 
 
 def test_holm_is_that_of_statsmodels():

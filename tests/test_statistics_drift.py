@@ -75,7 +75,7 @@ def test_many_observations_are_compared_with_random_orders():
     """All 5040 orders of 7 observations against 1999 random ones: within 4 standard errors."""
     evidence = soft(np.random.default_rng(0), 3, 7)
     events = log_of_evidence(evidence)
-    drift = small(events, least=1999, most=1999, enough=1999)
+    drift = small(events, draws=1999, most=1999, enough=1999)
     for i, e in enumerate(evidence):
         null, p_value, trend_p = over_all_orders(e)
         assert drift.null[i] == pytest.approx(null, rel=0.05)
@@ -115,7 +115,7 @@ def test_very_many_observations():
     rng = np.random.default_rng(2)
     events = log_of(rng.integers(0, 2, size=(3, 300)))
     assert np.isnan(expected_sbd(events.table())).all()
-    drift = small(events)
+    drift = small(events, draws=100)
     assert (np.abs(drift.excess) < 0.5 * drift.null).all()
 
 
@@ -199,8 +199,8 @@ def test_an_empty_log_and_one_without_disagreement():
 
 def test_settings_that_make_no_sense_are_refused():
     events = log_of([[0, 1]])
-    with pytest.raises(ConfigError, match="least = 10, most = 5"):
-        voxel_drift(events.table(), events, least=10, most=5)
+    with pytest.raises(ConfigError, match="draws = 0, most = 5"):
+        voxel_drift(events.table(), events, draws=0, most=5)
 
 
 # --- Tests of the scene -----------------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ def test_settings_that_make_no_sense_are_refused():
 def scene(labels, K=2, frame_orders=99):
     events = log_of(labels, K=K)
     table = events.table()
-    return scene_drift(table, events, small(events, least=1, most=1), seed=0, frame_orders=frame_orders)
+    return scene_drift(table, events, small(events, draws=1, most=1), seed=0, frame_orders=frame_orders)
 
 
 def test_the_scene_test_keeps_its_level_when_voxels_err_together():

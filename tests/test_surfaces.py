@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import io
+import json
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
 import looking_down as down
 import numpy as np
 import pytest
-from command_line import error_of
-from dataset_writers import write_colmap
+from dataset_writers import write_colmap, write_transforms
 from posed_config import configure, dataset_of
 from posed_scene import fails
 from posed_writer import write_posed
+from rich.console import Console
 
 import semstab
+from semstab.check import check, quick_check
+from semstab.check.display import print_check
 from semstab.datasets import open_dataset
 from semstab.datasets.surfaces import surface as surfaces
 from semstab.datasets.surfaces.casting import View
 from semstab.datasets.surfaces.surface import Surface
 from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.model.frames import Intrinsics
 from semstab.model.georeference import Georeference, wkt
 
 pytest.importorskip("laspy")
@@ -147,6 +153,71 @@ def test_other_datasets_need_no_depth_either(mesh, tmp_path) -> None:
     scene = open_dataset("colmap", {"root": tmp_path / "col", "surface": mesh, "casts": False}).scene("col")
     assert scene.missing(1) == []
     np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
+    write_transforms(tmp_path / "trans", frames)
+    content = json.loads((tmp_path / "trans/transforms.json").read_text()) | {"w": down.W, "h": down.H}
+    for entry in content["frames"]:
+        del entry["depth_file_path"]
+    (tmp_path / "trans/transforms.json").write_text(json.dumps(content))
+    scene = open_dataset("transforms_json", {"root": tmp_path / "trans", "surface": mesh, "casts": False}).scene(
+        "trans"
+    )
+    np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
+
+
+# --- what the images say ----------------------------------------------------------------------------------------------
+
+LARGE = Intrinsics(160, 160, 95.5, 63.5)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Six larger images of the plane, without depth and labels."""
+    frames = [down.frame(k, LARGE, (128, 192), detail=5) for k in range(6)]
+    folder = write_posed(
+        tmp_path_factory.mktemp("large") / "field", [f"{k}" for k in range(6)], {"": frames}, scale=None
+    )
+    shutil.rmtree(folder / "depth")
+    return folder
+
+
+def looked_at(photographs, surface):
+    scene = open_dataset("posed_folder", {"root": photographs, "surface": surface, "casts": False}).scene("field")
+    return quick_check(scene, list(range(6)))
+
+
+def test_images_confirm_a_surface_in_its_place(photographs, mesh) -> None:
+    verdict = looked_at(photographs, mesh)
+    assert verdict.state == "sound", verdict.text
+    assert "match where surface and poses carry them (correlation" in verdict.text
+
+
+@pytest.mark.parametrize(("up", "side"), [(1.5, "further from the cameras"), (-2.0, "nearer to the cameras")])
+def test_images_find_how_far_off_a_surface_lies(photographs, tmp_path, up, side) -> None:
+    verdict = looked_at(photographs, down.write_mesh(tmp_path / "moved.ply", shift=(0, 0, up)))
+    assert verdict.state == "unsound", verdict.text
+    found = re.search(rf"where the surface lies ([\d.]+) m {side} ", verdict.text)
+    assert found, verdict.text
+    assert float(found[1]) == pytest.approx(abs(up), rel=0.1)
+
+
+def test_without_images_nothing_is_claimed_of_a_surface(photographs, mesh, tmp_path) -> None:
+    bare = shutil.copytree(photographs, tmp_path / "field")
+    shutil.rmtree(bare / "color")
+    options = {"root": bare, "surface": mesh, "casts": False, "intrinsics_size": (192, 128)}
+    verdict = quick_check(open_dataset("posed_folder", options).scene("field"), list(range(6)))
+    assert verdict.state == "unclear"
+    assert "without images of overlapping frames nothing tells whether they fit" in verdict.text
+
+
+def test_the_check_says_what_depth_is_cast_at(photographs, mesh) -> None:
+    config = configure(photographs, dataset=dataset_of(photographs, surface=str(mesh), casts=False))
+    (checked,) = check(config)
+    console = Console(record=True, width=80, file=io.StringIO())
+    print_check(checked, console)
+    said = " ".join(console.export_text().split())
+    assert f"from rays cast at {mesh}".replace(" ", "") in said.replace(" ", "")
+    assert "field: sound: neighbouring images match" in said
+    assert "reprojected into each other" not in said
 
 
 # --- what is wrong ----------------------------------------------------------------------------------------------------
@@ -160,9 +231,9 @@ def test_a_surface_in_other_coordinates_than_the_poses_says_how_far_off(flight, 
     )
     dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "casts": False})
     fails(DataError, match, dataset.scene("field").geometry, 1)
-    options = ("--data", flight, "--set", f"dataset.options.surface={path}", "--set", "dataset.options.casts=false")
-    for command in ((), ("check",)):
-        assert "m away (east -576,7" in error_of(*command, *options, cwd=tmp_path)
+    config = configure(flight, dataset=dataset_of(flight, surface=str(path), casts=False))
+    fails(DataError, match, semstab.engine.run, config)
+    fails(DataError, match, list, check(config))
 
 
 def test_cameras_that_look_elsewhere_are_told_so(flight, mesh) -> None:

@@ -62,7 +62,7 @@ def test_columns_are_read_only_and_of_their_types():
     for name, dtype in types.items():
         column = getattr(TABLE, name)
         assert (name, column.dtype) == (name, dtype)
-        with pytest.raises(ValueError, match="read-only"):
+        with pytest.raises((ValueError, TypeError), match=r"read-only|not support item assignment"):
             column[0] = 0
 
 
@@ -294,11 +294,11 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, table):
     table.save(path)
     old = path.read_bytes()
 
-    def write_half(content, where, **options):
-        where.write_bytes(old[:20])
+    def write_half(writer, content):
+        writer.where.write_bytes(old[:20])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(pq, "write_table", write_half)
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", write_half)
     with pytest.raises(OSError, match="no space left"):
         table.save(path)
     assert path.read_bytes() == old

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
+from semstab.backbones.outside.class_list import class_names
 from semstab.backbones.outside.code import Code, guarded
 from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError, DataError
@@ -177,19 +178,3 @@ def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> 
     if found is None or isinstance(found, str) or not all(isinstance(name, str) for name in found):
         raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or say --classes a,b,c")
     return LabelSpace(code.name, tuple(found))
-
-
-def class_names(said: Sequence[str] | str) -> Sequence[str] | LabelSpace:
-    """'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML. Raises ConfigError for an empty one."""
-    if not isinstance(said, str):
-        return said
-    path = Path(said).expanduser()
-    if path.suffix in (".yaml", ".yml"):
-        return LabelSpace.load(path)
-    if path.suffix and path.is_file():
-        names = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    else:
-        names = [name.strip() for name in said.split(",")]
-    if not (found := [name for name in names if name]):
-        raise ConfigError(f"classes {said}: holds no name")
-    return found

@@ -8,21 +8,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.keys import index_of_keys
+from semstab.backends.numba_parts.loops import place_observations
 from semstab.backends.shared.observed import Observed
-from semstab.model.voxels import Events, index_columns
+from semstab.model.evidence import Evidence
+from semstab.model.voxels import Events
 
 Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A frame's observations, kept: as `Observed`, with the number of entries of each voxel."""
+    """A frame's observations, kept: rows of the map, pixels, and their entries as in `Observed`, without empty ones."""
 
     frame: int
-    key: Int64
-    pixels: Int64
-    entries: Int64
+    row: npt.NDArray[np.int32]
+    pixels: npt.NDArray[np.int32]
+    entries: npt.NDArray[np.uint16]
     label: npt.NDArray[np.uint16]
     weight: npt.NDArray[np.float64]
 
@@ -35,34 +36,48 @@ class History:
         self.num_classes = num_classes
         self._seen: list[_Seen] = []
 
-    def append(self, seen: Observed, frame: int) -> None:
-        """Keep a copy of the observations that outlives the next frame."""
+    def append(self, seen: Observed, row: Int64, frame: int) -> None:
+        """Keep a copy of the observations of the map's rows that outlives the next frame."""
         some = seen.weight > 0
-        entries = np.add.reduceat(some, seen.start[:-1], dtype=np.int64) if len(seen.key) else seen.key
-        kept = _Seen(frame, seen.key.copy(), seen.pixels.copy(), entries, seen.label[some], seen.weight[some])
-        self._seen.append(kept)
-
-    def events(self, origin: Int64) -> Events:
-        """The observations in order of integration within a voxel; keys count from the origin."""
-        seen = self._seen
-        keys = _joined([frame.key for frame in seen], np.int64)
-        distinct, voxel = np.unique(keys, return_inverse=True)  # packed keys sort like (ix, iy, iz)
-        by_voxel = np.argsort(voxel, kind="stable")
-        pixels = _joined([frame.pixels for frame in seen], np.int64)
-        evidence = np.zeros((len(keys), self.num_classes))
-        row = np.repeat(np.arange(len(keys)), _joined([frame.entries for frame in seen], np.int64))
-        evidence[row, _joined([frame.label for frame in seen], np.uint16)] = (
-            _joined([frame.weight for frame in seen], np.float64) / pixels[row]
+        entries = (
+            np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if len(seen.key) else seen.key.astype(np.uint16)
         )
+        self._seen.append(
+            _Seen(
+                frame,
+                row.astype(np.int32),
+                seen.pixels.astype(np.int32),
+                entries,
+                seen.label[some],
+                seen.weight[some],
+            )
+        )
+
+    def events(self, order: npt.NDArray[np.int32], index: dict[str, Any]) -> Events:
+        """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order))
+        observations, entries = np.zeros(len(order) + 1, np.int64), np.zeros(len(order) + 1, np.int64)
+        for seen in self._seen:
+            voxel = rank[seen.row] + 1  # a voxel is in a frame once
+            observations[voxel] += 1
+            entries[voxel] += seen.entries
+        place, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
+        voxels = np.repeat(np.arange(len(order)), observations[1:])
+        frame, pixels = np.empty(len(voxels), np.int32), np.empty(len(voxels), np.int64)
+        starts = np.empty(len(voxels) + 1, np.int64)
+        starts[-1] = entry[-1]
+        label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])
+        for seen in self._seen:
+            place_observations(
+                rank, seen.frame, seen.row, seen.pixels, seen.entries, seen.label, seen.weight,
+                place, entry, frame, pixels, starts, label, weight,
+            )  # fmt: skip
         return Events(
-            **index_columns(index_of_keys(distinct, origin)),
-            voxel=voxel[by_voxel],
-            frame=np.repeat([frame.frame for frame in seen], [len(frame.key) for frame in seen])[by_voxel],
-            evidence=evidence[by_voxel],
-            pixels=pixels[by_voxel],
+            **index,
+            voxel=voxels,
+            frame=frame,
+            evidence=Evidence(starts, label, weight, self.num_classes),
+            pixels=pixels,
             voxel_size=self.voxel_size,
         )
-
-
-def _joined(parts: list[npt.NDArray[Any]], dtype: Any) -> npt.NDArray[Any]:
-    return np.concatenate([np.zeros(0, dtype=dtype), *parts])

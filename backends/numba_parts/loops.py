@@ -216,3 +216,51 @@ def unchain(records, nodes, order, evidence):
         while at >= 0:
             evidence[i, nodes[at].label] = nodes[at].value
             at = np.int64(nodes[at].next)
+
+
+@parallel
+def count_chain(records, nodes, order, count):
+    """How many classes the records in that order have seen: count[1:] of (n + 1,)."""
+    for i in nb.prange(order.shape[0]):
+        at = np.int64(records[order[i]].next)
+        count[i + 1] = 1
+        while at >= 0:
+            count[i + 1] += 1
+            at = np.int64(nodes[at].next)
+
+
+@parallel
+def read_chain(records, nodes, order, starts, label, weight):
+    """Evidence of the records in that order as entries, starts (n + 1,) being the first of each, ascending by class."""
+    for i in nb.prange(order.shape[0]):
+        last = starts[i]
+        record = records[order[i]]
+        label[last], weight[last] = record.label, record.value
+        at = np.int64(record.next)
+        while at >= 0:
+            k, value = nodes[at].label, nodes[at].value
+            last += 1
+            e = last
+            while e > starts[i] and label[e - 1] > k:
+                label[e], weight[e] = label[e - 1], weight[e - 1]
+                e -= 1
+            label[e], weight[e] = k, value
+            at = np.int64(nodes[at].next)
+
+
+@serial
+def place_observations(
+    rank, index, row, seen_pixels, entries, seen_label, seen_weight, place, entry, frame, pixels, starts, label, weight
+):  # fmt: skip
+    """Write a frame's observations where each voxel's next one goes."""
+    e = 0
+    for i in range(row.shape[0]):
+        voxel = rank[row[i]]
+        at, to = place[voxel], entry[voxel]
+        place[voxel] += 1
+        entry[voxel] += entries[i]
+        frame[at], pixels[at], starts[at] = index, seen_pixels[i], to
+        for k in range(entries[i]):
+            label[to + k] = seen_label[e + k]
+            weight[to + k] = seen_weight[e + k] / seen_pixels[i]
+        e += entries[i]

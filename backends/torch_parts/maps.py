@@ -26,6 +26,7 @@ from semstab.backends.torch_parts.views import (
     evidence_of,
 )
 from semstab.errors import ConfigError, DataError
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Intrinsics
 from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
@@ -133,8 +134,10 @@ class TorchMaps:
         rows = self.storage.hash.rows[used[order]].to(torch.int64)
         seen = columns.op[rows] > 0
         keys, rows = keys[seen].cpu(), rows[seen]
-        values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES}
-        values["evidence"] = values["evidence"].astype(np.float64, copy=False)
+        values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES[1:]}
+        values["evidence"] = Evidence.read(
+            len(rows), columns.num_classes, lambda some: _at_home(columns.evidence, rows[some])
+        )
         index = index_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
         return VoxelTable(**index_columns(index), **values, voxel_size=self.voxel_size)
 

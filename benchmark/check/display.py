@@ -54,10 +54,11 @@ def _heading(checked: SceneCheck) -> str:
 def _tables(checked: SceneCheck) -> Iterator[tuple[str, Table]]:
     """Titles and tables."""
     verdict = checked.verdict
-    yield (
-        f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs",
-        _convention_table(checked),
-    )
+    if verdict.fits:
+        yield (
+            f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs",
+            _convention_table(checked),
+        )
     if checked.overlaps:
         yield "what frames share, by their distance among the selected ones", _overlap_table(checked)
     if checked.persistence:

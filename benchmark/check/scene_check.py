@@ -23,6 +23,7 @@ from semstab.check.coverage import (
 )
 from semstab.check.geometry import Verdict, judge, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
+from semstab.check.photometry import judge_surface, match_images
 from semstab.check.remarks import remarks
 from semstab.check.reprojection import Sample
 from semstab.check.views import View, clusters, evenly, label_source, pairs_within, reader
@@ -131,7 +132,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
     first = backbones[0] if backbones else label_source(scene)
     look = Look(scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True)
     sample, how = look.sample(config.dataset.options), look.reading(config.dataset.options)
-    verdict = judge(sample, how, thorough=True)
+    verdict = look.verdict(config.dataset.options, thorough=True)
     checked = SceneCheck(
         scene=scene.name,
         frames=len(scene),
@@ -157,7 +158,7 @@ def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any]
         look = Look(scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
         if len(look.views) < 2:
             continue
-        verdict = judge(look.sample(options or {}), look.reading(options or {}), thorough=False)
+        verdict = look.verdict(options or {}, thorough=False)
         if verdict.state != "unsound":
             break
     return verdict
@@ -241,6 +242,13 @@ class Look:
         views = {position: view for position, view in self.views.items() if position in self._compared}
         pairs = [pair for pair in self._pairs if pair[0] in views and pair[1] in views]
         return Sample(views, pairs, self.reading(options).convention)
+
+    def verdict(self, options: Mapping[str, Any], *, thorough: bool) -> Verdict:
+        """Of depth reprojected from frame to frame; of depth that is cast at a surface, of what the images say."""
+        sample = self.sample(options)
+        if self.scene.surface is not None:
+            return judge_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
+        return judge(sample, self.reading(options), thorough=thorough)
 
     def depth(self) -> Depth:
         """Of all frames that were read."""

@@ -10,13 +10,14 @@ import typer
 from typer.core import TyperGroup
 
 from semstab import __version__
+from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
 from semstab.cli.running import run, study, view
-from semstab.errors import OUT_OF_MEMORY, SemstabError
+from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
 
 INTERRUPTED = 130
@@ -55,6 +56,10 @@ class Group(TyperGroup):
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
             raise typer.Exit(2) from error
+        except ImportError as error:
+            what = f"{error.name or 'a package'} cannot be loaded ({one_line(error)})"
+            say(f"error: {what}; install semstab again, or give the process more memory (ulimit -v)")
+            raise typer.Exit(2) from error
         except MemoryError as error:
             say(f"error: {OUT_OF_MEMORY}")
             raise typer.Exit(2) from error
@@ -90,6 +95,7 @@ for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (che
     app.command(name)(command)
 app.command("export")(export)
 app.command("relabel")(relabel)
+app.command("conform")(conform)
 app.command("view")(view)
 app.command("list")(list_)
 

@@ -9,7 +9,7 @@ from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import Analysis, BackboneComparison, Sample, analyse, compare_backbones
+from semstab.statistics import Analysis, BackboneComparison, Looks, Sample, analyse, compare_backbones
 from semstab.task import Task
 
 
@@ -44,13 +44,15 @@ def comparison(
     maps: Mapping[str, VoxelTable],
     truth: VoxelTable | None = None,
     logs: Mapping[str, Events] | None = None,
+    looks: Mapping[str, Looks] | None = None,
 ) -> BackboneComparison | None:
     """Maps of a scene beside each other; None where there are not two or more of them in one label space.
 
-    With the logs of all of them, also under other rules of fusion.
+    With the logs of all of them, also under other rules of fusion; with the sampled looks of all, on common ones.
     """
     if len(maps) < 2 or len({table.classes for table in maps.values()}) > 1:
         return None
     if truth is not None and truth.classes != next(iter(maps.values())).classes:
         truth = None
-    return compare_backbones(maps, logs, truth, scene=scene)
+    sampled = looks if looks is not None and looks.keys() == maps.keys() else None
+    return compare_backbones(maps, logs, truth, looks=sampled, scene=scene)

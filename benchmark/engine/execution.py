@@ -31,7 +31,7 @@ from semstab.model.results import Agreement
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
-from semstab.statistics import BackboneComparison
+from semstab.statistics import BackboneComparison, Looks
 
 GB = 1e9
 
@@ -280,7 +280,9 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
         files = {record.unit.backbone: record.events_file for record in there if config.events}
         logs = {name: Events.load(file) for name, file in files.items() if file is not None and file.exists()}
         maps = {record.unit.backbone: tables.of(record) for record in there}
-        found = comparison(scene, maps, truth, logs if len(logs) == len(there) > 1 else None)
+        kept = {record.unit.backbone: record.looks_file for record in there}
+        looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
+        found = comparison(scene, maps, truth, logs if len(logs) == len(there) > 1 else None, looks)
         if found is not None:
             yield found
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.model.information import entropy_bits, normalise
-from semstab.model.measures import sbd
+from semstab.model.measures import Rows, by_chunk, sbd
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 
@@ -61,7 +61,12 @@ def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) 
     Drifting comes first because nearly all drifting voxels are ambiguous as well, but not the other way round: with
     more observations a voxel that stays ambiguous goes from drifting to uncertain.
     """
-    return categorise(table.op, sbd(table), entropy_bits(normalise(table.evidence)), thresholds)
+    return categorise(table.op, sbd(table), _bits(table), thresholds)
+
+
+@by_chunk
+def _bits(table: Rows) -> npt.NDArray[np.float64]:
+    return entropy_bits(normalise(table.evidence))
 
 
 def categorise(

@@ -68,7 +68,7 @@ def observations(log: Events, rows: Int64) -> Events:
     """These rows of a log, ascending, with the voxels that they are of."""
     voxels, of = np.unique(log.voxel[rows], return_inverse=True)
     own: dict[str, Any] = {name: getattr(log, name)[voxels] for name in ("ix", "iy", "iz")}
-    own |= {name: getattr(log, name)[rows] for name in ("frame", "evidence", "pixels")}
+    own |= {"frame": log.frame[rows], "evidence": log.evidence.take(rows), "pixels": log.pixels[rows]}
     return dataclasses.replace(log, **own, voxel=of)
 
 
@@ -81,10 +81,7 @@ def _dense(indices: Sequence[npt.NDArray[np.integer]]) -> list[Int64]:
 
 def rows_of(table: VoxelTable, where: npt.NDArray[np.bool_]) -> VoxelTable:
     """The voxels of a table for which `where` (n,) holds."""
-    columns: dict[str, Any] = {
-        name: value[where] for name, value in vars(table).items() if isinstance(value, np.ndarray)
-    }
-    return dataclasses.replace(table, **columns)
+    return table.rows(where)
 
 
 def require_same_grid(*tables: VoxelTable | Events) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.measures import MeasureMeans, dominant, mean, measures
+from semstab.model.measures import Float64, Int32, Measure, MeasureMeans, chunks, dominant, mean, measures
 from semstab.model.results import RECURRENT, Means, TableSummary
 from semstab.model.voxels import VoxelTable
 
@@ -22,27 +22,58 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     edges are the strata's upper bounds of OP, ascending; a last stratum holds what lies above. Each mean runs over the
     voxels where its measure is defined; over no voxel it is NaN.
     """
-    values = {measure: measure.of(table) for measure in measures()}
-    label = dominant(table)
-    names = table.classes or tuple(str(k) for k in range(table.K))
-
-    def means(name: str, where: npt.NDArray[np.bool_]) -> Means:
-        n = int(np.count_nonzero(where))
-        return Means(name, n / len(table) if len(table) else math.nan, n, MeasureMeans.over(values, table.op, where))
-
+    K, names = table.K, table.classes or tuple(str(k) for k in range(table.K))
+    by_stratum, by_class, by_recurrence = _Sums(len(edges) + 1), _Sums(K), _Sums(2)
+    for rows in chunks(table):
+        values = {measure: measure.of(rows) for measure in measures()}
+        by_stratum.add(values, rows.op, np.searchsorted(edges, rows.op))
+        by_class.add(values, rows.op, dominant(rows))
+        by_recurrence.add(values, rows.op, (rows.op >= RECURRENT).astype(np.int64))
     observations = int(table.op.sum(dtype=np.int64))
     return TableSummary(
-        K=table.K,
+        K=K,
         voxel_size=table.voxel_size,
         points=int(table.pixels.sum()),
         observations=observations,
         voxels=len(table),
         mean_op=observations / len(table) if len(table) else math.nan,
-        means=MeasureMeans.over(values, table.op, np.ones(len(table), dtype=np.bool_)),
-        strata=tuple(means(name, (table.op >= low) & (table.op <= high)) for name, low, high in strata(edges)),
-        recurrent=means(f"OP>={RECURRENT}", table.op >= RECURRENT),
-        classes=tuple(means(name, label == k) for k, name in enumerate(names)),
+        means=by_stratum.of(slice(None)),
+        strata=tuple(by_stratum.means(name, g, len(table)) for g, (name, _, _) in enumerate(strata(edges))),
+        recurrent=by_recurrence.means(f"OP>={RECURRENT}", 1, len(table)),
+        classes=tuple(by_class.means(name, k, len(table)) for k, name in enumerate(names)),
     )
+
+
+class _Sums:
+    """Sums of every measure over groups of voxels, which come in parts."""
+
+    def __init__(self, groups: int) -> None:
+        self.voxels = np.zeros(groups, np.int64)
+        self.total = {measure: np.zeros(groups) for measure in measures()}
+        self.defined = {measure: np.zeros(groups, np.int64) for measure in measures()}
+        self.often = {measure: np.zeros(groups, np.int64) for measure in measures() if measure.lowest_op > 1}
+
+    def add(self, values: Mapping[Measure, Float64], op: Int32, group: npt.NDArray[np.int64]) -> None:
+        """Values (n,) of each measure for voxels of these OP and groups (n,)."""
+        G = len(self.voxels)
+        self.voxels += np.bincount(group, minlength=G)
+        for measure, value in values.items():
+            known = ~np.isnan(value)
+            self.total[measure] += np.bincount(group[known], weights=value[known], minlength=G)
+            self.defined[measure] += np.bincount(group[known], minlength=G)
+        for measure, count in self.often.items():
+            count += np.bincount(group[op >= measure.lowest_op], minlength=G)  # noqa: PLW2901 - in place
+
+    def of(self, groups: slice) -> MeasureMeans:
+        """The means over some groups together."""
+        counts = {measure: int(self.defined[measure][groups].sum()) for measure in self.total}
+        value = {m.key: float(self.total[m][groups].sum()) / n if n else math.nan for m, n in counts.items()}
+        return MeasureMeans(value, {m.key: int(count[groups].sum()) for m, count in self.often.items()})
+
+    def means(self, name: str, group: int, voxels: int) -> Means:
+        """Those of one group, as a share of so many voxels."""
+        n = int(self.voxels[group])
+        return Means(name, n / voxels if voxels else math.nan, n, self.of(slice(group, group + 1)))
 
 
 def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:

@@ -31,10 +31,12 @@ class Standardised:
 
     edges    upper edges of the strata of OP
     weights  of the strata
+    thin     the part of the weights that lies in strata which some map hardly has: values there rest on few voxels
     """
 
     edges: tuple[int, ...]
     weights: tuple[float, ...]
+    thin: float
     values: Mapping[str, ByBackbone]
 
     def of(self, quantity: Quantity, backbone: str) -> Estimate:
@@ -46,8 +48,10 @@ class Standardised:
 class PairedDifference:
     """A measure of backbone a minus that of b on the voxels that all saw twice or more.
 
-    p_value  of the paired sign-flip test over blocks, for measures with one value a voxel; p_holm corrects it for the
-             number of pairs (Holm 1979)
+    p_value  that there is none, of the primary measure; p_holm corrects it for the number of pairs (Holm 1979). The
+             other measures describe: they have intervals and no test
+    question   what interval and p-value of the primary measure answer, see `Interval`
+    undecided  why nothing may be claimed of it; empty where something may
     """
 
     measure: str
@@ -56,6 +60,8 @@ class PairedDifference:
     difference: Estimate
     p_value: float
     p_holm: float
+    question: str = ""
+    undecided: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,9 +91,11 @@ class Ranking:
 class Paired:
     """Backbones on the voxels that every one of them observed at least twice.
 
-    values  what is `compared`, by its key and backbone
+    primary  the key of what is tested
+    values   what is `compared`, by its key and backbone
     """
 
+    primary: str
     voxels: int
     blocks: int
     block_size: float
@@ -98,6 +106,47 @@ class Paired:
     def of(self, quantity: Quantity) -> ByBackbone:
         """The values of what is compared, by backbone."""
         return self.values[quantity.key]
+
+
+@dataclass(frozen=True)
+class Ignored:
+    """What a backbone left out of the looks that any backbone labelled, and what that may be worth.
+
+    missing            share of their pixels
+    psa_low, psa_high  bounds of its mean PSA, whatever the missing looks would have said (Manski 1990)
+    alpha              between frames, where to leave a place out is a class of its own
+    """
+
+    backbone: str
+    missing: float
+    psa_low: float
+    psa_high: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class CommonLooks:
+    """What was compared: the looks (cell of a voxel, frame) that all backbones labelled, each with the same weight.
+
+    voxels, observations  sampled ones that they are of
+    decided               whether each look was reduced to its largest class: labels were compared with scores
+    order                 of the backbones by the primary measure on these looks, the best first
+    order_ignored         the same where to leave a place out is a class of its own
+    bounded               whether the bounds of PSA keep its order of the backbones, whatever was left out
+    """
+
+    voxels: int
+    observations: int
+    decided: bool
+    ignored: tuple[Ignored, ...]
+    order: tuple[str, ...]
+    order_ignored: tuple[str, ...]
+    bounded: bool
+
+    @property
+    def depends(self) -> bool:
+        """Whether the order depends on what was left out."""
+        return self.order != self.order_ignored or not self.bounded
 
 
 @dataclass(frozen=True)
@@ -126,4 +175,5 @@ class BackboneComparison:
     coverage: tuple[MapCoverage, ...]
     standardised: Standardised
     paired: Paired
+    looks: CommonLooks | None
     fusion_rules: RuleComparison | None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib.resources
 import reprlib
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +73,7 @@ class LabelSpace:
         if IGNORE_8BIT in self.ids and max(self.ids) == IGNORE_8BIT:
             raise ConfigError(f"taxonomy {self.name}: id 255 means 'ignore'; give the class another id")
         names = [name_key(name) for name in (*self.classes, *(m for ms in self.members for m in ms), *self.ignored)]
-        if repeated := sorted({name for name in names if names.count(name) > 1}):
+        if repeated := sorted(name for name, times in Counter(names).items() if times > 1):
             raise ConfigError(f"taxonomy {self.name}: '{repeated[0]}' is named twice")
 
     def __len__(self) -> int:

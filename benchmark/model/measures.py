@@ -5,21 +5,24 @@ Summaries, comparisons, tables, figures, Parquet, the terminal and the recording
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
+from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import entropy_bits, normalise
 from semstab.runtime.json_form import fields_of
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
+Values = TypeVar("Values", bound=npt.NDArray[Any])
 
 
 class Beliefs(Protocol):
@@ -30,12 +33,38 @@ class Beliefs(Protocol):
         """(n,) the number of frames that saw the voxel."""
 
     @property
-    def evidence(self) -> Float64:
+    def evidence(self) -> Float64 | Evidence:
         """(n, K) evidence of each class, up to a factor."""
 
     @property
     def drift_sum(self) -> Float64:
         """(n,) sum over t >= 2 of D_JS(p^(t), p^(t-1)), bits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Some voxels whose evidence is dense: what formulas are computed on."""
+
+    op: Int32
+    evidence: Float64
+    drift_sum: Float64
+
+
+def chunks(table: Beliefs) -> Iterator[Rows]:
+    """The voxels, few enough at a time for dense evidence."""
+    n, K = table.evidence.shape
+    return (Rows(table.op[some], table.evidence[some], table.drift_sum[some]) for some in row_chunks(n, K))
+
+
+def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
+    """A formula of voxels, computed without dense evidence of all of them."""
+
+    @functools.wraps(formula)
+    def of(table: Beliefs) -> Values:
+        values: Values = np.concatenate([formula(rows) for rows in chunks(table)])  # type: ignore[assignment]
+        return values
+
+    return of
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,7 +108,7 @@ class Quantity:
 class Measure(Quantity):
     """A number of each voxel, from 0 to `largest`.
 
-    of         computes it: (n,), NaN where undefined
+    of         computes it: (n,), NaN where undefined; from dense evidence, some voxels at a time
     lowest_op  from which OP on it is defined
     range      of its colours, in which maps differ; values beyond look like the ends
     panel      whether it has a panel in the figure of a map: not where another one shows the same places
@@ -91,11 +120,15 @@ class Measure(Quantity):
     largest: float = 1.0
     panel: bool = True
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "of", by_chunk(self.of))
+
 
 # --- Formulas ---------------------------------------------------------------------------------------------------------
 
 
-def vss(table: Beliefs) -> Float64:
+@by_chunk
+def vss(table: Rows) -> Float64:
     """Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
     concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
     return concentration
@@ -119,20 +152,23 @@ def op(table: Beliefs) -> Int32:
     return table.op
 
 
-def entropy(table: Beliefs) -> Float64:
+@by_chunk
+def entropy(table: Rows) -> Float64:
     """Normalised entropy (n,): -sum_k p_k log p_k / log K, in [0, 1]; report it together with K."""
     normalised: Float64 = entropy_bits(normalise(table.evidence)) / math.log2(table.evidence.shape[1])
     return normalised
 
 
-def margin(table: Beliefs) -> Float64:
+@by_chunk
+def margin(table: Rows) -> Float64:
     """How far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
     second, first = np.partition(normalise(table.evidence), -2, axis=1)[:, -2:].T
     lead: Float64 = first - second
     return lead
 
 
-def dominant(table: Beliefs) -> npt.NDArray[np.int64]:
+@by_chunk
+def dominant(table: Rows) -> npt.NDArray[np.int64]:
     """Dominant class (n,): argmax_k e_k, the lowest on ties."""
     label: npt.NDArray[np.int64] = table.evidence.argmax(axis=1)
     return label

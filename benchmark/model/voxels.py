@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import numpy.typing as npt
 
 from semstab.errors import DataError
 from semstab.model import parquet, tabular
+from semstab.model.evidence import Evidence
 from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.model.measures import MeasureMeans, dominant, measures
 
@@ -31,7 +33,7 @@ class VoxelTable:
 
     ix, iy, iz         (n,) int32 voxel index, floor(x_w / r)
     op                 (n,) int32 observation persistence: the number of frames that saw the voxel
-    evidence           (n, K) float64 accumulated evidence e(q), the sum over frames of s_bar
+    evidence           (n, K) accumulated evidence e(q), the sum over frames of s_bar; kept sparse
     drift_sum          (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits
     pixels             (n,) int64 pixels that fell into the voxel, all frames
     first_frame        (n,) int32 lowest frame index that saw it
@@ -48,7 +50,7 @@ class VoxelTable:
     iy: Int32
     iz: Int32
     op: Int32
-    evidence: Float64
+    evidence: Evidence
     drift_sum: Float64
     pixels: Int64
     first_frame: Int32
@@ -60,7 +62,7 @@ class VoxelTable:
 
     def __post_init__(self) -> None:
         _freeze_columns(self, _VOXEL_TYPES, self.ix)
-        if self.evidence.ndim != 2 or (self.classes and len(self.classes) != self.K):
+        if self.classes and len(self.classes) != self.K:
             raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
         ascends = self.iz[1:] > self.iz[:-1]
         for column in (self.iy, self.ix):  # a column decides where those before it are equal
@@ -74,7 +76,7 @@ class VoxelTable:
     @property
     def K(self) -> int:
         """Number of classes."""
-        return int(self.evidence.shape[1])
+        return self.evidence.K
 
     @property
     def index(self) -> Int32:
@@ -85,6 +87,11 @@ class VoxelTable:
     def centers(self) -> Float64:
         """(n, 3) world coordinates of the voxel centres, metres."""
         return (self.index.astype(np.float64) + 0.5) * self.voxel_size
+
+    def rows(self, rows: Any) -> VoxelTable:
+        """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
+        return replace(self, **columns, evidence=self.evidence.take(rows))
 
     def to_arrow(self) -> pa.Table:
         """Columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
@@ -97,12 +104,13 @@ class VoxelTable:
     def _columns(self) -> dict[str, Any]:
         names = self.classes or tuple(str(k) for k in range(self.K))
         x, y, z = self.centers.T
+        evidence = self.evidence[:]
         return {
             "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
             "class": tabular.named(dominant(self), names),
             **{measure.key: measure.of(self) for measure in measures()},
             "pixels": self.pixels, "first_frame": self.first_frame, "last_frame": self.last_frame,
-            **{f"evidence_{name}": self.evidence[:, k] for k, name in enumerate(names)},
+            **{f"evidence_{name}": evidence[:, k] for k, name in enumerate(names)},
         }  # fmt: skip
 
     def _repr_html_(self) -> str:
@@ -116,10 +124,26 @@ class VoxelTable:
         title = f"{len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes"
         return tabular.as_html(title, ["", "voxels", *(measure.title for measure in measures())], rows)
 
-    def save(self, path: str | Path, extra: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
-        """Write Parquet, atomically; `extra` columns (n,) go along for other programs and are not read back."""
-        columns = {name: getattr(self, name) for name in _VOXEL_TYPES}
-        parquet.write(path, columns | dict(extra or {}), type(self).__name__, self.voxel_size, self.classes)
+    def save(
+        self,
+        path: str | Path,
+        extra: Mapping[str, npt.NDArray[Any]] | None = None,
+        computed: Mapping[str, Callable[[VoxelTable], npt.NDArray[Any]]] | None = None,
+    ) -> None:
+        """Write Parquet, atomically, some rows after the others.
+
+        `extra` columns (n,), and what is `computed` from the rows that are written, go along for other programs and are
+        not read back.
+        """
+
+        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
+            part = self.rows(some)
+            own = {name: np.asarray(getattr(part, name)) for name in _VOXEL_TYPES}
+            made = {name: of(part) for name, of in (computed or {}).items()}
+            return own | made | {name: values[some] for name, values in (extra or {}).items()}
+
+        parts = map(columns, self.evidence.chunks())
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
 
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
@@ -135,7 +159,7 @@ class Events:
     ix, iy, iz  (n,) int32 the voxels, sorted
     voxel       (m,) int64 row into them, ascending
     frame       (m,) int32 frame index
-    evidence    (m, K) float64 s_bar, the mean of the frame's evidence in the voxel
+    evidence    (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse
     pixels      (m,) int64 pixels behind it
     voxel_size  r, metres
     classes     the K class names, where they are known
@@ -146,7 +170,7 @@ class Events:
     iz: Int32
     voxel: Int64
     frame: Int32
-    evidence: Float64
+    evidence: Evidence
     pixels: Int64
     voxel_size: float
     classes: tuple[str, ...] = ()
@@ -164,23 +188,23 @@ class Events:
     @property
     def K(self) -> int:
         """Number of classes."""
-        return int(self.evidence.shape[1])
+        return self.evidence.K
 
-    @property
+    @cached_property
     def starts(self) -> Int64:
         """(n,) first row of each voxel."""
-        return np.searchsorted(self.voxel, np.arange(len(self.ix))).astype(np.int64)
+        return np.flatnonzero(np.diff(self.voxel, prepend=-1))
 
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
-        starts, s_bar = self.starts, self.evidence
+        starts, s_bar = self.starts, self.evidence[:]
         op = np.diff(np.append(starts, len(self)))
         return VoxelTable(
             self.ix,
             self.iy,
             self.iz,
             op=op.astype(np.int32),
-            evidence=_sum_by_voxel(s_bar, starts),
+            evidence=Evidence.of(_sum_by_voxel(s_bar, starts)),
             drift_sum=_sum_by_voxel(self.drift(), starts),
             pixels=_sum_by_voxel(self.pixels, starts),
             first_frame=np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
@@ -193,7 +217,7 @@ class Events:
 
     def beliefs(self) -> Float64:
         """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
-        accumulated = self.evidence.copy()
+        accumulated = self.evidence[:]
         age = np.arange(len(self)) - self.starts[self.voxel]
         by_age = np.argsort(age, kind="stable")
         ends = np.cumsum(np.bincount(age, minlength=1))
@@ -219,14 +243,14 @@ class Events:
         pairs = np.stack([parent.ravel()[self.voxel], self.frame], axis=1)
         pairs, rows = np.unique(pairs, axis=0, return_inverse=True)
         pixels = np.zeros(len(pairs), dtype=np.int64)
-        evidence = np.zeros((len(pairs), self.evidence.shape[1]))
+        evidence = np.zeros((len(pairs), self.evidence.K))
         np.add.at(pixels, rows.ravel(), self.pixels)
-        np.add.at(evidence, rows.ravel(), self.evidence * self.pixels[:, None])
+        np.add.at(evidence, rows.ravel(), self.evidence[:] * self.pixels[:, None])
         return Events(
             **index_columns(coarse),
             voxel=pairs[:, 0].astype(np.int64),
             frame=pairs[:, 1].astype(np.int32),
-            evidence=evidence / pixels[:, None],
+            evidence=Evidence.of(evidence / pixels[:, None]),
             pixels=pixels,
             voxel_size=self.voxel_size * factor,
             classes=self.classes,
@@ -234,9 +258,13 @@ class Events:
 
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
-        columns = {name: getattr(self, name) for name in _EVENT_TYPES}
-        columns |= {name: getattr(self, name)[self.voxel] for name in _INDEX_TYPES}
-        parquet.write(path, columns, type(self).__name__, self.voxel_size, self.classes)
+
+        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
+            own = {name: getattr(self, name)[some] for name in _EVENT_TYPES}
+            return own | {name: getattr(self, name)[self.voxel[some]] for name in _INDEX_TYPES}
+
+        parts = map(columns, self.evidence.chunks())
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
@@ -266,8 +294,20 @@ def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:
 
 def _freeze_columns(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
     for name, dtype in types.items():
-        column: npt.NDArray[Any] = np.ascontiguousarray(getattr(table, name), dtype=dtype).view()
-        if len(column) != len(like):
-            raise DataError(f"{type(table).__name__}: column '{name}' has {len(column)} rows, expected {len(like)}")
-        column.setflags(write=False)
-        object.__setattr__(table, name, column)
+        given = getattr(table, name)
+        if len(given) != len(like):
+            raise DataError(f"{type(table).__name__}: column '{name}' has {len(given)} rows, expected {len(like)}")
+        object.__setattr__(table, name, _evidence(table, given) if name == "evidence" else _frozen(given, dtype))
+
+
+def _frozen(given: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    column: npt.NDArray[Any] = np.ascontiguousarray(given, dtype=dtype).view()
+    column.setflags(write=False)
+    return column
+
+
+def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
+    shape = np.shape(given)
+    if len(shape) != 2:
+        raise DataError(f"{type(table).__name__}: evidence of shape {shape}, expected one row of K classes each")
+    return Evidence.of(given)

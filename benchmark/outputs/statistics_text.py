@@ -6,9 +6,9 @@ import math
 import textwrap
 from collections.abc import Iterable, Sequence
 
-from semstab.model.comparison import BackboneComparison
+from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import Estimate, LagBin, MapStatistics, Reach, RuleOutcome
+from semstab.model.statistics import NEXT_FLIGHT, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -16,6 +16,8 @@ from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 Row = tuple[str, Estimate | float, str]
 Cell = str | float
 WIDTH = 80
+THIN = 0.1
+"""Part of the weights in strata that hardly overlap, from which on it is said."""
 
 
 def lines(found: MapStatistics) -> list[str]:
@@ -24,12 +26,13 @@ def lines(found: MapStatistics) -> list[str]:
     head = [
         *textwrap.wrap(found.verdict.line, WIDTH),
         "",
-        f"{repeated.voxels} of {found.voxels} voxels seen twice or more; intervals at 95 % from"
-        f" {blocks.count} blocks of {blocks.size:.4g} m",
+        f"{repeated.voxels} of {found.voxels} voxels seen twice or more, in {blocks.count} cubes of space",
+        f"intervals at 95 %, for this map; errors depend on each other within blocks of {blocks.size:.4g} m",
         "",
         f"{'':<34}{'value':>9}   {'interval':<20}",
     ]
-    rows = [*_agreement(found), *_drift(found), *_uncertainty(found), *_geometry(found), *_correctness(found)]
+    sections = (_agreement, _judged, _drift, _uncertainty, _geometry, _correctness)
+    rows = [row for section in sections for row in section(found)]
     return [*head, *(_line(*row) for row in rows), *_tables(found)]
 
 
@@ -46,7 +49,11 @@ def comparison_lines(found: BackboneComparison) -> list[str]:
         "",
         f"{'difference on common voxels':<34}{'value':>9}   {'interval':<20}{'p (Holm)':>10}",
     ]
-    out += [_line(f"{r.measure}: {r.a} - {r.b}", r.difference, _p("p", r.p_holm)) for r in paired.differences]
+    out += [_line(f"{r.measure}: {r.a} - {r.b}", r.difference, _tested(r)) for r in paired.differences]
+    if found.looks is not None:
+        out += ["", *_looks(found.looks), ""]
+    if found.standardised.thin > THIN:
+        out.append(f"standardised: {found.standardised.thin:.0%} of the weight is in strata that hardly overlap")
     for quantity in compared(truth=False):
         own = {name: found.standardised.of(quantity, name) for name in found.backbones}
         if quantity.key in found.standardised.values:
@@ -58,6 +65,26 @@ def comparison_lines(found: BackboneComparison) -> list[str]:
         changed = [measure for measure, changes in rules.order_changes.items() if changes]
         out.append(f"another fusion rule changes the order by: {', '.join(changed) or 'no measure'}")
     return out
+
+
+def _tested(row: PairedDifference) -> str:
+    if math.isnan(row.p_holm):
+        return ""
+    return f"{_p('p', row.p_holm)}, {row.undecided or row.question}"
+
+
+def _looks(found: CommonLooks) -> list[str]:
+    """What was compared, and what the order owes to what was left out."""
+    reduced = "; labels beside scores: each look reduced to its largest class" if found.decided else ""
+    rows = [(r.backbone, r.missing, r.psa_low, r.psa_high, r.alpha) for r in found.ignored]
+    depends = "depends" if found.depends else "does not depend"
+    return [
+        *textwrap.wrap(
+            f"compared on {found.observations} looks at {found.voxels} voxels that all labelled{reduced}", WIDTH
+        ),
+        *_table(("backbone", "left out", "PSA at least", "at most", "alpha, left out as a class"), rows),
+        f"the order {depends} on what was left out",
+    ]
 
 
 def _agreement(found: MapStatistics) -> list[Row]:
@@ -73,6 +100,20 @@ def _agreement(found: MapStatistics) -> list[Row]:
         *([] if found.reach is None else _reach(found.reach)),
         *([] if found.correlogram is None else _standard(found.correlogram.standard)),
     ]
+
+
+def _judged(found: MapStatistics) -> list[Row]:
+    """What may be said of the next flight, if anything."""
+    judged = found.judged
+    rows = {
+        "PSA": judged.psa,
+        "alpha": judged.alpha,
+        "alpha between frames": judged.alpha_between,
+        "VSS at OP >= 3": judged.vss,
+        "accuracy": judged.accuracy,
+        "wrong of the stable places": judged.wrong_of_stable,
+    }
+    return [(name, own, "the next flight") for name, own in rows.items() if own.question == NEXT_FLIGHT]
 
 
 def _reach(reach: Reach) -> list[Row]:

@@ -13,6 +13,7 @@ from semstab.backbones import Backbone, create, options_model
 from semstab.backbones.class_names import InTaxonomy
 from semstab.backbones.outside.border import Checked
 from semstab.backbones.outside.code import absolute
+from semstab.backbones.outside.network import is_network
 from semstab.backbones.outside.own import is_path
 from semstab.config import Settings, validated
 from semstab.datasets import GROUND_TRUTH
@@ -24,7 +25,7 @@ from semstab.runtime.files import parse_yaml
 class PredictorConfig(Settings):
     """Which backbone predicts, and how its predictions are called and given."""
 
-    backbone: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, package.module:NAME")
+    backbone: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, net.onnx")
     name: str | None = Field(None, description="what its predictions are called; the backbone's name by default")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that backbone")
     scores: bool = Field(False, description="soft scores, not labels alone")
@@ -50,7 +51,9 @@ class PredictorConfig(Settings):
     @property
     def label_name(self) -> str:
         """What its label maps are called."""
-        return self.name or self.backbone.rpartition(":")[2]
+        if self.name is not None:
+            return self.name
+        return Path(self.backbone).stem if is_network(self.backbone) else self.backbone.rpartition(":")[2]
 
     def resolved(self) -> PredictorConfig:
         """With every default of the backbone's options, and absolute paths.
@@ -58,7 +61,9 @@ class PredictorConfig(Settings):
         Raises ConfigError for an option that cannot be used, MissingDependencyError.
         """
         options = validated(options_model(self.backbone), self.options, f"backbone '{self.backbone}': ")
-        full = {"backbone": absolute(self.backbone), "options": _absolute(options).model_dump(mode="json")}
+        network = is_network(self.backbone)
+        backbone = str(Path(self.backbone).expanduser().absolute()) if network else absolute(self.backbone)
+        full = {"backbone": backbone, "options": _absolute(options).model_dump(mode="json")}
         return self.model_copy(update=full)
 
 

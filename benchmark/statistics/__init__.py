@@ -26,7 +26,7 @@ from semstab.statistics.agreement import (
 from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
 from semstab.statistics.ceiling import ceiling, losses, rendered
-from semstab.statistics.comparison import coverage, paired, sign_flip_test, standardised
+from semstab.statistics.comparison import coverage, paired, standardised
 from semstab.statistics.correctness import (
     Truth,
     correctness,
@@ -47,7 +47,7 @@ from semstab.statistics.drift import (
     voxel_drift,
 )
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
-from semstab.statistics.looks import Sample, Sampler, View, correlogram, reach_of
+from semstab.statistics.looks import Looks, Sample, Sampler, View, correlogram, reach_of
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.verdict import verdict
 
@@ -62,6 +62,7 @@ __all__ = [
     "Estimate",
     "Flips",
     "Fused",
+    "Looks",
     "Losses",
     "MapStatistics",
     "Quadrants",
@@ -100,7 +101,6 @@ __all__ = [
     "reliability",
     "rendered",
     "scene_drift",
-    "sign_flip_test",
     "spatial_blocks",
     "stable_wrong",
     "standardised",

@@ -22,6 +22,9 @@ ALPHA_BETWEEN = Quantity(
     key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(2, 4)
 )
 
+STABLE = 0.8
+"""A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
+
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""
 
@@ -33,7 +36,7 @@ def psa(table: VoxelTable) -> Float64:
     expectation is ||pi||^2 for every T >= 2.
     """
     T = table.op.astype(np.float64)
-    pairs = (table.evidence**2).sum(axis=1) - table.self_sum
+    pairs = table.evidence.rowwise(lambda e: (e**2).sum(axis=1)) - table.self_sum
     agreement = np.full(len(table), np.nan)
     again = table.op >= 2
     agreement[again] = np.clip(pairs[again] / (T * (T - 1))[again], 0.0, 1.0)
@@ -165,29 +168,39 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
 
     Without events only one-hot evidence tells how the frames agree on a class: NaN where other evidence is there.
     """
-    again = table.op >= 2
-    e, T = table.evidence[again], table.op[again].astype(np.float64)[:, None]
-    squares = _squares(table, events)[again]
+    again, of = table.op >= 2, np.repeat(np.arange(len(table)), np.diff(table.evidence.starts))
+    used = again[of]  # classes that nobody saw in a voxel are no disagreement there
+    k, e, squares = table.evidence.label[used], table.evidence.weight[used], _squares(table, events)[used]
+    T = table.op[of][used].astype(np.float64)
     disagreement = 2 * ((T - 1) * e - e**2 + squares) / (T * (T - 1))
-    n, total = T.sum(), e.sum(axis=0)
+    voxels, n = np.count_nonzero(again), table.op[again].sum(dtype=np.float64)
+
+    def by_class(values: Float64) -> Float64:
+        return np.bincount(k, weights=values, minlength=table.K).astype(np.float64)
+
+    total = by_class(e)
     with np.errstate(invalid="ignore", divide="ignore"):
-        p = (e / T).mean(axis=0) if len(e) else np.full(table.K, np.nan)
-        kappa = _beyond_chance(1 - disagreement.sum(axis=0) / len(e), 1 - 2 * p * (1 - p))
-        expected = 2 * ((n - 1) * total - total**2 + squares.sum(axis=0)) / (n * (n - 1))
-        alpha = _beyond_chance(1 - (T * disagreement).sum(axis=0) / n, 1 - expected)
+        p = by_class(e / T) / voxels
+        kappa = _beyond_chance(1 - by_class(disagreement) / voxels, 1 - 2 * p * (1 - p))
+        expected = 2 * ((n - 1) * total - total**2 + by_class(squares)) / (n * (n - 1))
+        alpha = _beyond_chance(1 - by_class(T * disagreement) / n, 1 - expected)
     names = table.classes or tuple(str(k) for k in range(table.K))
     rows = zip(names, total, kappa, alpha, strict=True)
     return tuple(ClassAgreement(name, *(float(value) for value in values)) for name, *values in rows)
 
 
 def _squares(table: VoxelTable, events: Events | None) -> Float64:
-    """(n, K) sum over frames of s_tk^2."""
+    """The sum over frames of s_tk^2 for each entry (m,) of the table's evidence."""
     if events is not None:
-        squares: Float64 = np.add.reduceat(events.evidence**2, events.starts, axis=0) if len(events) else table.evidence
+        from semstab.statistics import kernels, log_kernels
+
+        squares, bounds = np.zeros(len(table.evidence.weight)), np.append(events.starts, len(events))
+        voxels = table.evidence.entries
+        kernels.in_chunks(log_kernels.sum_squares, bounds, events.evidence.entries, table.K, voxels, squares)
         return squares
     again = table.op >= 2
     one_hot = (np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[again].all()
-    return table.evidence if one_hot else np.full_like(table.evidence, np.nan)
+    return table.evidence.weight if one_hot else np.full(len(table.evidence.weight), np.nan)
 
 
 def _beyond_chance(observed: Float64, expected: Float64) -> Float64:

@@ -9,7 +9,7 @@ import numpy as np
 
 from semstab.errors import ConfigError
 from semstab.metrics.matching import require_same_map
-from semstab.model.comparison import BackboneComparison, RuleComparison, Standardised
+from semstab.model.comparison import BackboneComparison, Paired, RuleComparison, Standardised
 from semstab.model.measures import Measure, Quantity, measures
 from semstab.model.statistics import RuleMeans
 from semstab.model.voxels import Events, VoxelTable
@@ -22,9 +22,13 @@ from semstab.statistics.comparison import (
     repeated_rows,
     standard_weights,
     standardised,
+    thin,
     voxelwise,
 )
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
+from semstab.statistics.looks import Looks
+from semstab.statistics.looks.common import decided
+from semstab.statistics.looks.ignored import Shared, common_looks
 
 SCHEMA = 1
 
@@ -34,6 +38,7 @@ def compare_backbones(
     events: Mapping[str, Events] | None = None,
     truth: VoxelTable | None = None,
     *,
+    looks: Mapping[str, Looks] | None = None,
     scene: str = "",
     seed: int = 0,
     block_size: float | None = None,
@@ -41,24 +46,54 @@ def compare_backbones(
     """Compare several backbones' maps of one scene; at least two.
 
     coverage      what each map holds
-    standardised  means at a common distribution of OP, each map with all its voxels
-    paired        values, differences and rankings on the voxels that all saw twice or more
+    standardised  means at a common distribution of OP, each map with all its voxels; none of labels beside scores
+    paired        values, differences and rankings on the voxels that all saw twice or more; where there are samples of
+                  looks (`Sampler`), on the looks that all made, with the same weights
+    looks         what these are, and what the order owes to what was left out; None without samples
     fusion_rules  the same ranking under other fusion rules, from the events of all backbones; None without them
     Raises ConfigError for fewer than two maps, DataError where they differ in K or voxel size.
     """
     if len(tables) < 2:
         raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
     weights = standard_weights(tables)
-    everywhere = {m.key: standardised(tables, m, seed=seed, weights=weights) for m in voxelwise()}
+    shared = None if looks is None else common_looks({name: looks[name] for name in tables})
+    mixed = shared is not None and shared.found.decided
+    comparable = () if mixed else voxelwise()  # means of labels beside means of scores would say nothing
+    everywhere = {m.key: standardised(tables, m, seed=seed, weights=weights) for m in comparable}
+    if mixed and events is not None:
+        events = {name: decided(events[name]) for name in tables}
     return BackboneComparison(
         scene=scene,
         schema=SCHEMA,
         seed=seed,
         backbones=tuple(tables),
         coverage=coverage(tables),
-        standardised=Standardised(EDGES, tuple(weights.tolist()), everywhere),
-        paired=paired(tables, truth, seed=seed, block_size=block_size),
+        standardised=Standardised(EDGES, tuple(weights.tolist()), thin(tables, weights), everywhere),
+        paired=_paired(tables, events, truth, shared, seed, block_size),
+        looks=None if shared is None else shared.found,
         fusion_rules=None if events is None else _by_rule(tables, events, truth),
+    )
+
+
+def _paired(
+    tables: Tables,
+    events: Mapping[str, Events] | None,
+    truth: VoxelTable | None,
+    shared: Shared | None,
+    seed: int,
+    block_size: float | None,
+) -> Paired:
+    """On common looks where there are some, else on the common voxels with all looks of each map."""
+    if shared is None:
+        return paired(tables, truth, logs=events, seed=seed, block_size=block_size)
+    return paired(
+        {name: log.table() for name, log in shared.logs.items()},
+        truth,
+        logs=shared.logs,
+        whole={name: log.table() for name, log in shared.whole.items()},
+        primary=shared.primary,
+        seed=seed,
+        block_size=block_size,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import voxel_keys
+from semstab.model.evidence import row_chunks
 from semstab.model.statistics import Estimate
+from semstab.model.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -38,8 +41,18 @@ class Blocks:
 
     def sums(self, columns: Float64) -> Float64:
         """Sums (count, C) over the voxels of each block of columns (n, C)."""
-        by_column = [np.bincount(self.of, weights=column, minlength=self.count) for column in columns.T]
-        return np.stack(by_column, axis=1)
+        return _sums(self.of, columns, self.count)
+
+    def sums_of(self, table: VoxelTable, rows: Int64, formula: Callable[[VoxelTable], Float64]) -> Float64:
+        """Those of the columns (n, C) that a formula makes of these rows (n,) of a table, which are never all there."""
+        parts = (
+            _sums(self.of[some], formula(table.rows(rows[some])), self.count) for some in row_chunks(len(rows), table.K)
+        )
+        return functools.reduce(np.add, parts)
+
+
+def _sums(of: Int64, columns: Float64, count: int) -> Float64:
+    return np.stack([np.bincount(of, weights=column, minlength=count) for column in columns.T], axis=1)
 
 
 def spatial_blocks(
@@ -94,6 +107,17 @@ class BlockBootstrap:
         """The statistic of the voxels' columns (n, C) with its interval."""
         return interval(self.blocks.sums(columns), statistic, self.weights, bounds)
 
+    def estimate_of(
+        self,
+        table: VoxelTable,
+        rows: Int64,
+        formula: Callable[[VoxelTable], Float64],
+        statistic: Statistic,
+        bounds: tuple[float, float] = (-math.inf, math.inf),
+    ) -> Estimate:
+        """The statistic of the columns that a formula makes of these rows of a table, with its interval."""
+        return interval(self.blocks.sums_of(table, rows, formula), statistic, self.weights, bounds)
+
     def replicates(self, columns: Float64, statistic: Statistic) -> Float64:
         """The statistic (R,) in each resample."""
         return statistic(self.weights @ self.blocks.sums(columns))
@@ -130,24 +154,33 @@ def interval(
 
 def _standard_errors(sums: Float64, statistic: Statistic, weights: Float64) -> Float64:
     """Standard errors (R,) by the delta method: blocks are the sampling units, weights (R, B) how often they are in."""
-    gradient = _gradient(statistic, weights @ sums)
+    slopes = _slopes(statistic, weights @ sums, sums)
     n = weights.sum(axis=1)
     variance = np.zeros(len(weights))
     with np.errstate(invalid="ignore", over="ignore"):  # resamples in which the statistic is not defined
         for rows in np.array_split(np.arange(len(weights)), max(1, weights.size // 2**22)):
-            linear = gradient[rows] @ sums.T
+            linear = slopes(rows)
             mean = (weights[rows] * linear).sum(axis=1, keepdims=True) / n[rows, None]
             variance[rows] = (weights[rows] * (linear - mean) ** 2).sum(axis=1)
     errors: Float64 = np.sqrt(variance * n / np.maximum(n - 1, 1))
     return errors
 
 
-def _gradient(statistic: Statistic, totals: Float64) -> Float64:
-    """Central differences (R, C) of the statistic at totals (R, C)."""
+def _slopes(statistic: Statistic, totals: Float64, sums: Float64) -> Callable[[Int64], Float64]:
+    """The statistic's linear part in each block's sums (B, C) at some of the totals (R, C): (r, B)."""
+    if len(sums) < totals.shape[1]:  # fewer blocks than columns, as with many classes
+        along = np.stack([_derivative(statistic, totals, 1e-3 * own) for own in sums], axis=1) * 1e3
+        return lambda rows: along[rows]
     scale = np.abs(totals).max(axis=0)
     gradient = np.zeros_like(totals)
     for column in np.flatnonzero(scale):
         step = np.zeros(totals.shape[1])
         step[column] = 1e-5 * scale[column]
-        gradient[:, column] = (statistic(totals + step) - statistic(totals - step)) / (2 * step[column])
-    return gradient
+        gradient[:, column] = _derivative(statistic, totals, step) / step[column]
+    return lambda rows: gradient[rows] @ sums.T
+
+
+def _derivative(statistic: Statistic, totals: Float64, step: Float64) -> Float64:
+    """Half the difference (R,) of the statistic one step ahead of the totals and one behind."""
+    half: Float64 = (statistic(totals + step) - statistic(totals - step)) / 2
+    return half

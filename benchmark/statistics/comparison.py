@@ -10,13 +10,22 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.metrics.matching import require_same_grid, shared_rows
+from semstab.metrics.matching import observations, require_same_grid, rows_of, shared_rows
 from semstab.model.comparison import MapCoverage, Paired, PairedDifference, Rank, Ranking
 from semstab.model.measures import Quantity, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import Estimate
-from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import ALPHA, PSA, alpha_columns, alpha_of, psa, ratio_of
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.agreement import (
+    ALPHA,
+    ALPHA_BETWEEN,
+    PSA,
+    alpha_columns,
+    alpha_of,
+    between_of,
+    psa,
+    ratio_of,
+)
 from semstab.statistics.blocks import (
     LEAST_BLOCKS,
     REPLICATES,
@@ -32,7 +41,8 @@ Tables = Mapping[str, VoxelTable]
 EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
 """Upper edges of the strata of OP that comparisons are standardised by; OP = 1 is left out."""
 
-FLIPS = 9999
+LEAST_VOXELS, LEAST_OVERLAP = 50, 0.1
+"""A stratum overlaps hardly where some map has fewer voxels in it, or a smaller part of what another map has."""
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
@@ -66,7 +76,7 @@ def voxelwise() -> dict[Quantity, Callable[[VoxelTable], Float64]]:
 
 def compared(*, truth: bool) -> tuple[Quantity, ...]:
     """All that is compared, in the order of the tables; what needs ground truth only where there is some."""
-    quantities = (PSA, ALPHA, *measures(), ACCURACY)
+    quantities = (ALPHA_BETWEEN, PSA, ALPHA, *measures(), ACCURACY)
     return tuple(quantity for quantity in quantities if truth or quantity.needs != "truth")
 
 
@@ -82,6 +92,13 @@ def standard_weights(tables: Tables, edges: Sequence[int] = EDGES) -> Float64:
     pooled = np.where((counts > 0).all(axis=0), counts.sum(axis=0), 0)
     total = pooled.sum()
     return pooled / total if total else np.zeros(counts.shape[1])
+
+
+def thin(tables: Tables, weights: Float64, edges: Sequence[int] = EDGES) -> float:
+    """The part of the weights in strata of OP of which some map has few voxels, or a small part of what another has."""
+    counts = np.stack([np.bincount(_stratum(table, edges), minlength=len(edges) + 2)[1:] for table in tables.values()])
+    few = (counts < LEAST_VOXELS).any(axis=0) | (counts.min(axis=0) < LEAST_OVERLAP * counts.max(axis=0))
+    return float(weights[few].sum())
 
 
 def standardised(
@@ -137,38 +154,69 @@ def paired(
     tables: Tables,
     truth: VoxelTable | None = None,
     *,
+    logs: Mapping[str, Events] | None = None,
+    whole: Tables | None = None,
+    primary: Quantity = ALPHA_BETWEEN,
     seed: int = 0,
     block_size: float | None = None,
     replicates: int = REPLICATES,
-    flips: int = FLIPS,
     least_blocks: int = LEAST_BLOCKS,
 ) -> Paired:
     """Compare backbones voxel by voxel where all of them observed at least twice.
 
     truth is the map of the ground truth labels; without it there is no accuracy. Intervals come from one spatial block
-    bootstrap, the same resamples for all; block_size is in metres.
+    bootstrap, the same resamples for all; block_size is in metres. Only the primary measure is tested, alpha or alpha
+    between frames: for the next flight where the logs of the tables are given, else for this map. `whole` are the same
+    tables before looks were reduced to a class, where they were: of them is alpha between frames.
     """
     rows = repeated_rows(tables)
     first = next(iter(tables.values()))
     blocks = spatial_blocks(first.index[rows[0]], first.voxel_size, size=block_size, least=least_blocks)
     bootstrap = BlockBootstrap(blocks, replicates=replicates, seed=seed)
-    columns, statistics = _columns(tables, rows, truth)
+    columns, statistics = _columns(tables, rows, truth, whole or tables)
     values, differences, rankings = {}, [], []
     for measure, statistic in statistics.items():
         sums = columns[measure]
-        bounds = (-1.0, 1.0) if measure is ALPHA else (0.0, 1.0)
+        bounds = (-1.0, 1.0) if measure in (ALPHA, ALPHA_BETWEEN) else (0.0, 1.0)
         values[measure.key] = {name: bootstrap.estimate(sums[name], statistic, bounds) for name in tables}
-        differences += _differences(measure, statistic, sums, bootstrap, seed, flips)
+        differences += _differences(measure, statistic, sums, bootstrap)
         rankings.append(_ranking(measure, statistic, sums, bootstrap))
-    return Paired(len(rows[0]), blocks.count, blocks.size, values, tuple(differences), tuple(rankings))
+    tested = _tested(primary, tables, rows, logs or {})
+    differences = [tested.get((row.measure, row.a, row.b), row) for row in differences]
+    return Paired(primary.key, len(rows[0]), blocks.count, blocks.size, values, tuple(differences), tuple(rankings))
+
+
+def _tested(
+    primary: Quantity, tables: Tables, rows: Sequence[npt.NDArray[np.int64]], logs: Mapping[str, Events]
+) -> dict[tuple[str, str, str], PairedDifference]:
+    """The differences of the primary measure with their p-values, corrected for the number of pairs."""
+    from semstab.statistics.sampling import difference, influence_sums
+
+    if not len(rows[0]):
+        return {}
+    sums = {}
+    for (name, table), own in zip(tables.items(), rows, strict=True):
+        where = np.zeros(len(table), dtype=np.bool_)
+        where[own] = True
+        log = None if name not in logs else observations(logs[name], np.flatnonzero(where[logs[name].voxel]))
+        sums[name] = influence_sums(rows_of(table, where), log)
+    found = [(a, b, difference(sums[a], sums[b], primary.key)) for a, b in itertools.combinations(tables, 2)]
+    corrected = holm([interval.p_value for *_, interval in found])
+    return {
+        (primary.key, a, b): PairedDifference(
+            primary.key, a, b, Estimate(i.value, i.low, i.high), i.p_value, p_holm, i.question, i.undecided
+        )
+        for (a, b, i), p_holm in zip(found, corrected, strict=True)
+    }
 
 
 def _columns(
-    tables: Tables, rows: Sequence[npt.NDArray[np.int64]], truth: VoxelTable | None
+    tables: Tables, rows: Sequence[npt.NDArray[np.int64]], truth: VoxelTable | None, whole: Tables
 ) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
     """By measure: each backbone's columns on the common voxels, and what makes the measure of their sums."""
     quantities = compared(truth=truth is not None)
-    statistics: dict[Quantity, Statistic] = {q: alpha_of if q is ALPHA else ratio_of for q in quantities}
+    alphas: dict[Quantity, Statistic] = {ALPHA: alpha_of, ALPHA_BETWEEN: between_of}
+    statistics = {quantity: alphas.get(quantity, ratio_of) for quantity in quantities}
     columns: dict[Quantity, dict[str, Float64]] = {measure: {} for measure in statistics}
     for measure, values in voxelwise().items():
         own = [values(table)[r] for table, r in zip(tables.values(), rows, strict=True)]
@@ -178,7 +226,7 @@ def _columns(
             for name, value in zip(tables, own, strict=True)
         }
     for (name, table), r in zip(tables.items(), rows, strict=True):
-        columns[ALPHA][name] = alpha_columns(table)[r]
+        columns[ALPHA][name], columns[ALPHA_BETWEEN][name] = alpha_columns(table)[r], alpha_columns(whole[name])[r]
         if truth is not None:
             true = join_truth(table, truth)
             right = np.stack([true.known & (dominant(table) == true.label), true.known], axis=1)
@@ -191,41 +239,18 @@ def _differences(
     statistic: Statistic,
     columns: Mapping[str, Float64],
     bootstrap: BlockBootstrap,
-    seed: int,
-    flips: int,
 ) -> list[PairedDifference]:
     found = []
     for a, b in itertools.combinations(columns, 2):
         both = np.concatenate([columns[a], columns[b]], axis=1)
         estimate = bootstrap.estimate(both, _difference_of(statistic, columns[a].shape[1]))
-        p = math.nan
-        if measure is not ALPHA:
-            p = sign_flip_test(bootstrap.blocks.sums(columns[a][:, :1] - columns[b][:, :1])[:, 0], seed, flips)
-        found.append((a, b, estimate, p))
-    corrected = holm([p for *_, p in found])
-    return [PairedDifference(measure.key, *row, p_holm) for row, p_holm in zip(found, corrected, strict=True)]
+        found.append(PairedDifference(measure.key, a, b, estimate, math.nan, math.nan))
+    return found
 
 
 def _difference_of(statistic: Statistic, C: int) -> Statistic:
     """The statistic of the first C sums minus that of the others."""
     return lambda sums: statistic(sums[..., :C]) - statistic(sums[..., C:])
-
-
-def sign_flip_test(differences: Float64, seed: int = 0, flips: int = FLIPS) -> float:
-    """P-value of the sum of paired differences (B,) of independent blocks, two-sided.
-
-    Under the hypothesis that the two are interchangeable within a block each difference has either sign with equal
-    probability; `flips` random signs stand for all of them (Fisher 1935). NaN where there is no block.
-    """
-    if not len(differences):
-        return math.nan
-    seen = abs(differences.sum())
-    rng = np.random.default_rng(seed)
-    as_high = 0
-    for rows in np.array_split(np.arange(flips), max(1, flips * len(differences) // 2**24)):
-        signs = rng.integers(0, 2, size=(len(rows), len(differences)), dtype=np.int8) * 2.0 - 1.0
-        as_high += int(np.count_nonzero(np.abs(signs @ differences) >= seen - 1e-9 * (1 + seen)))
-    return (as_high + 1) / (flips + 1)
 
 
 def holm(p: Sequence[float]) -> list[float]:

@@ -11,14 +11,15 @@ import numpy.typing as npt
 
 from semstab.metrics import strata
 from semstab.metrics.matching import shared_rows
+from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
-from semstab.model.measures import MeasureMeans, Quantity, dominant, measures
+from semstab.model.measures import MeasureMeans, Quantity, dominant, measures, vss
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNDEFINED, Correctness, Estimate, Quadrants, Reliability, RuleMeans
+from semstab.model.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import BlockBootstrap
+from semstab.statistics.agreement import STABLE, psa, ratio_of
 from semstab.statistics.fusion_rules import Fused
+from semstab.statistics.sampling.places import Places
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -27,9 +28,6 @@ ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="tr
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
 ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
 BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
-
-STABLE = 0.8
-"""A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
 
 PURE = 0.5
 """A voxel has a true class where more than this share of its ground truth evidence is of one class."""
@@ -55,22 +53,62 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
     Raises DataError where the maps differ in K or voxel size.
     """
     rows, true_rows = shared_rows(table, truth)
-    belief = normalise(truth.evidence[true_rows])
-    rows, true_rows = rows[pure := belief.max(axis=1) > PURE], true_rows[pure]
+    pure = vss(truth)[true_rows] > PURE
     label = np.full(len(table), -1, dtype=np.int64)
-    label[rows] = dominant(truth)[true_rows]
+    label[rows[pure]] = dominant(truth)[true_rows[pure]]
     return Truth(label >= 0, label)
 
 
-def correctness(belief: Float64, label: npt.NDArray[np.int64], name: str = "all") -> Correctness:
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Beliefs beside the true classes, (n,) each.
+
+    label, predicted  the true and the most likely class
+    confidence        belief in the latter
+    error             squared distance of the belief from certainty of the true class, for Brier's score
+    K                 number of classes
+    """
+
+    label: npt.NDArray[np.int64]
+    predicted: npt.NDArray[np.int64]
+    confidence: Float64
+    error: Float64
+    K: int
+
+    @classmethod
+    def of(cls, evidence: Float64 | Evidence, label: npt.NDArray[np.int64]) -> Judged:
+        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
+        n, K = evidence.shape
+        predicted, confidence, error = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
+        for some in row_chunks(n, K):
+            belief = normalise(evidence[some])
+            predicted[some], confidence[some] = belief.argmax(axis=1), belief.max(axis=1)
+            belief[np.arange(len(belief)), label[some]] -= 1
+            error[some] = (belief**2).sum(axis=1)
+        return cls(label, predicted, confidence, error, K)
+
+    def rows(self, where: Mask) -> Judged:
+        """Those for which `where` (n,) holds."""
+        return Judged(self.label[where], self.predicted[where], self.confidence[where], self.error[where], self.K)
+
+    @property
+    def right(self) -> Mask:
+        """(n,) whether the most likely class is the true one."""
+        same: Mask = self.predicted == self.label
+        return same
+
+
+def correctness(belief: Float64 | Evidence, label: npt.NDArray[np.int64], name: str = "all") -> Correctness:
     """Of beliefs (n, K) and true classes (n,)."""
-    if not len(belief):
+    return _correctness(Judged.of(belief, label), name)
+
+
+def _correctness(judged: Judged, name: str = "all") -> Correctness:
+    n = len(judged.label)
+    if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
-    right = belief.argmax(axis=1) == label
-    bins = reliability(belief, label)
-    ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in bins if row.voxels) / len(belief)
-    brier = ((belief - np.eye(belief.shape[1])[label]) ** 2).sum(axis=1).mean()
-    return Correctness(name, len(belief), float(right.mean()), miou(belief, label), float(ece), float(brier))
+    ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in _bins(judged) if row.voxels) / n
+    return Correctness(name, n, float(judged.right.mean()), _miou(judged), float(ece), float(judged.error.mean()))
 
 
 def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
@@ -80,23 +118,26 @@ def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     if truth is None:
         return RuleMeans(means)
     known = where & truth.known
-    right = correctness(fused.belief[known], truth.label[known])
+    right = _correctness(Judged.of(fused.evidence, truth.label).rows(known))
     return RuleMeans(means, right.accuracy, right.miou, right.ece, right.brier)
 
 
-def miou(belief: Float64, label: npt.NDArray[np.int64]) -> float:
-    """Mean intersection over union of the dominant classes of beliefs (n, K) with true classes (n,)."""
-    K = belief.shape[1]
-    confusion = np.bincount(label * K + belief.argmax(axis=1), minlength=K * K).reshape(K, K)
+def _miou(judged: Judged) -> float:
+    """Mean intersection over union of the most likely classes with the true ones."""
+    K = judged.K
+    confusion = np.bincount(judged.label * K + judged.predicted, minlength=K * K).reshape(K, K)
     union = confusion.sum(axis=0) + confusion.sum(axis=1) - confusion.diagonal()
     present = union > 0
     return float((confusion.diagonal()[present] / union[present]).mean()) if present.any() else math.nan
 
 
-def reliability(belief: Float64, label: npt.NDArray[np.int64]) -> tuple[Reliability, ...]:
+def reliability(belief: Float64 | Evidence, label: npt.NDArray[np.int64]) -> tuple[Reliability, ...]:
     """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    confidence = belief.max(axis=1)
-    right = belief.argmax(axis=1) == label
+    return _bins(Judged.of(belief, label))
+
+
+def _bins(judged: Judged) -> tuple[Reliability, ...]:
+    confidence, right = judged.confidence, judged.right
     of = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
     count = np.bincount(of, minlength=BINS)
     with np.errstate(invalid="ignore"):
@@ -110,23 +151,23 @@ def reliability(belief: Float64, label: npt.NDArray[np.int64]) -> tuple[Reliabil
 
 def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[Correctness, ...]:
     """Correctness of all voxels with a true class, then of each stratum of OP."""
-    belief = normalise(table.evidence)
+    judged = Judged.of(table.evidence, truth.label)
     groups = [("all", 1, np.iinfo(np.int32).max), *strata(edges)]
     rows = [(name, truth.known & (table.op >= low) & (table.op <= high)) for name, low, high in groups]
-    return tuple(correctness(belief[where], truth.label[where], name) for name, where in rows)
+    return tuple(_correctness(judged.rows(where), name) for name, where in rows)
 
 
-def quadrants(table: VoxelTable, truth: Truth, bootstrap: BlockBootstrap, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
-    `bootstrap` is over blocks of the table's voxels.
+    `places` are those of all of the table's voxels.
     """
     counted, steady, right = _masks(table, truth, stable)
     if not counted.any():
-        return Quadrants(0, *[UNDEFINED] * 5)
+        return Quadrants(0, *[UNKNOWN] * 5)
 
-    def share(where: Mask, of: Mask) -> Estimate:
-        return bootstrap.estimate(np.stack([where & of, of], axis=1).astype(np.float64), ratio_of, (0.0, 1.0))
+    def share(where: Mask, of: Mask) -> Interval:
+        return places.estimate(np.stack([where & of, of], axis=1).astype(np.float64), ratio_of)
 
     return Quadrants(
         voxels=int(counted.sum()),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +21,21 @@ from semstab.statistics.agreement import ONE_HOT
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
+ROUNDING = 1e-9
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
-LEAST_DRAWS, MOST_DRAWS, ENOUGH_HITS = 100, 1999, 20
-"""Random orders of a voxel: at least, at most, and how many in a tail settle its p-value."""
+NULL_DRAWS = 16
+"""Random orders of a voxel's observations whose mean drift is its null, where that is not known exactly."""
+
+MOST_DRAWS, ENOUGH_HITS = 1999, 20
+"""Random orders of a voxel that is tested: at most, and how many in a tail settle its p-value."""
+
+CLEAR, LIKELY = 1e-4, 0.02
+"""P-values of the trend from its mean and variance over orders stand from LIKELY on; those from CLEAR on are computed
+from random orders; a lower one becomes the lowest that these could give."""
+
+DRIFT_SAMPLE, SCENE_SAMPLE = 5_000, 30_000
+"""At most so many voxels are tested for an unusual SBD, and about so many observations tell whether a scene drifts."""
 
 FRAME_ORDERS = 499
 TESTABLE = 6
@@ -36,7 +48,8 @@ class VoxelDrift:
 
     null         SBD expected when the same observations come in random order, bits; OP >= 2
     excess       SBD - null, bits: below 0 where the belief moves late or only once, above 0 where it moves early
-    p_value      of an SBD this far from what random orders give, either way; where observations disagree
+    p_value      of an SBD this far from what random orders give, either way; where observations disagree, above
+                 OP 5 of a random sample of these voxels
     trend        share of the disagreement that goes one way in time: R^2 of the evidence on the number of the
                  observation; OP >= 3, where observations disagree
     trend_null   its expectation in random order, 1 / (OP - 1)
@@ -92,14 +105,14 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
     T = table.op.astype(np.int64)
     known = (T >= 2) & (T <= kernels.LONGEST_TABLE) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
-    counts = np.rint(table.evidence[known]).astype(np.int64)
-    voxel, label = np.nonzero(counts)
+    entries = table.evidence.take(known)
+    count, voxel = np.rint(entries.weight).astype(np.int64), np.repeat(np.arange(len(entries)), np.diff(entries.starts))
     base = kernels.LONGEST_TABLE + 1
-    pairs, of = np.unique(counts[voxel, label] * base + T[known][voxel], return_inverse=True)
+    pairs, of = np.unique(count * base + T[known][voxel], return_inverse=True)
     part = np.zeros(len(pairs))
     drifts, _ = _drift_tables(T[known])
     kernels.in_chunks(kernels.expected_one_hot, *np.divmod(pairs, base), _log_factorials(base), drifts, part)
-    expected = np.bincount(voxel, weights=part[of], minlength=len(counts)) / (T[known] - 1)
+    expected = np.bincount(voxel, weights=part[of], minlength=len(entries)) / (T[known] - 1)
     return _spread_out(expected, known)
 
 
@@ -108,40 +121,106 @@ def voxel_drift(
     events: Events,
     *,
     seed: int = 0,
-    least: int = LEAST_DRAWS,
+    draws: int = NULL_DRAWS,
     most: int = MOST_DRAWS,
     enough: int = ENOUGH_HITS,
+    sample: int = DRIFT_SAMPLE,
 ) -> VoxelDrift:
     """Compare each voxel's order of observations with random orders of them; events is the log behind the table.
 
-    The null is exact for OP <= 5, where all orders are gone through, and for one-hot evidence (`expected_sbd`); else it
-    is the mean of `least` random orders. P-values above OP 5 come from up to `most` random orders, fewer where `enough`
-    of them are as extreme. They are valid at every voxel under the hypothesis that its observations are exchangeable.
+    Null and p-values are exact for OP <= 5, where all orders are gone through. Above, the null is exact for one-hot
+    evidence (`expected_sbd`), else the mean of `draws` random orders; p-values come from up to `most` random orders,
+    fewer where `enough` of them are as extreme: those of SBD for `sample` voxels drawn at random, those of the trend
+    where its mean and variance over all orders, which are exact, say that it might be below 0.02. So they are valid, up
+    to there, under the hypothesis that a voxel's observations are exchangeable.
     """
-    from semstab.statistics import kernels
-
-    if not (1 <= least <= most and enough >= 1):
-        raise ConfigError(f"least = {least}, most = {most}, enough = {enough}: use 1 <= least <= most, enough >= 1")
-    vary, first, T = _varying(table, events)
-    seen, null, p = np.zeros((len(T), 2)), np.zeros(len(T)), np.zeros((len(T), 3))
-    seeds = np.random.default_rng(seed).integers(2**64, size=len(table), dtype=np.uint64)[vary]
-    kernels.in_chunks(
-        kernels.permute_voxels, first, T, events.evidence, *_drift_tables(T), seeds, least, most, enough, seen, null, p
-    )
+    if not (draws >= 1 and most >= 1 and enough >= 1):
+        raise ConfigError(f"draws = {draws}, most = {most}, enough = {enough}: use 1 or more")
+    vary, _, T = _varying(table, events)
+    orders = _Orders.of(table, events, vary, seed)
+    null, p, variance = orders.measure(draws)
+    spread = T * (T * T - 1.0) / 12 * variation(table)[vary]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        trend = np.where(T > 2, orders.seen[:, 1] / spread, np.nan)
+        trend_p = np.where(T > 2, p[:, 2], np.nan)
+    p_value = np.minimum(1.0, 2 * p[:, :2].min(axis=1))
+    many = np.flatnonzero(orders.enumerated < T)
+    p_value[many] = np.nan
+    drawn = many[np.argsort(orders.seeds[many])[:sample]]
+    p_value[drawn] = orders.test(drawn, by_drift=True, most=most, enough=enough)
+    trend_p[many] = np.maximum(_beta_tail(trend[many], variance[many] / spread[many] ** 2, T[many]), 1 / (most + 1))
+    unsure = many[(trend_p[many] < LIKELY) & (trend_p[many] >= CLEAR)]
+    trend_p[unsure] = orders.test(unsure, by_drift=False, most=most, enough=enough)
     expected = np.where(table.op >= 2, 0.0, np.nan)
     expected[vary] = null / (T - 1)
     exact = expected_sbd(table)
     expected = np.where(np.isnan(exact), expected, exact)
-    spread = T * (T * T - 1.0) / 12 * variation(table)[vary]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return VoxelDrift(
-            null=expected,
-            excess=sbd(table) - expected,
-            p_value=_spread_out(np.minimum(1.0, 2 * p[:, :2].min(axis=1)), vary),
-            trend=_spread_out(np.where(T > 2, seen[:, 1] / spread, np.nan), vary),
-            trend_null=_spread_out(np.where(T > 2, 1 / (T - 1), np.nan), vary),
-            trend_p=_spread_out(np.where(T > 2, p[:, 2], np.nan), vary),
-        )
+    return VoxelDrift(
+        null=expected,
+        excess=sbd(table) - expected,
+        p_value=_spread_out(p_value, vary),
+        trend=_spread_out(trend, vary),
+        trend_null=_spread_out(np.where(T > 2, 1 / np.maximum(T - 1, 1), np.nan), vary),
+        trend_p=_spread_out(trend_p, vary),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Orders:
+    """The observations of some voxels in other orders; arguments of the compiled loops.
+
+    first, T  (n,) their first rows of the log and OP
+    log       starts, label and weight of all observations
+    seeds     (n,) of each voxel's random stream, which depends on its place only
+    seen      (n, 2) its sum of drifts and its trend
+    """
+
+    first: Int64
+    T: Int64
+    log: tuple[Int64, npt.NDArray[np.uint16], Float64]
+    K: int
+    seeds: npt.NDArray[np.uint64]
+    seen: Float64
+    enumerated: int
+
+    @classmethod
+    def of(cls, table: VoxelTable, events: Events, where: npt.NDArray[np.bool_], seed: int) -> _Orders:
+        from semstab.statistics import kernels
+
+        first, T = events.starts[where], table.op[where].astype(np.int64)
+        seeds = _streams(table.rows(where).index, seed)
+        return cls(first, T, events.evidence.entries, table.K, seeds, np.zeros((len(T), 2)), kernels.ENUMERATED)
+
+    def measure(self, draws: int) -> tuple[Float64, Float64, Float64]:
+        """Fill `seen`; the null of the drifts (n,), p-values (n, 3) of few observations, the trend's variance."""
+        from semstab.statistics import kernels
+
+        null, p, variance = np.zeros(len(self.T)), np.zeros((len(self.T), 3)), np.zeros(len(self.T))
+        kernels.in_chunks(kernels.measure_voxels, *self._shared(), draws, self.seen, null, p, variance)
+        return null, p, variance
+
+    def test(self, which: Int64, *, by_drift: bool, most: int, enough: int) -> Float64:
+        """P-values (r,) of the voxels of these numbers."""
+        from semstab.statistics import kernels
+
+        p = np.zeros(len(which))
+        kernels.in_chunks(kernels.permute_voxels, which, *self._shared(), by_drift, most, enough, self.seen, p)
+        return p
+
+    def _shared(self) -> tuple[Any, ...]:
+        entries = self.log[0][self.first + self.T] - self.log[0][self.first]
+        return self.first, self.T, self.log, self.K, int(entries.max(initial=0)), *_drift_tables(self.T), self.seeds
+
+
+def _beta_tail(trend: Float64, variance: Float64, T: Int64) -> Float64:
+    """P-value (n,) of a trend R^2 whose mean is 1 / (T - 1), as if it had a beta distribution of that variance."""
+    from scipy.special import betaincc
+
+    mean = 1 / (T - 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = mean * (1 - mean) / variance - 1
+    p: Float64 = betaincc(mean * size, (1 - mean) * size, np.clip(trend - ROUNDING, 0.0, 1.0))
+    return np.where(size > 0, p, 1.0)
 
 
 def scene_drift(
@@ -152,17 +231,13 @@ def scene_drift(
     What neighbouring voxels have in common in a frame stays in common, so that the test holds its level however
     strongly voxels depend on each other. `drift` is what `voxel_drift` says of the same map.
     """
-    from semstab.statistics import kernels
-
     vary, first, T = _varying(table, events)
-    frames, rank = np.unique(events.frame, return_inverse=True)
-    as_seen = np.tile(np.arange(len(frames)), (frame_orders, 1))
-    orders = np.random.default_rng(seed).permuted(as_seen, axis=1)
-    sums = np.zeros((kernels.CHUNKS, frame_orders, 2))
-    kernels.in_chunks(kernels.permute_frames, first, T, events.evidence, rank, orders, *_drift_tables(T), sums)
-    drifted, trended = sums.sum(axis=0).T
+    chosen = _some_observations(T, _streams(table.rows(vary).index, seed), SCENE_SAMPLE)
+    drifted, trended = _frame_orders(events, table.K, first[chosen], T[chosen], seed, frame_orders)
+    tested = np.flatnonzero(vary)[chosen]
     moved = drift.trend * variation(table)
-    p_value = min(1.0, 2 * min(_tail(-drifted, -_total(sbd(table)[vary])), _tail(drifted, _total(sbd(table)[vary]))))
+    total_drift = _total(sbd(table)[tested])
+    p_value = min(1.0, 2 * min(_tail(-drifted, -total_drift), _tail(drifted, total_drift)))
     trend = trend_columns(table, drift).sum(axis=0)
     return SceneDrift(
         sbd=mean(sbd(table)),
@@ -170,8 +245,35 @@ def scene_drift(
         p_value=p_value if vary.any() else math.nan,
         trend=trend[0] / trend[2] if trend[2] else math.nan,
         trend_null=trend[1] / trend[2] if trend[2] else math.nan,
-        trend_p=_tail(trended, _total(moved)) if trend[2] else math.nan,
+        trend_p=_tail(trended, _total(moved[tested])) if trend[2] else math.nan,
     )
+
+
+def _some_observations(T: Int64, streams: npt.NDArray[np.uint64], most: int) -> Int64:
+    """Numbers of voxels of OP T (n,), drawn at random, that have about `most` observations together; ascending."""
+    drawn = np.argsort(streams)
+    return np.sort(drawn[: np.searchsorted(np.cumsum(T[drawn]), most) + 1])
+
+
+def _frame_orders(
+    events: Events, K: int, first: Int64, T: Int64, seed: int, frame_orders: int
+) -> tuple[Float64, Float64]:
+    """Sums over voxels of their SBD and of their trends (R,), in random orders of the frames."""
+    from semstab.statistics import kernels
+
+    at = np.concatenate([[0], np.cumsum(T)])
+    rows = np.arange(at[-1]) + np.repeat(first - at[:-1], T)
+    frames, rank = np.unique(events.frame[rows], return_inverse=True)
+    as_seen = np.tile(np.arange(len(frames)), (frame_orders, 1))
+    orders = np.random.default_rng(seed).permuted(as_seen, axis=1)
+    voxels = np.arange(kernels.CHUNKS + 1) * len(T) // kernels.CHUNKS
+    edges = np.stack([voxels, at[voxels]], axis=1)
+    sums = np.zeros((kernels.CHUNKS, frame_orders, 2))
+    kernels.in_chunks(
+        kernels.permute_frames, edges, first, T, events.evidence.entries, K, rank, orders, *_drift_tables(T), sums
+    )
+    drifted, trended = sums.sum(axis=0).T
+    return drifted, trended
 
 
 def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
@@ -183,22 +285,26 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
 
 def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
-    label = events.evidence.argmax(axis=1)
-    starts = events.starts
-    op = np.diff(np.append(starts, len(events))).astype(np.float64)
-    if not len(events):
-        return Flips(op, op, op)
-    changed = np.diff(label, prepend=label[0]) != 0
-    changed[starts] = False
-    ends = np.append(starts[1:], len(events)) - 1
-    last = np.maximum.reduceat(np.where(changed, np.arange(len(events)), -1), starts)
-    since = (events.frame[ends] - events.frame[last]).astype(np.float64)
-    counts = np.zeros((len(starts), events.evidence.shape[1]))
-    np.add.at(counts, (events.voxel, label), 1.0)
+    from semstab.statistics import kernels, log_kernels
+
+    n, bounds = len(events.ix), np.append(events.starts, len(events))
+    changes, differing, since = np.zeros(n), np.zeros(n), np.full(n, np.nan)
+    kernels.in_chunks(
+        log_kernels.count_flips,
+        bounds,
+        events.frame,
+        events.evidence.entries,
+        events.evidence.K,
+        changes,
+        differing,
+        since,
+    )
+    op = np.diff(bounds).astype(np.float64)
+    again = op >= 2
     with np.errstate(invalid="ignore", divide="ignore"):
-        rate = np.where(op >= 2, np.add.reduceat(changed, starts, dtype=np.float64) / (op - 1), np.nan)
-        null = np.where(op >= 2, 1 - (counts * (counts - 1)).sum(axis=1) / (op * (op - 1)), np.nan)
-    return Flips(rate, null, np.where(last >= 0, since, np.nan))
+        rate = np.where(again, changes / (op - 1), np.nan)
+        null = np.where(again, differing / (op * (op - 1) / 2), np.nan)
+    return Flips(rate, null, since)
 
 
 def benjamini_hochberg(p: Float64) -> Float64:
@@ -218,7 +324,7 @@ def benjamini_hochberg(p: Float64) -> Float64:
 
 def variation(table: VoxelTable) -> Float64:
     """(n,) how far a voxel's observations are from their mean: sum over frames of ||s_t - mean||^2."""
-    squares: Float64 = table.self_sum - (table.evidence**2).sum(axis=1) / table.op
+    squares: Float64 = table.self_sum - table.evidence.rowwise(lambda e: (e**2).sum(axis=1)) / table.op
     return np.maximum(squares, 0.0)
 
 
@@ -233,7 +339,16 @@ def _drift_tables(T: Int64) -> tuple[Float64, Float64]:
     from semstab.statistics import kernels
 
     longest = int(T.max(initial=2))
-    return kernels.one_hot_drifts(min(longest, kernels.LONGEST_TABLE)), kernels.shrinking_drifts(longest)
+    return kernels.one_hot_drifts(min(longest, kernels.LONGEST_TABLE)), kernels.step_terms(longest)
+
+
+def _streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
+    """A random number (n,) of each voxel that depends on its index (n, 3) and the seed only."""
+    from semstab.statistics import kernels
+
+    streams = np.empty(len(index), np.uint64)
+    kernels.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), streams)
+    return streams
 
 
 def _log_factorials(count: int) -> Float64:

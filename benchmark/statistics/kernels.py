@@ -1,4 +1,4 @@
-"""Compiled loops over the observations of voxels: the orders in which they could have come, and rules to fuse them.
+"""Compiled loops over the observations of voxels, in the orders in which they could have come.
 
 Voxels go by chunks whose number does not depend on the number of threads, each voxel draws from a random stream of its
 own, and every sum runs in one fixed order: the same seed gives the same numbers for any number of threads.
@@ -12,7 +12,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared.beliefs import js_term
+from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import mix
 from semstab.runtime.compiled import serial
 
@@ -60,15 +60,6 @@ def one_hot_drifts(longest):
 
 
 @serial
-def shrinking_drifts(longest):
-    """Table (longest,) at [t] of what a class adds that had one of t observations and is not in the next one."""
-    drifts = np.zeros(longest)
-    for t in range(1, longest):
-        drifts[t] = js_term(1 / t, 1 / (t + 1))
-    return drifts
-
-
-@serial
 def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
     """The part of the expected sum of drifts that a class causes with n of T one-hot observations in random order.
 
@@ -91,75 +82,118 @@ def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
 
 
 @serial
-def _load(evidence, first, T, starts, column, share):
-    """Copy a voxel's T observations as entries that are not 0: the t-th has starts[t] to starts[t + 1].
+def step_terms(longest):
+    """Table (longest, 5) at [t] of 1 / t, log2 t, their mean with those of t + 1, and c log2 c of the mean c of 1 / t.
 
-    An entry has its class, numbered among the A that the voxel ever saw, and its share of the observation. Returns A,
-    the number of entries, and whether all observations are one-hot and few enough for the table of drifts.
+    Columns: 1 / t, 1 / (t + 1), (log2 t + log2(t + 1)) / 2, c = (1 / t + 1 / (t + 1)) / 2, c log2 c.
     """
-    K = evidence.shape[1]
-    number = np.full(K, -1)
-    A = entries = 0
-    for t in range(T):
-        starts[t] = entries
-        for k in range(K):
-            if evidence[first + t, k] > 0.0:
-                if number[k] < 0:
-                    number[k] = A
-                    A += 1
-                column[entries] = number[k]
-                share[entries] = evidence[first + t, k]
-                entries += 1
-    starts[T] = entries
-    return A, entries, entries == T and T <= LONGEST_TABLE
+    terms = np.zeros((longest, 5))
+    for t in range(1, longest):
+        terms[t, 0], terms[t, 1] = 1 / t, 1 / (t + 1)
+        terms[t, 2] = 0.5 * (np.log2(t) + np.log2(t + 1))
+        terms[t, 3] = 0.5 / t + 0.5 / (t + 1)
+        terms[t, 4] = plogp(terms[t, 3])
+    return terms
 
 
 @serial
-def _blend(column, share, first, last, t, weight, shrink, total, moment):
-    """Add entries first..last of a voxel's observation, the t-th, counted from 0; returns the drift it causes, bits.
+def load(log, first, T, number, starts, column, share):
+    """Copy a voxel's T observations: the t-th has entries starts[t] to starts[t + 1].
 
-    total and moment take, by class, the shares and `weight` times them. A class that is not in the new observation only
-    shrinks, by t / (t + 1): `shrink` is what that adds for each observation of it, so that only the classes of the new
-    observation have to be looked at.
+    log is (starts, label, weight) of all observations. An entry has its class, numbered among the A that the voxel ever
+    saw, and its share of the observation; number is work space (K,), all -1. Returns A, and whether all observations
+    are one-hot and few enough for the table of drifts.
     """
-    drift, others = 0.0, np.float64(t)
-    for entry in range(first, last):
-        a = column[entry]
-        before = total[a]
-        total[a] = before + share[entry]
-        moment[a] += weight * share[entry]
+    at, label, weight = log
+    A = 0
+    for t in range(T + 1):
+        starts[t] = at[first + t] - at[first]
+    for e in range(starts[T]):
+        k = label[at[first] + e]
+        if number[k] < 0:
+            number[k] = A
+            A += 1
+        column[e] = number[k]
+        share[e] = weight[at[first] + e]
+    for e in range(starts[T]):
+        number[label[at[first] + e]] = -1
+    return A, starts[T] == T and T <= LONGEST_TABLE
+
+
+@serial
+def blend(column, share, first, last, t, terms, total, plogs, spread):
+    """Add entries first..last of a voxel's observation, of which t came before; returns the drift it causes, bits.
+
+    The drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after. By class, total takes
+    the shares n and plogs n log2 n; spread is the sum of plogs, returned anew. Classes that are not in the new
+    observation have the share c n of m, so that only those that are have to be looked at.
+    """
+    inverse, next_inverse = terms[t, 0], terms[t, 1]
+    rest, rest_plogs, after, mixed = np.float64(t), spread, spread, 0.0
+    for e in range(first, last):
+        a = column[e]
+        n = total[a]
+        more = n + share[e]
+        total[a] = more
+        rest -= n
+        rest_plogs -= plogs[a]
+        after -= plogs[a]
+        plogs[a] = plogp(more)
+        after += plogs[a]
         if t > 0:
-            others -= before
-            drift += js_term(before / t, total[a] / (t + 1))
-    return drift + others * shrink
+            mixed += plogp(0.5 * (n * inverse + more * next_inverse))
+    if t == 0:
+        return 0.0, after
+    of_mean = mixed + terms[t, 3] * rest_plogs + rest * terms[t, 4]
+    return 0.5 * (spread * inverse + after * next_inverse) - terms[t, 2] - of_mean, after
 
 
 @serial
-def _measure(order, voxel, drifts, shrinks, work, out):
-    """The sum of drifts, bits, and the trend || sum_t (t - mean t) s_t ||^2 in that order; work space is (2, A)."""
+def _drift(order, voxel, drifts, terms, work):
+    """The sum of drifts, bits, in that order; work space is (2, A)."""
     starts, column, share, T, A, one_hot = voxel
-    total, moment = work
+    total, plogs = work[0], work[1]
     total[:A] = 0.0
-    moment[:A] = 0.0
-    middle = 0.5 * (T - 1)
-    drift = trend = 0.0
+    plogs[:A] = 0.0
+    drift = spread = 0.0
     if one_hot:
         for t in range(T):
             a = column[order[t]]
             drift += drifts[np.int64(total[a]), t]
             total[a] += 1.0
-            moment[a] += t - middle
     else:
         for t in range(T):
             first, last = starts[order[t]], starts[order[t] + 1]
-            drift += _blend(column, share, first, last, t, t - middle, shrinks[t], total, moment)
+            step, spread = blend(column, share, first, last, t, terms, total, plogs, spread)
+            drift += step
+    return drift
+
+
+@serial
+def _trend(order, voxel, moment):
+    """|| sum_t (t - mean t) s_t ||^2 in that order; work space is (A,)."""
+    starts, column, share, T, A, _ = voxel
+    moment[:A] = 0.0
+    for t in range(T):
+        for e in range(starts[order[t]], starts[order[t] + 1]):
+            moment[column[e]] += (t - 0.5 * (T - 1)) * share[e]
+    trend = 0.0
     for a in range(A):
         trend += moment[a] * moment[a]
-    out[0] = drift
-    out[1] = trend
+    return trend
 
 
 # --- Orders of one voxel ----------------------------------------------------------------------------------------------
+
+
+@serial
+def draw_streams(index, seed, streams):
+    """A random stream of each voxel (n,) from its index (n, 3) and the seed."""
+    for i in range(index.shape[0]):
+        state = seed
+        for axis in range(3):
+            state = mix(state ^ np.uint64(index[i, axis]))
+        streams[i] = state
 
 
 @serial
@@ -196,160 +230,231 @@ def _next_order(order, T):
 
 
 @serial
-def _try(order, voxel, drifts, shrinks, seen, work, hits):
-    """Count an order towards the tails: a drift as low, one as high, a trend as high as seen; returns its drift."""
-    out = work[2]
-    _measure(order, voxel, drifts, shrinks, work[:2], out)
-    hits[0] += 1 if out[0] <= seen[0] + ROUNDING else 0
-    hits[1] += 1 if out[0] >= seen[0] - ROUNDING else 0
-    hits[2] += 1 if out[1] >= seen[1] - ROUNDING * (1.0 + seen[1]) else 0
-    return out[0]
+def _try_all(order, voxel, terms, seen, work, p):
+    """The p-values over all T! orders of a drift as low, one as high, a trend as high; returns the mean drift.
 
-
-@serial
-def _try_all(order, voxel, drifts, shrinks, seen, work, hits, p):
-    """The p-values over all T! orders, exactly; returns the mean drift."""
+    A step's drift depends on which observations came before, not on their order: it is computed once for each set.
+    """
+    starts, column, share, T, A, _ = voxel
+    steps = np.zeros((1 << T, T))
+    for before in range(1, 1 << T):
+        work[0, :A] = 0.0
+        work[1, :A] = 0.0
+        spread, t = 0.0, 0
+        for j in range(T):
+            if before >> j & 1:
+                _, spread = blend(column, share, starts[j], starts[j + 1], t, terms, work[0], work[1], spread)
+                t += 1
+        for j in range(T):
+            if not before >> j & 1:
+                work[2, :A], work[3, :A] = work[0, :A], work[1, :A]
+                drift, _ = blend(column, share, starts[j], starts[j + 1], t, terms, work[2], work[3], spread)
+                steps[before, j] = drift
     total = 0.0
     tried = 0
+    p[:] = 0.0
     more = True
     while more:
-        total += _try(order, voxel, drifts, shrinks, seen, work, hits)
+        before, drift = 0, 0.0
+        for t in range(T):
+            drift += steps[before, order[t]]
+            before |= 1 << order[t]
+        total += drift
+        p[0] += 1 if drift <= seen[0] + ROUNDING else 0
+        p[1] += 1 if drift >= seen[0] - ROUNDING else 0
+        p[2] += 1 if _trend(order, voxel, work[0]) >= seen[1] - ROUNDING * (1.0 + seen[1]) else 0
         tried += 1
-        more = _next_order(order, voxel[3])
-    for tail in range(3):
-        p[tail] = hits[tail] / tried
+        more = _next_order(order, T)
+    p /= tried
     return total / tried
 
 
 @serial
-def _try_some(order, voxel, drifts, shrinks, seen, work, hits, p, state, least, most, enough):
-    """The p-values from random orders; returns the mean drift of the first `least` of them.
+def _trend_variance(voxel, scatter):
+    """The variance of the trend over all orders, exactly; scatter is work space (A, A), all 0, and is left so.
 
-    A tail that has met `enough` orders is settled: its p-value is their share of the orders tried until then. The
-    others take all `most` orders (Besag and Clifford 1991, Biometrika 78).
+    With x_i the observations less their mean, w_i = i - (T - 1) / 2 and G = (x_i . x_j), the trend is
+    sum_ij G_ij w_i w_j; its second moment sums E[w_i w_j w_k w_l] over the ways in which the four can coincide. Rows of
+    G and the w sum to 0, which leaves trace G, sum_i G_ii^2 and sum_ij G_ij^2 = ||scatter||^2.
     """
-    total = 0.0
-    tried = open_tails = 0
-    p[:] = 0.0
-    while tried < least or (tried < most and open_tails > 0):
-        _shuffle(order, voxel[3], state)
-        drift = _try(order, voxel, drifts, shrinks, seen, work, hits)
-        tried += 1
-        if tried <= least:
-            total += drift
-        open_tails = 0
-        for tail in range(3):
-            if hits[tail] == enough and p[tail] == 0.0:
-                p[tail] = enough / tried
-            open_tails += 1 if p[tail] == 0.0 else 0
-    for tail in range(3):
-        if p[tail] == 0.0:
-            p[tail] = (hits[tail] + 1) / (tried + 1)
-    return total / least
+    starts, column, share, T, A, _ = voxel
+    mean = np.zeros(A)
+    for e in range(starts[T]):
+        mean[column[e]] += share[e] / T
+    length = 0.0
+    for a in range(A):
+        length += mean[a] * mean[a]
+    D = D2 = F = 0.0
+    for t in range(T):
+        own = length
+        for e in range(starts[t], starts[t + 1]):
+            own += share[e] * (share[e] - 2.0 * mean[column[e]])
+            for other in range(starts[t], starts[t + 1]):
+                scatter[column[e], column[other]] += share[e] * share[other]
+        D += own
+        D2 += own * own
+    for a in range(A):
+        for b in range(A):
+            entry = scatter[a, b] - T * mean[a] * mean[b]
+            F += entry * entry
+            scatter[a, b] = 0.0
+    p2 = T * (T * T - 1.0) / 12
+    p4 = p2 * (3.0 * T * T - 7) / 20
+    pairs = T * (T - 1.0)
+    second = (p4 / T + 4 * p4 / pairs) * D2 + (p2 * p2 - p4) / pairs * (D * D + 2 * F - 3 * D2)
+    second += (2 * p4 - p2 * p2) / (pairs * (T - 2)) * (12 * D2 - 2 * D * D - 4 * F)
+    second += (3 * p2 * p2 - 6 * p4) / (pairs * (T - 2) * (T - 3)) * (D * D + 2 * F - 6 * D2)
+    return second - (p2 * D / (T - 1)) ** 2
 
 
 @serial
-def permute_voxels(chunk, first, T, evidence, drifts, shrinks, seeds, least, most, enough, seen, null, p):
-    """Compare each voxel's order of observations with all orders of them, or with random ones where T > ENUMERATED.
+def _room(T, entries, K):
+    """Work space for voxels of at most T observations and so many entries."""
+    work = np.empty((4, max(K, 2)))
+    return np.empty(T + 1, np.int64), np.empty(T, np.int64), np.empty(entries, np.int64), np.empty(entries), work
 
-    first, T (n,) are its rows of evidence (m, K), seeds (n,) its random stream. seen (n, 2) takes its sum of drifts and
-    its trend, null (n,) the mean sum of drifts over orders, p (n, 3) the p-values of `_try`'s tails.
+
+@serial
+def measure_voxels(chunk, first, T, log, K, entries, drifts, terms, seeds, draws, seen, null, p, variance):
+    """What each voxel's order gives, and what orders of its observations give on average.
+
+    first, T (n,) are its rows of the log, seeds (n,) its random stream, `entries` is the most that one has. seen (n, 2)
+    takes its sum of drifts and its trend, null (n,) the mean sum of drifts over orders: all where T <= ENUMERATED,
+    which also gives the p-values (n, 3), else `draws` random ones, none where the counts tell. variance (n,) takes that
+    of the trend over all orders, for T > ENUMERATED.
     """
-    K = evidence.shape[1]
-    longest = T.max() if T.shape[0] else 0
-    starts, order = np.empty(longest + 1, dtype=np.int64), np.empty(longest, dtype=np.int64)
-    column, share = np.empty(longest * K, dtype=np.int64), np.empty(longest * K)
-    work = np.empty((3, max(K, 2)))
-    hits, state = np.empty(3, dtype=np.int64), np.empty(1, dtype=np.uint64)
+    starts, order, column, share, work = _room(T.max() if T.shape[0] else 0, entries, K)
+    number, state, scatter = np.full(K, -1), np.empty(1, dtype=np.uint64), np.zeros((K, K))
     for i in range(chunk, T.shape[0], CHUNKS):
-        A, _, one_hot = _load(evidence, first[i], T[i], starts, column, share)
+        A, one_hot = load(log, first[i], T[i], number, starts, column, share)
         voxel = starts, column, share, T[i], A, one_hot
         for t in range(T[i]):
             order[t] = t
-        _measure(order, voxel, drifts, shrinks, work[:2], seen[i])
-        hits[:] = 0
+        seen[i, 0] = _drift(order, voxel, drifts, terms, work)
+        seen[i, 1] = _trend(order, voxel, work[0])
         if T[i] <= ENUMERATED:
-            null[i] = _try_all(order, voxel, drifts, shrinks, seen[i], work, hits, p[i])
-        else:
-            state[0] = seeds[i]
-            null[i] = _try_some(order, voxel, drifts, shrinks, seen[i], work, hits, p[i], state, least, most, enough)
+            null[i] = _try_all(order, voxel, terms, seen[i], work, p[i])
+            continue
+        variance[i] = _trend_variance(voxel, scatter)
+        state[0] = seeds[i]
+        for _ in range(0 if one_hot else draws):
+            _shuffle(order, T[i], state)
+            null[i] += _drift(order, voxel, drifts, terms, work) / draws
+
+
+@serial
+def permute_voxels(chunk, which, first, T, log, K, entries, drifts, terms, seeds, by_drift, most, enough, seen, p):
+    """P-values of some voxels from random orders of their observations: by the drift, in either tail, or by the trend.
+
+    which (r,) are their numbers in first, T, seeds, seen as in `measure_voxels`. A tail that has met `enough` orders as
+    extreme is settled: its p-value is their share of the orders tried until then; one that has not takes all `most`
+    orders (Besag and Clifford 1991, Biometrika 78). p (r,) takes the trend's, or twice the drift's smaller one.
+    """
+    starts, order, column, share, work = _room(T.max() if T.shape[0] else 0, entries, K)
+    number, state, hits, tail = np.full(K, -1), np.empty(1, dtype=np.uint64), np.empty(2, np.int64), np.empty(2)
+    for at in range(chunk, which.shape[0], CHUNKS):
+        i = which[at]
+        A, one_hot = load(log, first[i], T[i], number, starts, column, share)
+        voxel = starts, column, share, T[i], A, one_hot
+        for t in range(T[i]):
+            order[t] = t
+        state[0] = seeds[i]
+        target = seen[i, 0] if by_drift else seen[i, 1]
+        slack = ROUNDING if by_drift else ROUNDING * (1.0 + target)
+        hits[:] = 0
+        tail[:] = 0.0 if by_drift else 1.0
+        tail[1] = 0.0
+        tried = 0
+        while tried < most and tail.min() == 0.0:
+            _shuffle(order, T[i], state)
+            value = _drift(order, voxel, drifts, terms, work) if by_drift else _trend(order, voxel, work[0])
+            tried += 1
+            hits[0] += 1 if value <= target + slack else 0
+            hits[1] += 1 if value >= target - slack else 0
+            for side in range(2):
+                if hits[side] == enough and tail[side] == 0.0:
+                    tail[side] = enough / tried
+        for side in range(2):
+            if tail[side] == 0.0:
+                tail[side] = (hits[side] + 1) / (tried + 1)
+        p[at] = min(1.0, 2.0 * tail.min()) if by_drift else tail[1]
 
 
 # --- Orders of the frames ---------------------------------------------------------------------------------------------
 
 
 @serial
-def _gather(first, T, evidence, rank, frames):
-    """The observations of some voxels, numbered voxel by voxel, and which of them each frame made.
+def _gather(first, T, log, K, rank, groups):
+    """The observations of some voxels, numbered voxel by voxel, and which of them each group of frames made.
 
-    Returns starts, slot and share as `_load` does, slots being counted on from voxel to voxel; the voxel of each
-    observation; whether a voxel is one-hot; the bounds of its slots; bounds and numbers of each frame's observations.
+    Returns starts, slot and share as `load` does, slots being counted on from voxel to voxel; the voxel of each
+    observation; whether a voxel is one-hot; the bounds of its slots; bounds and numbers of each group's observations.
     """
-    K = evidence.shape[1]
-    observations = T.sum()
-    size = 0
+    observations, size = T.sum(), 0
     for i in range(T.shape[0]):
-        for row in range(first[i], first[i] + T[i]):
-            for k in range(K):
-                size += 1 if evidence[row, k] > 0.0 else 0
+        size += log[0][first[i] + T[i]] - log[0][first[i]]
+    number = np.full(K, -1)
     starts, slot, share = np.zeros(observations + 1, np.int64), np.empty(size, np.int64), np.empty(size)
     voxel, made = np.empty(observations, np.int64), np.empty(observations, np.int64)
     one_hot, slots = np.empty(T.shape[0], np.bool_), np.zeros(T.shape[0] + 1, np.int64)
-    bounds = np.zeros(frames + 1, np.int64)
+    bounds = np.zeros(groups + 1, np.int64)
     at = entries = 0
     for i in range(T.shape[0]):
-        A, added, one_hot[i] = _load(evidence, first[i], T[i], starts[at:], slot[entries:], share[entries:])
+        A, one_hot[i] = load(log, first[i], T[i], number, starts[at:], slot[entries:], share[entries:])
         slots[i + 1] = slots[i] + A
+        added = starts[at + T[i]]
         for entry in range(entries, entries + added):
             slot[entry] += slots[i]
         for t in range(T[i]):
             starts[at + t] += entries
             voxel[at + t] = i
-            bounds[rank[first[i] + t] + 1] += 1
+            bounds[rank[at + t] + 1] += 1
         at += T[i]
         entries += added
     starts[at] = entries
     bounds = np.cumsum(bounds)
     free = bounds.copy()
-    at = 0
-    for i in range(T.shape[0]):
-        for row in range(first[i], first[i] + T[i]):
-            made[free[rank[row]]] = at
-            free[rank[row]] += 1
-            at += 1
+    for at in range(observations):
+        made[free[rank[at]]] = at
+        free[rank[at]] += 1
     return starts, slot, share, voxel, one_hot, slots, bounds, made
 
 
 @serial
-def permute_frames(chunk, first, T, evidence, rank, orders, drifts, shrinks, sums):
-    """Statistics of the scene with its frames in other orders, the same for all voxels.
+def permute_frames(chunk, edges, first, T, log, K, rank, orders, drifts, terms, sums):
+    """Statistics of the scene with its groups of frames in other orders, the same for all voxels.
 
-    rank (m,) is the frame of each observation, orders (R, F) the frames in each order. sums (CHUNKS, R, 2) takes, over
-    voxels: the drift a step; the trend divided by sum_t (t - mean t)^2, over those with T > 2. The frames are gone
+    edges (CHUNKS + 1, 2) bounds each chunk's voxels and their observations; rank (m,) is the group of each observation
+    of the voxels, one voxel after the other, orders (R, G) the groups in each order. sums (CHUNKS, R, 2) takes, over
+    voxels: the drift a step; the trend divided by sum_t (t - mean t)^2, over those with T > 2. The groups are gone
     through in their order and tell all voxels what they saw, so that nothing has to be sorted.
     """
-    some = slice(chunk * T.shape[0] // CHUNKS, (chunk + 1) * T.shape[0] // CHUNKS)
-    first, T = first[some], T[some]
-    starts, slot, share, voxel, one_hot, slots, bounds, made = _gather(first, T, evidence, rank, orders.shape[1])
-    total, moment, seen = np.empty(slots[-1]), np.empty(slots[-1]), np.empty(T.shape[0], np.int64)
+    first, T = first[edges[chunk, 0] : edges[chunk + 1, 0]], T[edges[chunk, 0] : edges[chunk + 1, 0]]
+    rank = rank[edges[chunk, 1] : edges[chunk + 1, 1]]
+    starts, slot, share, voxel, one_hot, slots, bounds, made = _gather(first, T, log, K, rank, orders.shape[1])
+    total, plogs, moment = np.empty(slots[-1]), np.empty(slots[-1]), np.empty(slots[-1])
+    spread, seen = np.empty(T.shape[0]), np.empty(T.shape[0], np.int64)
     for r in range(orders.shape[0]):
         total[:] = 0.0
+        plogs[:] = 0.0
         moment[:] = 0.0
+        spread[:] = 0.0
         seen[:] = 0
         for place in range(orders.shape[1]):
-            frame = orders[r, place]
-            for j in range(bounds[frame], bounds[frame + 1]):
+            group = orders[r, place]
+            for j in range(bounds[group], bounds[group + 1]):
                 at = made[j]
                 i = voxel[at]
-                t, weight, first_entry = seen[i], seen[i] - 0.5 * (T[i] - 1), starts[at]
+                t, weight = seen[i], seen[i] - 0.5 * (T[i] - 1)
                 seen[i] = t + 1
+                for e in range(starts[at], starts[at + 1]):
+                    moment[slot[e]] += weight * share[e]
                 if one_hot[i]:
-                    a = slot[first_entry]
+                    a = slot[starts[at]]
                     drift = drifts[np.int64(total[a]), t]
                     total[a] += 1.0
-                    moment[a] += weight
                 else:
-                    drift = _blend(slot, share, first_entry, starts[at + 1], t, weight, shrinks[t], total, moment)
+                    drift, spread[i] = blend(slot, share, starts[at], starts[at + 1], t, terms, total, plogs, spread[i])
                 sums[chunk, r, 0] += drift / (T[i] - 1)
         for i in range(T.shape[0]):
             if T[i] > 2:
@@ -357,39 +462,3 @@ def permute_frames(chunk, first, T, evidence, rank, orders, drifts, shrinks, sum
                 for a in range(slots[i], slots[i + 1]):
                     trend += moment[a] * moment[a]
                 sums[chunk, r, 1] += trend / (T[i] * (T[i] * T[i] - 1) / 12)
-
-
-# --- Fusion rules -----------------------------------------------------------------------------------------------------
-
-
-@serial
-def fuse_by_rule(chunk, starts, evidence, pooled, mean, belief, drift_sum):
-    """Fuse each voxel's observations by adding them, or their logarithms where `pooled`; `mean` divides by how many.
-
-    starts (n + 1,) bounds its rows of evidence (m, K). belief (n, K) takes the belief after the last observation,
-    drift_sum (n,) the sum of the Jensen-Shannon divergences of successive beliefs, bits.
-    """
-    K = evidence.shape[1]
-    total, before, after = np.empty(K), np.empty(K), np.empty(K)
-    for i in range(chunk, belief.shape[0], CHUNKS):
-        total[:] = 0.0
-        drift = 0.0
-        for row in range(starts[i], starts[i + 1]):
-            count = row - starts[i] + 1
-            for k in range(K):
-                total[k] += np.log(evidence[row, k]) if pooled else evidence[row, k]
-            scale = 1.0 / count if mean or not pooled else 1.0
-            top = total.max() * scale
-            norm = 0.0
-            for k in range(K):
-                after[k] = np.exp(total[k] * scale - top) if pooled else total[k] * scale
-                norm += after[k]
-            step = 0.0
-            for k in range(K):
-                after[k] /= norm
-                if count > 1:
-                    step += js_term(before[k], after[k])
-                before[k] = after[k]
-            drift += min(max(step, 0.0), 1.0)
-        drift_sum[i] = drift
-        belief[i] = after

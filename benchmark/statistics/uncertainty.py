@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.information import entropy_bits, normalise
+from semstab.model.measures import entropy
 from semstab.model.voxels import VoxelTable
 
 Float64 = npt.NDArray[np.float64]
@@ -33,6 +33,6 @@ def decompose(table: VoxelTable) -> Uncertainty:
 
     Between-frame entropy is 0 at OP = 1 and grows with OP for the very same predictions: compare it within a stratum.
     """
-    total = entropy_bits(normalise(table.evidence)) / math.log2(table.K)
+    total = entropy(table)
     within = table.frame_entropy_sum / table.op / math.log2(table.K)
     return Uncertainty(np.minimum(within, total), np.maximum(total - within, 0.0), total)

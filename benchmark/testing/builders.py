@@ -150,5 +150,5 @@ def share_that_differs(a: VoxelTable, b: VoxelTable, tolerance: float) -> float:
 
 def _rows(table: VoxelTable) -> dict[Voxel, npt.NDArray[np.float64]]:
     measures = np.stack([vss(table), sbd(table), entropy(table)], axis=1)
-    columns = [measures, *(getattr(table, name).reshape(len(table), -1) for name in (*EXACT, *SUMS))]
+    columns = [measures, *(np.asarray(getattr(table, name)).reshape(len(table), -1) for name in (*EXACT, *SUMS))]
     return dict(zip(voxels(table), np.concatenate(columns, axis=1), strict=True))

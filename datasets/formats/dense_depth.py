@@ -49,7 +49,7 @@ def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -
     width, height, channels, kind = MVEI_HEADER.unpack_from(data, len(MVEI))
     if (channels, kind) != (1, MVEI_FLOAT):
         raise DataError(f"{path}: {channels} channels of type {kind}; a depth map has one of type {MVEI_FLOAT} (float)")
-    return _samples(path, data, start, (height, width), np.dtype("<f4")) / np.float32(scale or 1)
+    return _metres(path, data, start, (height, width), np.dtype("<f4"), 1 / (scale or 1))
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def dmap_header(path: Path, data: bytes) -> DmapHeader:
         raise DataError(f"{path}: the depth map is truncated after {len(data)} bytes; {AGAIN}") from error
     if not holds & 1:
         raise DataError(f"{path}: holds no depth; {AGAIN}")
-    start = at + 4 + 4 * views + DMAP_CAMERA  # beyond the file where that is damaged, which `_samples` says
+    start = at + 4 + 4 * views + DMAP_CAMERA  # beyond the file where that is damaged, which `_metres` says
     return DmapHeader(name, (height, width), SAMPLES[magic], exponent if new else 0, start)
 
 
@@ -91,12 +91,11 @@ def read_dmap(path: Path, scale: float | None = None, read: Read = read_bytes) -
     """Depth (H, W) of a .dmap along the optical axis, float32, 0 where there is none; raises as `read_mvei`."""
     data = read(path)
     header = dmap_header(path, data)
-    stored = _samples(path, data, header.start, header.shape, header.dtype)
-    return stored * np.float32(2.0**header.exponent / (scale or 1))
+    return _metres(path, data, header.start, header.shape, header.dtype, 2.0**header.exponent / (scale or 1))
 
 
-def _samples(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any]) -> Depth:
-    """Samples (H, W) as float32. Raises DataError where there are not as many."""
+def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any], unit: float) -> Depth:
+    """Samples (H, W) in a unit, as float32 metres. Raises DataError where there are not as many."""
     if not (min(shape) > 0 and math.prod(shape) <= MAX_PIXELS):
         raise DataError(f"{path}: claims {shape[1]}x{shape[0]} pixels; is it damaged?")
     end = start + math.prod(shape) * dtype.itemsize
@@ -104,4 +103,7 @@ def _samples(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype:
         raise DataError(
             f"{path}: truncated: {shape[1]}x{shape[0]} pixels need {end} bytes, it has {len(data)}; {AGAIN}"
         )
-    return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape).astype(np.float32)
+    stored = np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape)
+    with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
+        metres: Depth = np.multiply(stored, unit, dtype=np.float32, casting="same_kind")
+    return metres

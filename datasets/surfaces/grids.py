@@ -53,7 +53,7 @@ def read_heights(path: Path, cell: float | None, georeference: Georeference | No
         if place.b or place.d:
             raise DataError(f"{path}: the raster is rotated; bring it to north up (gdalwarp)")
         if georeference is not None and file.crs is not None:
-            _require_same_projection(path, file.crs.to_wkt(), georeference)
+            require_same_projection(path, file.crs.to_wkt(), georeference)
         factor = max(1.0, (cell or 0) / abs(place.a), math.sqrt(file.width * file.height / MOST_CELLS))
         rows, columns = (max(1, math.floor(side / factor)) for side in (file.height, file.width))
         z = file.read(1, out_shape=(rows, columns), masked=True, resampling=rasterio.enums.Resampling.average)
@@ -85,13 +85,13 @@ def heights_of_points(path: Path, points: Float64, cell: float | None) -> Height
     return Heights(z.reshape(rows, columns), low[0] + side / 2, low[1] + side / 2, side, side)
 
 
-def _require_same_projection(path: Path, crs: str, georeference: Georeference) -> None:
+def require_same_projection(path: Path, crs: str, georeference: Georeference) -> None:
+    """Raise ConfigError where a file's reference system is known to be another one than the scene's."""
     from pyproj import CRS
 
     theirs, ours = (CRS.from_user_input(text).to_2d() for text in (crs, georeference.crs))
     numbers = theirs.to_epsg(), ours.to_epsg()
     if None not in numbers and numbers[0] != numbers[1]:
         raise ConfigError(
-            f"{path}: lies in EPSG:{numbers[0]}, the scene in EPSG:{numbers[1]}; reproject it (gdalwarp -t_srs"
-            f" EPSG:{numbers[1]})"
+            f"{path}: lies in EPSG:{numbers[0]}, the scene in EPSG:{numbers[1]}; reproject it (gdalwarp or pdal)"
         )

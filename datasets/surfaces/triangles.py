@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.surfaces.grids import Heights, heights_of_points, read_heights
+from semstab.datasets.surfaces.grids import Heights, heights_of_points, read_heights, require_same_projection
 from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
 from semstab.model.georeference import INSTALL, Georeference
 
@@ -70,6 +70,8 @@ def _las(path: Path, cell: float | None, georeference: Georeference | None) -> T
 
     def chunks() -> Iterator[Float64]:
         with laspy.open(path) as file:
+            if georeference is not None and (crs := file.header.parse_crs()) is not None:
+                require_same_projection(path, crs.to_wkt(), georeference)
             for points in file.chunk_iterator(POINTS_AT_ONCE):
                 yield np.stack([points.x, points.y, points.z], axis=1) - offset
 

@@ -47,7 +47,7 @@ def golden(backend="numpy"):
         for name in ("seconds", "association_seconds", "update_seconds"):
             del report[name]
     table = fusion.table()
-    columns = {name: value for name, value in vars(table).items() if isinstance(value, np.ndarray)}
+    columns = {name: value for name, value in vars(table).items() if hasattr(value, "tolist")}
     columns |= {measure.key: measure.of(table) for measure in measures()}
     return {
         "voxels": {name: column.tolist() for name, column in columns.items()},

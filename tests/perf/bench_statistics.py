@@ -1,131 +1,128 @@
-"""Time of the statistics over a simulated log, beside plain NumPy on the same work.
+"""CPU time of the statistics beside that of the fusion whose log they read, and the memory that both take.
 
-    python tests/perf/bench_statistics.py [--json FILE] [--observations 2000000] [--classes 7] [--disagree 0.3]
+    python tests/perf/bench_statistics.py [--frames 200] [--size 640x480] [--voxel-size 0.05] [--classes 7] [--rooms 1]
 
-A floor of voxels is seen 6 times on average by 80 frames; on a share of the voxels frames err, some of them within the
-voxel. Where all frames agree no order matters, and the permutations pass by. NumPy is timed on one order or resample of
-the whole log, the compiled code on all that it makes; times are given for one of them, and the median of the rounds is
-taken. The code is compiled before.
+A camera walks round a furnished room and sees each place again and again (room.py); with --rooms it goes on to the next
+one. Time is user and system time of all threads; compiled code is loaded before. Memory is the most that the process
+took since the step before, above what it took with its modules loaded.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import threading
 from collections.abc import Callable
-from statistics import median
+from pathlib import Path
 from typing import Any
 
-import flight
-import numpy as np
+import room
 
 from semstab import statistics
+from semstab.backends import create
+from semstab.metrics import summarise
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.files import write_json
-from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
-from semstab.statistics.drift import FRAME_ORDERS, LEAST_DRAWS
 
-FRAMES, MEAN_OP = 80, 6
-BASELINE = "plain NumPy"
+PAGE = resource.getpagesize()
 
 
-def simulated(observations: int, K: int, disagree: float, seed: int = 0) -> Events:
-    """A log of about that many observations; errors are anew in each frame, one in ten within a voxel."""
-    rng = np.random.default_rng(seed)
-    n = max(observations // MEAN_OP, 4)
-    T = np.minimum(rng.geometric(1 / MEAN_OP, n), FRAMES)
-    voxel = np.repeat(np.arange(n), T)
-    age = np.arange(len(voxel)) - np.repeat(np.cumsum(T) - T, T)
-    noisy = (rng.random(n) < disagree)[voxel]
-    own = rng.integers(0, K, n)[voxel]
-    label = np.where(noisy & (rng.random(len(voxel)) < 0.3), rng.integers(0, K, len(voxel)), own)
-    evidence = np.eye(K)[label]
-    mixed = np.flatnonzero(noisy & (rng.random(len(voxel)) < 0.1))
-    evidence[mixed] = 0.75 * evidence[mixed] + 0.25 * np.eye(K)[rng.integers(0, K, len(mixed))]
-    side = int(np.ceil(np.sqrt(n)))
-    x, y = np.divmod(np.arange(n), side)
-    frame = rng.integers(0, FRAMES - T + 1)[voxel] + age
-    return Events(x, y, np.zeros(n), voxel, frame, evidence, np.ones(len(voxel)), 0.2)
+class Watch:
+    """CPU time of steps, and the most memory that each sees resident."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.peak: dict[str, int] = {}
+        self.before = resident()
+
+    def __call__(self, name: str, call: Callable[[], Any]) -> Any:
+        highest, over = resident(), threading.Event()
+
+        def look() -> None:
+            nonlocal highest
+            while not over.wait(0.005):
+                highest = max(highest, resident())
+
+        thread = threading.Thread(target=look)
+        thread.start()
+        started = cpu_seconds()
+        found = call()
+        self.seconds[name] = self.seconds.get(name, 0.0) + cpu_seconds() - started
+        over.set()
+        thread.join()
+        self.peak[name] = max(self.peak.get(name, 0), highest - self.before, resident() - self.before)
+        return found
 
 
-def numpy_order(events: Events, rng: np.random.Generator) -> float:
-    """Mean SBD with the observations of each voxel in one random order."""
-    order = np.lexsort([rng.random(len(events)), events.voxel])
-    shuffled = Events(
-        events.ix, events.iy, events.iz, events.voxel, events.frame, events.evidence[order], events.pixels, 0.2
-    )
-    return float(shuffled.drift().sum())
+def cpu_seconds() -> float:
+    """User and system time of this process."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
 
 
-def numpy_resample(table: VoxelTable, of_block: list[Any], rng: np.random.Generator) -> float:
-    """Krippendorff's alpha of one resample of the blocks, from the rows of its voxels."""
-    rows = np.concatenate([of_block[b] for b in rng.integers(len(of_block), size=len(of_block))])
-    return float(alpha_of(alpha_columns(table)[rows].sum(axis=0)))
+def resident() -> int:
+    """Bytes that this process has in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def measure(events: Events, rounds: int) -> list[dict[str, Any]]:
-    """Rows of the table."""
-    table = events.table()
-    rng = np.random.default_rng(0)
-    again = table.op >= 2
-    blocks = statistics.spatial_blocks(table.index, table.voxel_size)
-    of_block = [np.flatnonzero(blocks.of == b) for b in range(blocks.count)]
-    bootstrap = statistics.BlockBootstrap(blocks)
-    resamples = len(bootstrap.weights)
+def fused(watch: Watch, frames: int, size: tuple[int, int], voxel_size: float, K: int, rooms: int) -> Any:
+    """The map of the walk, with its history."""
+    fusion = create("numba", voxel_size=voxel_size, num_classes=K, history=True)
+    for index in range(frames):
+        frame = room.frame(index, *size, K=K, step=frames // rooms)
+        watch("fusion", lambda frame=frame: fusion.integrate(frame))
+    return fusion
+
+
+def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
+    """What of the statistics is timed by itself."""
     drift = statistics.voxel_drift(table, events)
-    noise = np.stack([np.where(again, drift.excess, 0.0), again], axis=1)
+    return {
+        "drift of each voxel": lambda: statistics.voxel_drift(table, events),
+        "drift of the scene": lambda: statistics.scene_drift(table, events, drift),
+        "fusion rules": lambda: [statistics.fuse(events, rule) for rule in statistics.RULES],
+        "flips": lambda: statistics.flips(events),
+        "agreement by class": lambda: statistics.class_agreement(table, events),
+    }
 
-    def fixed_orders() -> Any:
-        return statistics.voxel_drift(table, events, least=LEAST_DRAWS, most=LEAST_DRAWS, enough=10 * LEAST_DRAWS)
 
-    work: list[tuple[str, str, int, Callable[[], Any]]] = [
-        ("one order", BASELINE, 1, lambda: numpy_order(events, rng)),
-        ("one order", f"compiled, {LEAST_DRAWS} a voxel", LEAST_DRAWS, fixed_orders),
-        ("one order", f"compiled, {FRAME_ORDERS} of the frames", FRAME_ORDERS,
-         lambda: statistics.scene_drift(table, events, drift)),
-        ("one resample", BASELINE, 1, lambda: numpy_resample(table, of_block, rng)),
-        ("one resample", f"block bootstrap, {resamples}", resamples,
-         lambda: bootstrap.estimate(alpha_columns(table), alpha_of)),
-        ("all of it", "p-value of each voxel", 1, lambda: statistics.voxel_drift(table, events)),
-        ("all of it", "p-value of the scene", 1, lambda: statistics.scene_drift(table, events, drift)),
-        ("all of it", "exact null from counts", 1, lambda: statistics.expected_sbd(table)),
-        ("all of it", "interval of a mean", 1, lambda: bootstrap.estimate(noise, ratio_of)),
-        ("all of it", "describe", 1, lambda: statistics.describe(table, events, table)),
-    ]  # fmt: skip
-    times = {(what, name): [] for what, name, *_ in work}
-    for turn in range(rounds + 1):  # the first one compiles and warms up
-        for what, name, parts, call in work:
-            took = flight.milliseconds(call) / parts
-            if turn:
-                times[what, name].append(took)
-    return [
-        {
-            "work": what,
-            "name": name,
-            "ms": median(taken),
-            "ratio": median(taken) / median(times[what, BASELINE]) if (what, BASELINE) in times else None,
-        }
-        for (what, name), taken in times.items()
-    ]
+def measure(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Seconds and bytes of each step, with the number of voxels and observations."""
+    width, height = (int(side) for side in arguments.size.split("x"))
+    K, walk = arguments.classes, (arguments.voxel_size, arguments.classes, arguments.rooms)
+    warm = fused(Watch(), 8, (96, 72), 0.2, K, 1)
+    statistics.describe(warm.table(), warm.events(), warm.table())
+    watch = Watch()
+    fusion = fused(watch, arguments.frames, (width, height), *walk)
+    table = watch("table", fusion.table)
+    watch("summary", lambda: summarise(table))
+    events = watch("log", fusion.events)
+    watch("all statistics", lambda: statistics.describe(table, events, table))
+    for name, call in sections(table, events).items():
+        watch(f"  {name}", call)
+    counts = {"voxels": len(table), "observations": len(events), "frames": arguments.frames}
+    return {**counts, "K": K, "seconds": watch.seconds, "peak": watch.peak}
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="also write the figures there")
-    parser.add_argument("--observations", type=int, default=2_000_000)
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--size", default="640x480")
+    parser.add_argument("--voxel-size", type=float, default=0.05, help="metres")
     parser.add_argument("--classes", type=int, default=7)
-    parser.add_argument("--disagree", type=float, default=0.3, help="share of the voxels on which frames err")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rooms", type=int, default=1)
     arguments = parser.parse_args()
-    events = simulated(arguments.observations, arguments.classes, arguments.disagree)
-    rows = measure(events, arguments.rounds)
-    print(f"{len(events):,} observations of {len(events.ix):,} voxels, K = {arguments.classes}")
-    print(f"{'work':<14}{'implementation':<32}{'ms':>12}{'of NumPy':>12}")
-    for row in rows:
-        ratio = "" if row["ratio"] is None else f"1/{1 / row['ratio']:.0f}" if row["ratio"] < 0.1 else "1"
-        print(f"{row['work']:<14}{row['name']:<32}{row['ms']:12,.1f}{ratio:>12}")
+    found = measure(arguments)
+    n, m, fusion = found["voxels"], found["observations"], found["seconds"]["fusion"]
+    print(f"{found['frames']} frames, {m:,} observations of {n:,} voxels ({m / n:.1f} looks each), K = {found['K']}")
+    print(f"{'step':<24}{'CPU s':>9}{'us/observation':>16}{'of fusion':>11}{'peak bytes/voxel':>18}")
+    for name, seconds in found["seconds"].items():
+        row = f"{name:<24}{seconds:9.2f}{1e6 * seconds / m:16.3f}{seconds / fusion:11.2f}"
+        print(f"{row}{found['peak'][name] / n:18,.0f}")
     if arguments.json:
-        write_json(arguments.json, {"observations": len(events), "voxels": len(events.ix), "rows": rows})
+        write_json(arguments.json, found)
 
 
 if __name__ == "__main__":

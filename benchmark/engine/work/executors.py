@@ -15,9 +15,9 @@ from typing import Any, Protocol
 
 from semstab.engine.observer import Observers
 from semstab.engine.work.jobs import Job, Outcome, failed
-from semstab.engine.work.memory import available_bytes
 from semstab.engine.work.passes import run_job
 from semstab.errors import ConfigError, MissingDependencyError
+from semstab.runtime.memory import available_bytes
 from semstab.runtime.prefetch import default_threads
 from semstab.runtime.process import follow_parent, settle
 
@@ -112,7 +112,8 @@ class LocalProcesses:
     def _with_a_share(self, job: Job) -> Job:
         memory = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
         threads = job.threads or default_threads()
-        return dataclasses.replace(job, threads=max(1, threads // self.width), memory_bytes=memory / self.width)
+        threads = max(1, threads // self.width)
+        return dataclasses.replace(job, threads=threads, memory_bytes=memory / self.width, width=self.width)
 
 
 def _check_start(pool: cf.ProcessPoolExecutor) -> None:

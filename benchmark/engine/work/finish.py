@@ -25,7 +25,7 @@ from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, summarise
 from semstab.model.measures import dominant, measures
-from semstab.model.records import EVENTS, FRAMES, OVERVIEW, TRUTH, VOXELS, UnitContent
+from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
 from semstab.model.results import STAGES, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
@@ -122,7 +122,11 @@ def _savers(
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
         save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
     )
+    if found is not None:
+        savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found.sums.save
     savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
+    if one.sampler is not None:
+        savers[f"{LOOKS}/{unit.slug}.parquet"] = one.sampler.looks(table.classes).save
     events = one.backend.events() if config.events else None
     if events is not None:
         savers[f"{EVENTS}/{unit.slug}.parquet"] = dataclasses.replace(events, classes=table.classes).save
@@ -147,8 +151,8 @@ def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]
 
 def save_voxels(table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
-    own = {measure.key: measure.of(table) for measure in measures()}
-    table.save(path, {**own, "label": dominant(table), **(columns or {})})
+    own = {measure.key: measure.of for measure in measures()}
+    table.save(path, columns, {**own, "label": dominant})
 
 
 def _save_text(text: str, path: Path) -> None:

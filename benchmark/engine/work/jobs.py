@@ -52,6 +52,7 @@ class Job:
     threads       that decode frames ahead
     memory_bytes  that maps may take before some are put off to another pass over the frames; None: half of what is free
     observers     made where the job is done, and told of what is fused there
+    width         how many jobs share the machine's memory
     """
 
     scene: str
@@ -62,6 +63,7 @@ class Job:
     threads: int | None = None
     memory_bytes: float | None = None
     observers: tuple[Factory, ...] = ()
+    width: int = 1
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +12,7 @@ from semstab.backends import expected_bytes
 from semstab.config import Config
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
+from semstab.runtime.memory import available_bytes
 from semstab.task import Task, read
 
 if TYPE_CHECKING:
@@ -85,19 +85,6 @@ def _too_large(task: Task, config: Config, expected: Expected, free: int) -> str
         f" {config.voxel_size:g} m would take {expected.bytes / GB:.2g} GB, and {room}; use larger voxels (voxel_size),"
         f" fewer frames (frames), a larger pixel_stride{without}; or set memory_gb to try all the same"
     )
-
-
-def available_bytes() -> int:
-    """Memory that this process can still take: of the machine, and of its control group where that has a limit."""
-    import psutil
-
-    free = int(psutil.virtual_memory().available)
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
-    except OSError:
-        return free
-    return free if limit == "max" else min(free, int(limit) - int(used))
 
 
 def _pairs(indices: Sequence[int]) -> list[Sequence[int]]:

@@ -17,11 +17,13 @@ from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow
 from semstab.engine.work.finish import finish
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
-from semstab.engine.work.memory import available_bytes, require_memory
+from semstab.engine.work.memory import require_memory
 from semstab.engine.work.regions import measure_regions
+from semstab.engine.work.room import Room
 from semstab.engine.work.stream import Decoded, Prepared, Stream, UnitMap, streams_of
-from semstab.errors import DataError
+from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
+from semstab.runtime.memory import available_bytes, resident_bytes
 from semstab.runtime.prefetch import Fetched, prefetch
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Sampler
@@ -99,6 +101,7 @@ class Pass:
         self._watch = Stopwatch()
         self._streams = streams_of([one for request in requests for one in self._created(request)])
         self._memory_before = resident_bytes()
+        self._room = Room(requests[0].config.memory_gb, job.width)
         self._bound = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
 
     def run(self) -> list[Outcome]:
@@ -118,6 +121,9 @@ class Pass:
                     if stream.maps and index in stream.indices:
                         self._feed(stream, fetched)
                 self._make_room()
+                self._require_room()
+                if not any(stream.maps for stream in self._streams):
+                    break  # all of them failed
         for stream in self._streams:
             self._finish(stream)
         if self._outcomes:
@@ -155,6 +161,7 @@ class Pass:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
                     one.rows.append(self._told(one, now.frame, row))
+                    one.observations += row.report.voxels
             if watched:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
         lost = {outcome.identity for outcome in self._outcomes}
@@ -212,6 +219,17 @@ class Pass:
         for stream in self._streams:
             stream.maps = [one for one in stream.maps if one.request.identity not in off]
 
+    def _require_room(self) -> None:
+        """Fail the largest map where the memory left would not do for its end, before the system ends the process."""
+        maps = [one for stream in self._streams for one in stream.maps if one.rows]
+        largest = self._room.lacking(maps) if maps else None
+        if largest is None:
+            return
+        with self._failing([largest.request]):
+            raise ConfigError(self._room.text(largest))
+        for stream in self._streams:
+            stream.maps = [one for one in stream.maps if one is not largest]
+
     @contextlib.contextmanager
     def _failing(self, requests: Sequence[Request]) -> Iterator[None]:
         """What is raised in the block becomes the outcome of these units, but of those that failed before."""
@@ -259,10 +277,3 @@ def _ground_truth(scene: Scene, index: int) -> Frame | None:
         return scene.frame(index, GROUND_TRUTH, color=False)
     except DataError:
         return None
-
-
-def resident_bytes() -> int:
-    """Memory that this process takes."""
-    import psutil
-
-    return int(psutil.Process().memory_info().rss)

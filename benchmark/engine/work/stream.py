@@ -36,6 +36,7 @@ class UnitMap:
     sampler: Sampler | None = None
     truth_sampler: Sampler | None = None
     rows: list[FrameRow] = field(default_factory=list)
+    observations: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,7 @@ def declare(header: laspy.LasHeader, name: str, kind: npt.DTypeLike, about: str)
     """An extra dimension, where the header has none of that name."""
     las = library(Path(name))
     if name not in header.point_format.dimension_names:
-        header.add_extra_dims([las.ExtraBytesParams(name=name[:32], type=np.dtype(kind), description=about[:31])])
+        header.add_extra_dims([las.ExtraBytesParams(name=name, type=np.dtype(kind), description=about[:31])])
 
 
 def declare_column(header: laspy.LasHeader, name: str, column: Column) -> None:

@@ -79,7 +79,7 @@ def relabel(
     folder.save()
     report = Relabelled(
         task.scene.name, task.backbone, name, str(folder.path), len(task.indices), **tally.counts,
-        correctness=tally.correctness(),
+        leave_own_out=chosen.leave_own_out, correctness=tally.correctness(),
     )  # fmt: skip
     write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": dataclasses.asdict(chosen)})
     return report

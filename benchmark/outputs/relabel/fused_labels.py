@@ -14,6 +14,7 @@ from semstab.config import nearest
 from semstab.errors import ConfigError
 from semstab.metrics import CATEGORIES, categories
 from semstab.metrics.matching import rows_of
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.model.measures import dominant
@@ -96,11 +97,11 @@ class FusedLabels:
         own = observe(frame, self._table.voxel_size, self._table.K)
         centers = np.add(own.index, 0.5, dtype=np.float64) * self._table.voxel_size
         at = np.searchsorted(rows, self._lookup.rows(centers))
-        evidence, op, self_sum = seen.evidence.copy(), seen.op.copy(), seen.self_sum.copy()
+        evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
         evidence[at] = np.abs(np.round(evidence[at] - own.s_bar, DECIMALS))
         op[at] -= 1
         self_sum[at] -= (own.s_bar**2).sum(axis=1)
-        return dataclasses.replace(seen, evidence=evidence, op=op, self_sum=self_sum)
+        return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
 
 
 def labels_of(fused: Int64, ids: Sequence[int]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:

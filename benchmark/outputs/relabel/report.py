@@ -67,6 +67,7 @@ class Relabelled:
     filled: int
     unseen: int
     unstable: int
+    leave_own_out: bool = False
     correctness: Correctness | None = None
 
     def lines(self) -> Iterator[str]:
@@ -80,6 +81,8 @@ class Relabelled:
             (self.unstable, "dropped as unstable"),
         ]
         yield f"  of {self.pixels:,} pixels " + ", ".join(f"{n / self.pixels:.1%} {what}" for n, what in counts)
+        if not self.leave_own_out:
+            yield "  the stability of these maps says nothing: a voxel has one class in all of them"
         if self.correctness is not None:
             c = self.correctness
             yield (

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from semstab.model.comparison import BackboneComparison, MapCoverage
+from semstab.model.comparison import BackboneComparison, CommonLooks, MapCoverage
 from semstab.model.records import Result
 from semstab.outputs.tables.statistics import INTERVALS
 from semstab.outputs.tables.table import Column, Group, Row, Table
 from semstab.statistics.comparison import compared
 
-_COMMON = "On the voxels that every backbone saw twice or more."
+_COMMON = "On the voxels that every backbone saw twice or more, and on looks (a place in a frame) that all labelled."
 
 
 def comparison(result: Result) -> list[Table]:
     """Paired differences, ranking, and what each map covers; one group a scene."""
-    return [_differences(result), _ranking(result), _coverage(result)] if result.comparisons else []
+    found = [_differences(result), _ranking(result), _coverage(result)] if result.comparisons else []
+    return [*found, _ignored(result)] if any(each.looks for each in result.comparisons) else found
 
 
 def _differences(result: Result) -> Table:
@@ -23,10 +24,11 @@ def _differences(result: Result) -> Table:
         Column("measure", "Measure"),
         Column("difference", "Difference", 4, signed=True),
         Column("p_holm", "p (Holm)", 4),
+        Column("answers", "p answers"),
     )
     caption = (
-        f"{_COMMON} p: of a paired test that flips the sign of a block's difference, corrected for the number of pairs."
-        f" {INTERVALS}"
+        f"{_COMMON} Only the first measure is tested, its p corrected for the number of pairs by Holm's method; the"
+        f" others describe. {INTERVALS}"
     )
     groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
@@ -34,7 +36,10 @@ def _differences(result: Result) -> Table:
 
 def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
-    return tuple((row.a, row.b, words[row.measure], row.difference, row.p_holm) for row in found.paired.differences)
+    rows = sorted(found.paired.differences, key=lambda row: row.measure != found.paired.primary)
+    return tuple(
+        (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.question) for row in rows
+    )
 
 
 def _ranking(result: Result) -> Table:
@@ -44,11 +49,11 @@ def _ranking(result: Result) -> Table:
         Column("backbone", "Backbone"),
         Column("range", "95% of resamples"),
         Column("best_percent", "first in (%)", 0),
-        Column("value", "Same places", 4),
+        Column("value", "Same looks", 4),
         Column("standardised", "Same OP", 4),
     )
     caption = (
-        f"Same places: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
+        f"Same looks: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
         f" strata of OP weighted by those of all maps together. {INTERVALS}"
     )
     groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
@@ -69,6 +74,31 @@ def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
         )
         for ranking in found.paired.rankings
         for rank in ranking.ranks
+    )
+
+
+def _ignored(result: Result) -> Table:
+    columns = (
+        Column("backbone", "Backbone"),
+        Column("missing_percent", "left out (%)", 1),
+        Column("psa_low", "at least", 3, over="PSA with these"),
+        Column("psa_high", "at most", 3, over="PSA with these"),
+        Column("alpha_ignored", "Alpha, leaving out as a class", 3),
+        Column("order", "Order depends on it"),
+    )
+    caption = (
+        "Of the looks that any backbone labelled, what each left out, in pixels; PSA had these agreed never, or always"
+        " (Manski); alpha between frames where to leave a place out is a class of its own. The order depends on it"
+        " where that alpha, or PSA within its bounds, would order the backbones otherwise."
+    )
+    groups = tuple(Group(found.scene, _ignored_rows(found.looks)) for found in result.comparisons if found.looks)
+    return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
+
+
+def _ignored_rows(found: CommonLooks) -> tuple[Row, ...]:
+    depends = "yes" if found.depends else "no"
+    return tuple(
+        (row.backbone, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored
     )
 
 

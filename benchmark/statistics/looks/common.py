@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from semstab.errors import DataError
 from semstab.metrics.matching import voxel_keys
+from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 from semstab.statistics.looks.entries import Looks, View
 
@@ -90,7 +91,8 @@ def _filled(looks: Looks, places: Looks, ignored: Float64) -> Looks:
 
 def decided(log: Events) -> Events:
     """Each look reduced to its largest class, the lowest on ties: what labels and scores have in common."""
-    one_hot = np.eye(log.K)[log.evidence.argmax(axis=1)]
+    label = log.evidence.rowwise(lambda s: s.round(9).argmax(axis=1))  # sums in another order are equal still
+    one_hot = Evidence(np.arange(len(log) + 1), label.astype(np.uint16), np.ones(len(log)), log.K)
     return dataclasses.replace(log, evidence=one_hot)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import shared_observations
+from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNDEFINED, Correlogram, Estimate, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
@@ -92,7 +93,7 @@ def _pairs(sample: Sample, seen: Events, limit: Events, index: npt.NDArray[np.in
         lag *= 2
 
 
-def _sums(evidence: Float64, first: Int64, second: Int64) -> Float64:
+def _sums(evidence: Evidence, first: Int64, second: Int64) -> Float64:
     """(m, 3 + K) of pairs of observations: s . s', how many, ||s||^2 and s, summed over both."""
     a, b = evidence[first], evidence[second]
     own = (a**2).sum(axis=1) + (b**2).sum(axis=1)

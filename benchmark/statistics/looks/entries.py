@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.metrics.matching import voxel_keys
+from semstab.metrics.matching import shared_observations, voxel_keys
+from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
 from semstab.runtime.files import atomic_path
 
@@ -57,6 +58,11 @@ class Sample:
     views: tuple[View, ...]
     soft: bool
     by: str = OWN
+
+    def shared(self) -> tuple[Events, Events]:
+        """The observations that both logs have."""
+        seen, limit = shared_observations(self.seen, self.limit)
+        return seen, limit
 
     def against(self, truth: Sample) -> Sample:
         """The same with the ground truth's labels as the limit, of a sample of the same frames."""
@@ -111,14 +117,17 @@ class Looks:
         voxel = places_of(index)
         look, total = _looked(voxel, self.view, self.weight)
         first = np.unique(look, return_index=True)[1]
-        sums = np.bincount(look * self.K + self.label, weights=self.weight, minlength=len(total) * self.K)
+        pairs, pair = np.unique(look * self.K + self.label, return_inverse=True)
+        of, label = np.divmod(pairs, self.K)
+        share = np.bincount(pair, weights=self.weight) / total[of]
+        starts = np.searchsorted(of, np.arange(len(total) + 1))
         frames = np.array([view.frame for view in self.views], dtype=np.int32)
         distinct = np.unique(voxel, return_index=True)[1]
         return Events(
             **index_columns(index[distinct]),
             voxel=voxel[first],
             frame=frames[self.view[first]],
-            evidence=sums.reshape(len(total), self.K) / total[:, None],
+            evidence=Evidence(starts, label.astype(np.uint16), share, self.K),
             pixels=np.rint(total).astype(np.int64),
             voxel_size=self.voxel_size,
             classes=self.classes,

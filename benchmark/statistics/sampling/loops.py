@@ -15,23 +15,40 @@ from semstab.statistics.kernels import CHUNKS
 
 
 @serial
-def _classes_of(evidence, first, T, total, squares, own, active):
-    """Sums over a voxel's observations, by class, and of each one's square; returns how many classes it ever saw."""
-    K = evidence.shape[1]
+def _classes_of(log, first, T, rows, total, squares, own, active):
+    """A voxel's observations as dense rows (T, K), which are 0 before, their sums by class and those of squares.
+
+    log is (starts, label, weight) of all observations. Returns how many classes the voxel ever saw: those in `active`,
+    ascending; total and squares are of these only.
+    """
+    at, label, weight = log
     A = 0
-    for k in range(K):
-        total[k] = squares[k] = 0.0
-        for t in range(T):
-            total[k] += evidence[first + t, k]
-            squares[k] += evidence[first + t, k] ** 2
-        if total[k] > 0.0:
-            active[A] = k
-            A += 1
     for t in range(T):
         own[t] = 0.0
-        for j in range(A):
-            own[t] += evidence[first + t, active[j]] ** 2
+        for e in range(at[first + t], at[first + t + 1]):
+            k = np.int64(label[e])
+            rows[t, k] = weight[e]
+            own[t] += weight[e] ** 2
+            j = A - 1
+            while j >= 0 and active[j] > k:
+                j -= 1
+            if j < 0 or active[j] != k:
+                for later in range(A, j + 1, -1):
+                    active[later] = active[later - 1]
+                active[j + 1] = k
+                total[k] = squares[k] = 0.0
+                A += 1
+            total[k] += weight[e]
+            squares[k] += weight[e] ** 2
     return A
+
+
+@serial
+def _cleared(log, first, T, rows):
+    """Leave 0 where a voxel's observations were."""
+    for t in range(T):
+        for e in range(log[0][first + t], log[0][first + t + 1]):
+            rows[t, log[1][e]] = 0.0
 
 
 @serial
@@ -56,12 +73,12 @@ def _label_without(total, row, active, A):
 
 
 @serial
-def _add_truth(out, evidence, first, T, group, truth, stable, counts_stable, total, active, A, without, column, K):
+def _add_truth(out, rows, first, T, group, truth, stable, counts_stable, total, active, A, without, column, K):
     """What is right: of the fused label by leaving a frame out, of each look by itself."""
     right = 1.0 if _label(total, active, A) == truth else 0.0
     mean = 0.0
     for t in range(T):
-        without[t] = 1.0 if _label_without(total, evidence[first + t], active, A) == truth else 0.0
+        without[t] = 1.0 if _label_without(total, rows[t], active, A) == truth else 0.0
         mean += without[t] / T
     for t in range(T):
         sums = out[group[first + t]]
@@ -69,7 +86,7 @@ def _add_truth(out, evidence, first, T, group, truth, stable, counts_stable, tot
         sums[column + KNOWN] += 1.0 / T
         sums[column + RIGHT] += own
         sums[column + LOOKS] += 1.0
-        sums[column + LOOKS_RIGHT] += evidence[first + t, truth]
+        sums[column + LOOKS_RIGHT] += rows[t, truth]
         if counts_stable and stable:
             sums[column + STABLE] += 1.0 / T
             sums[column + STABLE_WRONG] += (1.0 - right) / T
@@ -79,17 +96,17 @@ def _add_truth(out, evidence, first, T, group, truth, stable, counts_stable, tot
 
 
 @serial
-def add_influences(chunk, order, bounds, starts, op, evidence, group, truth, stable, by_class, with_truth, sums):
+def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, stable, by_class, with_truth, sums):
     """Add the observations of the voxels with T >= 2 to `sums` (cells, groups, C).
 
     order (n,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts, op (n,) are a voxel's rows
-    of evidence (m, K) and group (m,), truth (n,) its true class or -1, stable the PSA from which a place is. A place's
+    of the log and of group (m,), truth (n,) its true class or -1, stable the PSA from which a place is. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
     against, and the shares add up to T P.
     """
-    K = evidence.shape[1]
     longest = op.max() if op.shape[0] else 0
+    rows = np.zeros((longest, K))
     total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
     own, without = np.empty(longest), np.empty(longest)
     scale = 1.0 / np.log(K)
@@ -100,7 +117,7 @@ def add_influences(chunk, order, bounds, starts, op, evidence, group, truth, sta
             first, T = starts[i], op[i]
             if T < 2:
                 continue
-            A = _classes_of(evidence, first, T, total, squares, own, active)
+            A = _classes_of(log, first, T, rows, total, squares, own, active)
             best = _label(total, active, A)
             agreed = 0.0
             for j in range(A):
@@ -108,7 +125,7 @@ def add_influences(chunk, order, bounds, starts, op, evidence, group, truth, sta
             agreed /= T * (T - 1.0)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             for t in range(T):
-                s, add = evidence[first + t], out[group[first + t]]
+                s, add = rows[t], out[group[first + t]]
                 with_others = surprise = 0.0
                 for j in range(A):
                     k = active[j]
@@ -139,6 +156,7 @@ def add_influences(chunk, order, bounds, starts, op, evidence, group, truth, sta
                         add[ENTROPY + 1 + 2 * K + k] += s[k] ** 2
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    out, evidence, first, T, group, truth[i], agreed >= stable, T > 2, total, active, A, without,
+                    out, rows, first, T, group, truth[i], agreed >= stable, T > 2, total, active, A, without,
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
+            _cleared(log, first, T, rows)

@@ -5,8 +5,7 @@ Sources: opendronemap.org (docs, Outputs); opensfm.org; the folders of real proj
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -17,28 +16,25 @@ from semstab.datasets.files.label_source import ScenePlace
 from semstab.datasets.files.options import DepthKind, FileOptions, PoseConvention, UpAxis
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.files.templates import Folders, Template, inside
-from semstab.datasets.formats.dense_depth import HEADER_BYTES, dmap_header
+from semstab.datasets.files.templates import Template
 from semstab.datasets.formats.disk import natural, subfolders
-from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from semstab.datasets.formats.odm_georeference import GEOREFERENCING, georeference_of
-from semstab.datasets.formats.opensfm import Shot, read_reconstruction
+from semstab.datasets.odm.georeference import GEOREFERENCING, georeference_of
+from semstab.datasets.odm.project import (
+    DISTORTED,
+    LOOK_FOR,
+    PLACES,
+    UNDISTORTED,
+    Images,
+    Kind,
+    Project,
+    depth_files,
+    find_project,
+    frame_names,
+    written_names,
+)
+from semstab.datasets.odm.reconstruction import Shot, read_reconstruction
 from semstab.errors import DataError
 from semstab.model.georeference import Georeference
-from semstab.runtime.files import open_file
-
-UNDISTORTED = "undistorted/reconstruction.json"
-DISTORTED = "reconstruction.json"
-
-MESHES = (
-    "odm_meshing/odm_mesh.ply", "odm_meshing/odm_25dmesh.ply", "odm_texturing*/odm_textured_model_geo.obj",
-    "odm_texturing*/*_geo.obj",
-)  # fmt: skip
-DSM = "odm_dem/dsm.tif"
-MVE = "mve/views/view_{:04d}.mve/depth-L0.mvei"
-DMAPS = "openmvs/depthmaps"
-
-Kind = Literal["mesh", "dsm", "mve", "openmvs", "files"]
 
 
 class OdmOptions(FileOptions):
@@ -62,29 +58,6 @@ class OdmOptions(FileOptions):
     depth_kind: DepthKind = None
     pose_convention: PoseConvention = "world_to_camera"
     up_axis: UpAxis = "z"
-
-
-@dataclass(frozen=True)
-class Project:
-    """The parts of a project: its folder, that of OpenSfM in it, and the file of its poses."""
-
-    folder: Path
-    opensfm: Path
-    poses: Path
-
-    @property
-    def undistorted(self) -> bool:
-        """Whether the poses are of undistorted images."""
-        return self.poses == self.opensfm / UNDISTORTED
-
-
-def find_project(folder: Path) -> Project | None:
-    """The project in a folder, of OpenDroneMap or of OpenSfM; None where nothing is reconstructed."""
-    for opensfm in (folder / "opensfm", folder):
-        for poses in (opensfm / UNDISTORTED, opensfm / DISTORTED):
-            if poses.is_file():
-                return Project(folder, opensfm, poses)
-    return None
 
 
 class Odm(FileDataset[OdmOptions]):
@@ -127,7 +100,7 @@ class Odm(FileDataset[OdmOptions]):
         project = self._project(folder)
         kinds = [options.depth_from] if options.depth_from else list(LOOK_FOR)
         for kind in kinds:
-            if (found := LOOK_FOR[kind](project, options)) is not None:
+            if (found := LOOK_FOR[kind](project, options.depth)) is not None:
                 surface = found if kind in ("mesh", "dsm") else None
                 along = options.depth_kind or ("ray" if kind == "mve" else "planar")
                 return options.model_copy(update={"surface": surface, "depth_from": kind, "depth_kind": along})
@@ -156,9 +129,12 @@ class Odm(FileDataset[OdmOptions]):
         project = self._project(folder)
         shots = self._shots(project.poses)
         names = frame_names(shot.name for shot in shots)
-        depth = self._depth_files(project, shots, names)
+        kind = self.settled(folder).depth_from
+        depth = depth_files(
+            project, kind, {shot.name: name for shot, name in zip(shots, names, strict=True)}, self._depth
+        )
         originals = self._originals(project)
-        look = _Images(self.options, project)
+        look = Images(project, self.options.images)
         frames = [
             self._frame(project, look, shot, name, depth[shot.name], originals.get(name))
             for shot, name in zip(shots, names, strict=True)
@@ -166,7 +142,7 @@ class Odm(FileDataset[OdmOptions]):
         return sorted(frames, key=lambda frame: natural(frame.name))
 
     def _frame(
-        self, project: Project, look: _Images, shot: Shot, name: str, depth: Path, original: Shot | None
+        self, project: Project, look: Images, shot: Shot, name: str, depth: Path, original: Shot | None
     ) -> FrameSource:
         color, photograph = look.color(shot.name), look.photograph(shot.name)
         wanted = self.options.labels_on or ("undistorted" if project.undistorted else "original")
@@ -199,19 +175,6 @@ class Odm(FileDataset[OdmOptions]):
         shots = self._shots(path)
         return dict(zip(frame_names(shot.name for shot in shots), shots, strict=True))
 
-    def _depth_files(self, project: Project, shots: list[Shot], names: list[str]) -> dict[str, Path]:
-        """The depth map that each shot has, or would have, by the shot's name."""
-        kind = self.settled(project.folder).depth_from
-        if kind == "mve":
-            return {shot.name: project.folder / MVE.format(k) for k, shot in enumerate(shots)}
-        if kind == "openmvs":
-            maps = _dmaps(project)
-            nothing = project.opensfm / "undistorted" / DMAPS
-            return {s.name: maps.get(name, nothing / f"{name}.dmap") for s, name in zip(shots, names, strict=True)}
-        folders = Folders()
-        wanted = {s.name: project.folder / self._depth.filled(name=name) for s, name in zip(shots, names, strict=True)}
-        return {name: folders.one_of(path, DEPTH_SUFFIXES) or path for name, path in wanted.items()}
-
     def _shots(self, path: Path) -> list[Shot]:
         if path not in self._read:
             self._read[path] = read_reconstruction(path, self.options.reconstruction)
@@ -221,109 +184,3 @@ class Odm(FileDataset[OdmOptions]):
         project = find_project(folder)
         assert project is not None
         return project
-
-
-class _Images:
-    """The files of a project's images, by the names that ODM and OpenSfM give them."""
-
-    def __init__(self, options: OdmOptions, project: Project) -> None:
-        self._folders = Folders()
-        self._project = project
-        self._photographs = [project.folder / "images", project.opensfm / "images"]
-        own = [project.opensfm / "undistorted/images"] if project.undistorted else self._photographs
-        self._own = own if options.images is None else [options.images]
-
-    def color(self, shot: str) -> Path | None:
-        """The image that the shot's pose is of."""
-        return self._first(self._own, shot)
-
-    def photograph(self, shot: str) -> Path | None:
-        """The photograph that it was made of."""
-        return self._first(self._photographs, shot)
-
-    def _first(self, places: Iterable[Path], shot: str) -> Path | None:
-        for place in places:
-            for written in written_names(shot):
-                path = inside(place, place, written, str(self._project.poses))
-                if path.suffix.lower() in COLOR_SUFFIXES and self._folders.has(path):
-                    return path
-        return None
-
-
-PHOTO_SUFFIXES = (".JPG", ".jpg", ".JPEG", ".jpeg", ".png", ".PNG", ".tif", ".TIF", ".tiff", ".TIFF")
-ADDED_SUFFIXES = ("", ".tif", ".jpg", ".png")
-"""What ODM appends to the name of an undistorted image."""
-
-
-def bare_name(shot: str) -> str:
-    """A shot's name without the suffixes of images: DJI_0018 of DJI_0018.JPG.tif."""
-    while Path(shot).suffix and Path(shot).suffix in PHOTO_SUFFIXES:
-        shot = shot[: -len(Path(shot).suffix)]
-    return shot
-
-
-def written_names(shot: str) -> tuple[str, ...]:
-    """The names that files of a shot may have: its own, and without and with any suffixes."""
-    bare = bare_name(shot)
-    names = (f"{bare}{suffix}{added}" for suffix in PHOTO_SUFFIXES for added in ADDED_SUFFIXES)
-    return tuple(dict.fromkeys((shot, *(f"{shot}{added}" for added in ADDED_SUFFIXES), bare, *names)))
-
-
-def frame_names(shots: Iterable[str]) -> list[str]:
-    """The frames' names: the shots' without suffixes, or as they are where these would not differ."""
-    names = list(shots)
-    bare = [bare_name(name) for name in names]
-    return bare if len(set(bare)) == len(names) else names
-
-
-# --- depth ----------------------------------------------------------------------------------------------------------
-
-
-def _mesh(project: Project, _: OdmOptions) -> Path | None:
-    return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
-
-
-def _dsm(project: Project, _: OdmOptions) -> Path | None:
-    path = project.folder / DSM
-    return path if path.is_file() else None
-
-
-def _mve(project: Project, _: OdmOptions) -> Path | None:
-    return next(iter(sorted(project.folder.glob("mve/views/*/depth-L0.mvei"))), None)
-
-
-def _openmvs(project: Project, _: OdmOptions) -> Path | None:
-    return next(iter(_dmap_files(project)), None)
-
-
-def _files(project: Project, options: OdmOptions) -> Path | None:
-    folder = (project.folder / options.depth).parent
-    return folder if "{" not in str(folder) and folder.is_dir() else None
-
-
-LOOK_FOR: dict[Kind, Callable[[Project, OdmOptions], Path | None]] = {
-    "mesh": _mesh, "dsm": _dsm, "mve": _mve, "openmvs": _openmvs, "files": _files,
-}  # fmt: skip
-"""By source of depth what finds it, the one that is taken first in front."""
-
-PLACES: dict[Kind, str] = {
-    "mesh": "odm_meshing/odm_mesh.ply, odm_25dmesh.ply, odm_texturing*/*_geo.obj",
-    "dsm": DSM,
-    "mve": "mve/views/view_NNNN.mve/depth-L0.mvei",
-    "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
-    "files": "depth/NAME.png",
-}
-
-
-def _dmap_files(project: Project) -> list[Path]:
-    return sorted((project.opensfm / "undistorted" / DMAPS).glob("*.dmap"))
-
-
-def _dmaps(project: Project) -> dict[str, Path]:
-    """Depth maps of OpenMVS by the name of the frame that each says it is of."""
-    found = {}
-    for path in _dmap_files(project):
-        with open_file(path) as file:
-            image = dmap_header(path, file.read(HEADER_BYTES)).image
-        found[bare_name(Path(image.replace("\\", "/")).name)] = path
-    return found

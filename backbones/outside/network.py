@@ -1,0 +1,189 @@
+"""Backbone of a network in a file: `net.onnx`, TorchScript (`net.pt`) or an exported program (`net.pt2`)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import PIL.Image
+from pydantic import BaseModel, Field, PositiveInt
+
+from semstab.backbones import Backbone, Image, Prediction, narrowed
+from semstab.backbones.outside.class_list import class_names
+from semstab.backbones.outside.runtimes import FORMATS, Array, load_network
+from semstab.config import Settings
+from semstab.errors import ConfigError, DataError, one_line
+from semstab.model.labels import IGNORE_8BIT, LabelSpace
+
+Maps = npt.NDArray[np.float32]
+
+
+class NetworkOptions(Settings):
+    """How an image is given to the network, and what it gives back."""
+
+    classes: list[str] | str | None = Field(
+        None, description="names in the order of its output; or a file: a name a line, or a taxonomy's YAML"
+    )
+    size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = Field(
+        None, description="[height, width] that it sees, or one number for a square; the image's own where not given"
+    )
+    mean: tuple[float, ...] = Field((0.485, 0.456, 0.406), description="taken off each channel, of values 0 to 1")
+    std: tuple[float, ...] = Field((0.229, 0.224, 0.225), description="by which each channel is then divided")
+    scale: float = Field(255.0, gt=0, description="by which values 0 to 255 are divided before; 1 for mean and std so")
+    channels: Literal["rgb", "bgr"] = "rgb"
+    layout: Literal["nchw", "nhwc"] = Field("nchw", description="of its input and of its output")
+    output: int = Field(0, ge=0, description="which of its outputs, counted from 0")
+    gives: Literal["logits", "probabilities", "labels"] | None = Field(
+        None, description="what its output is; where not given labels of whole numbers, else logits"
+    )
+    device: str = Field("cpu", description="cpu, cuda, ...; ONNX files run on the cpu")
+    threads: int | None = Field(None, ge=1, description="threads on a CPU")
+
+
+class NetworkMaker:
+    """Makes backbones of one file; has `Options` and is called with them, like a backbone's class."""
+
+    Options: type[BaseModel] = NetworkOptions
+
+    def __init__(self, name: str) -> None:
+        self.path = Path(name).expanduser()
+
+    def __call__(self, options: NetworkOptions) -> Backbone:
+        """The backbone."""
+        return NetworkFile(self.path, options)
+
+
+class NetworkFile(Backbone):
+    """The class of the largest output, upsampled bilinearly to the image; images are resized by Pillow, bilinearly."""
+
+    gives_scores = True
+
+    def __init__(self, path: Path, options: NetworkOptions) -> None:
+        self._path, self._options = path, options
+        self._network = load_network(path, options.device, options.threads)
+        if options.classes is None:
+            raise ConfigError(f"{path}: its classes are not known; say --classes a,b,c or a file with a name a line")
+        names = class_names(options.classes)
+        self.label_space = names if isinstance(names, LabelSpace) else LabelSpace(path.stem, tuple(names))
+        self.gives_scores = options.gives != "labels"
+        for what in ("mean", "std"):
+            if len(getattr(options, what)) not in (1, 3) or (what == "std" and 0 in options.std):
+                raise ConfigError(f"{path}: {what}: give three numbers, or one; std above 0")
+        self._size = self._seen_size()
+        self._digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+
+    def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
+        """See `Backbone`. Raises DataError for an output that is none of these classes."""
+        return [self._prediction(image, scores) for image in images]
+
+    def identity(self) -> dict[str, Any]:
+        """The file's content and the settings."""
+        assert self.label_space is not None
+        settings = self._options.model_dump(mode="json", exclude={"classes", "threads"})
+        return {"file": self._digest, **settings, "classes": list(self.label_space.classes)}
+
+    def _seen_size(self) -> tuple[int, int] | None:
+        """(height, width) that it sees; None where that is each image's own."""
+        said, shape = self._options.size, self._network.shape
+        wanted = (said, said) if isinstance(said, int) else said
+        sides = shape[2:4] if self._options.layout == "nchw" else shape[1:3]
+        if len(sides) != 2 or sides[0] is None or sides[1] is None:
+            return wanted
+        own = (sides[0], sides[1])
+        if wanted not in (None, own):
+            raise ConfigError(f"{self._path}: sees images of {own[0]}x{own[1]} only; leave size out")
+        return own
+
+    def _prediction(self, image: Image, scores: bool) -> Prediction:
+        shape = (image.shape[0], image.shape[1])
+        output = self._run(self._pixels(image))
+        K = len(self.label_space or ())
+        gives = self._options.gives or ("labels" if output.dtype.kind in "iu" else "logits")
+        if gives == "labels":
+            if scores:
+                raise DataError(f"{self._path}: gives labels, no scores; leave scores out")
+            labels = self._map(output, ()).astype(np.int64)
+            wrong = ((labels < 0) | (labels >= K)) & (labels != IGNORE_8BIT)
+            if wrong.any():
+                raise DataError(f"{self._path}: gave the label {labels[wrong][0]}, but has {K} classes, 0 to {K - 1}")
+            small = np.ascontiguousarray(labels.astype(np.uint16))
+            full = cv2.resize(small, shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+            return Prediction(narrowed(np.asarray(full), K))
+        maps = np.asarray(self._map(output, (K,)), dtype=np.float32)
+        labels = largest(maps, shape)
+        if not scores:
+            return Prediction(narrowed(labels, K))
+        full = np.dstack([upsampled(each, shape) for each in maps]).reshape(*shape, K)
+        return Prediction(narrowed(labels, K), _softmax(full) if gives == "logits" else _shares(full))
+
+    def _pixels(self, image: Image) -> Array:
+        """(1, 3, h, w) or (1, h, w, 3) as the network takes it."""
+        size = self._size or image.shape[:2]
+        seen = image if image.shape[:2] == size else np.asarray(PIL.Image.fromarray(image).resize(size[::-1], 2))
+        seen = seen if self._options.channels == "rgb" else seen[..., ::-1]
+        if np.dtype(self._network.dtype) == np.uint8:
+            values: Array = seen
+        else:
+            mean, std = (np.array(each, np.float32) for each in (self._options.mean, self._options.std))
+            values = (seen.astype(np.float32) / np.float32(self._options.scale) - mean) / std
+        laid = values[None] if self._options.layout == "nhwc" else values.transpose(2, 0, 1)[None]
+        return np.ascontiguousarray(laid, dtype=self._network.dtype)
+
+    def _run(self, pixels: Array) -> Array:
+        try:
+            outputs = self._network(pixels)
+        except Exception as error:  # whatever the runtime has
+            raise DataError(
+                f"{self._path}: cannot see an image of shape {pixels.shape} ({one_line(error)}); mend size, layout"
+            ) from error
+        if self._options.output >= len(outputs):
+            raise ConfigError(f"{self._path}: output: has {len(outputs)} outputs, counted from 0")
+        return outputs[self._options.output]
+
+    def _map(self, output: Array, classes: tuple[int, ...]) -> Array:
+        """The output of one image as (K, h, w), of labels as (h, w). Raises DataError where it is none."""
+        found = output[0] if output.ndim > 2 and output.shape[0] == 1 else output
+        if not classes and found.ndim == 3 and 1 in (found.shape[0], found.shape[-1]):
+            found = found[0] if found.shape[0] == 1 else found[..., 0]
+        if classes and found.ndim == 3 and self._options.layout == "nhwc":
+            found = found.transpose(2, 0, 1)
+        if found.ndim != 2 + len(classes) or found.shape[: len(classes)] != classes:
+            what = f"{classes[0]} classes" if classes else "labels"
+            raise DataError(f"{self._path}: its output of shape {output.shape} holds no {what}; mend classes or output")
+        return found
+
+
+def is_network(name: str) -> bool:
+    """Whether a backbone's name is a network's file."""
+    return Path(name).suffix in FORMATS
+
+
+def upsampled(values: Maps, shape: tuple[int, int]) -> Maps:
+    """A map (h, w) at (H, W), bilinear, pixel areas aligned."""
+    return np.asarray(cv2.resize(np.ascontiguousarray(values), shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def largest(maps: Maps, shape: tuple[int, int]) -> npt.NDArray[np.int64]:
+    """(H, W) which of the maps (K, h, w), upsampled, is the largest, the lowest on ties; one at a time."""
+    best, label = upsampled(maps[0], shape), np.zeros(shape, dtype=np.int64)
+    for k in range(1, len(maps)):
+        value = upsampled(maps[k], shape)
+        label[value > best] = k
+        np.maximum(value, best, out=best)
+    return label
+
+
+def _softmax(values: Maps) -> Maps:
+    weight = np.exp(values - values.max(axis=2, keepdims=True))
+    return np.asarray(weight / weight.sum(axis=2, keepdims=True), np.float32)
+
+
+def _shares(values: Maps) -> Maps:
+    total = values.sum(axis=2, keepdims=True)
+    shares: Maps = np.divide(values, total, out=np.zeros_like(values), where=total > 0)
+    return shares

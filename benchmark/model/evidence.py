@@ -1,0 +1,154 @@
+"""Evidence of voxels or observations: rows of class weights, of which only what is not 0 is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+CHUNK_VALUES = 1 << 18
+"""Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
+
+
+def row_chunks(rows: int, K: int) -> Iterator[slice]:
+    """Slices of consecutive rows whose dense evidence has at most `CHUNK_VALUES` values; one at least, if empty."""
+    step = max(1, CHUNK_VALUES // max(K, 1))
+    return (slice(first, min(first + step, rows)) for first in range(0, max(rows, 1), step))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence(NDArrayOperatorsMixin):
+    """An array (n, K) by its entries that are not 0. Indexed by rows it gives dense rows; NumPy sees all of it dense.
+
+    starts  (n + 1,) int64 first entry of each row
+    label   (m,) uint16 the entry's class, ascending within a row
+    weight  (m,) float64
+    K       number of classes
+    """
+
+    starts: Int64
+    label: npt.NDArray[np.uint16]
+    weight: Float64
+    K: int
+
+    @classmethod
+    def of(cls, rows: npt.ArrayLike | Evidence) -> Evidence:
+        """Dense rows (n, K), or evidence as it is."""
+        if isinstance(rows, Evidence):
+            return rows
+        dense = np.asarray(rows, dtype=np.float64)
+        return cls.read(len(dense), dense.shape[1], lambda some: dense[some])
+
+    @classmethod
+    def read(cls, rows: int, K: int, dense: Callable[[slice], Float64]) -> Evidence:
+        """So many rows of what gives a slice of them, dense (r, K)."""
+        counts, labels, weights = [np.zeros(1, np.int64)], [], []
+        for some in row_chunks(rows, K):
+            part = dense(some)
+            row, label = np.nonzero(part)
+            counts.append(np.bincount(row, minlength=len(part)))
+            labels.append(label.astype(np.uint16))
+            weights.append(part[row, label].astype(np.float64))
+        return cls(np.cumsum(np.concatenate(counts)), np.concatenate(labels), np.concatenate(weights), K)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Evidence]) -> Evidence:
+        """The rows of one after the other."""
+        counts = np.concatenate([[0], *(np.diff(part.starts) for part in parts)])
+        label, weight = (np.concatenate([getattr(part, name) for part in parts]) for name in ("label", "weight"))
+        return cls(np.cumsum(counts), label, weight, parts[0].K)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n, K)."""
+        return len(self), self.K
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its entries."""
+        return self.starts.nbytes + self.label.nbytes + self.weight.nbytes
+
+    @property
+    def entries(self) -> tuple[Int64, npt.NDArray[np.uint16], Float64]:
+        """starts, label and weight, as compiled loops take them."""
+        return self.starts, self.label, self.weight
+
+    @property
+    def ndim(self) -> int:
+        """2."""
+        return 2
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    def __getitem__(self, rows: Any) -> Any:
+        if isinstance(rows, tuple):
+            return self[:][rows]
+        if isinstance(rows, slice) and rows.step in (None, 1):
+            return self._stretch(*rows.indices(len(self))[:2])
+        if np.ndim(rows) == 0 and not isinstance(rows, slice):
+            row = range(len(self))[rows]
+            return self._stretch(row, row + 1)[0]
+        return self.take(rows)._stretch()
+
+    def take(self, rows: Any) -> Evidence:
+        """The rows (r,) of these numbers, or for which a mask (n,) holds."""
+        chosen = np.arange(len(self))[rows]
+        first, count = self.starts[chosen], np.diff(self.starts)[chosen]
+        starts = np.concatenate([[0], np.cumsum(count)])
+        entry = np.arange(starts[-1]) + np.repeat(first - starts[:-1], count)
+        return Evidence(starts, self.label[entry], self.weight[entry], self.K)
+
+    def chunks(self) -> Iterator[slice]:
+        """Consecutive rows that together are small when dense."""
+        return row_chunks(len(self), self.K)
+
+    def rowwise(self, formula: Callable[[Float64], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """What a formula makes of dense rows (r, K), chunk by chunk: (n, ...)."""
+        return np.concatenate([formula(self[some]) for some in self.chunks()])
+
+    @property
+    def dtype(self) -> np.dtype[np.float64]:
+        """float64."""
+        return np.dtype(np.float64)
+
+    def sum(self, axis: int, *, keepdims: bool = False) -> Float64:
+        """Of each row (n,) for axis 1, of each class (K,) for axis 0."""
+        if axis == 0:
+            return np.bincount(self.label, weights=self.weight, minlength=self.K).astype(np.float64)
+        return self.rowwise(lambda rows: rows.sum(axis=1, keepdims=keepdims))
+
+    def max(self, axis: int) -> Float64:
+        """The largest of each row (n,)."""
+        return self.rowwise(lambda rows: rows.max(axis=axis))
+
+    def argmax(self, axis: int) -> Int64:
+        """The class of the largest of each row (n,), the lowest on ties."""
+        return self.rowwise(lambda rows: rows.argmax(axis=axis).astype(np.int64))
+
+    def tolist(self) -> list[list[float]]:
+        """All of it, dense."""
+        content: list[list[float]] = self[:].tolist()
+        return content
+
+    def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
+        """Dense rows from the first to before the last."""
+        starts = self.starts[first : (len(self) if last is None else max(first, last)) + 1]
+        dense = np.zeros((len(starts) - 1, self.K))
+        entries = slice(starts[0], starts[-1])
+        dense[np.repeat(np.arange(len(dense)), np.diff(starts)), self.label[entries]] = self.weight[entries]
+        return dense
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        return self._stretch().astype(dtype or np.float64, copy=False)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **settings: Any) -> Any:
+        dense = (np.asarray(value) if isinstance(value, Evidence) else value for value in inputs)
+        return getattr(ufunc, method)(*dense, **settings)
