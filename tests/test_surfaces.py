@@ -306,7 +306,8 @@ def test_without_the_extra_it_is_said_what_to_install(tmp_path, monkeypatch) -> 
 
 def test_without_a_size_it_is_said_what_to_set(flight, mesh, tmp_path) -> None:
     bare = shutil.copytree(flight, tmp_path / "field")
-    shutil.rmtree(bare / "color")
+    for folder in ("color", "depth"):
+        shutil.rmtree(bare / folder)
     options = {"root": bare, "surface": mesh, "casts": False}
     scene = open_dataset("posed_folder", options).scene("field")
     fails(DataError, "no colour image says the size of depth; set intrinsics_size", scene.depth, 0)
