@@ -25,7 +25,7 @@ from semstab.statistics.sampling.influence import (
 
 Float64 = npt.NDArray[np.float64]
 
-LEAST_FRAMES = 40
+LEAST_FRAMES = 60
 """Of fewer frames nothing is said about the next flight: bad ones may all have been missed, and a quality that lasts
 looks constant."""
 
