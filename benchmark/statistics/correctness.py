@@ -15,11 +15,11 @@ from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
 from semstab.model.measures import MeasureMeans, Quantity, dominant, measures, vss
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNDEFINED, Correctness, Estimate, Quadrants, Reliability, RuleMeans
+from semstab.model.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import BlockBootstrap
+from semstab.statistics.agreement import STABLE, psa, ratio_of
 from semstab.statistics.fusion_rules import Fused
+from semstab.statistics.sampling.places import Places
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -28,9 +28,6 @@ ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="tr
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
 ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
 BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
-
-STABLE = 0.8
-"""A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
 
 PURE = 0.5
 """A voxel has a true class where more than this share of its ground truth evidence is of one class."""
@@ -160,17 +157,17 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
     return tuple(_correctness(judged.rows(where), name) for name, where in rows)
 
 
-def quadrants(table: VoxelTable, truth: Truth, bootstrap: BlockBootstrap, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
-    `bootstrap` is over blocks of the table's voxels.
+    `places` are those of all of the table's voxels.
     """
     counted, steady, right = _masks(table, truth, stable)
     if not counted.any():
-        return Quadrants(0, *[UNDEFINED] * 5)
+        return Quadrants(0, *[UNKNOWN] * 5)
 
-    def share(where: Mask, of: Mask) -> Estimate:
-        return bootstrap.estimate(np.stack([where & of, of], axis=1).astype(np.float64), ratio_of, (0.0, 1.0))
+    def share(where: Mask, of: Mask) -> Interval:
+        return places.estimate(np.stack([where & of, of], axis=1).astype(np.float64), ratio_of)
 
     return Quadrants(
         voxels=int(counted.sum()),

@@ -20,7 +20,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.outputs.plots.topdown import EMPTY, Float64, FromAbove, Int64
 from semstab.statistics import decompose, psa
-from semstab.statistics.correctness import STABLE
+from semstab.statistics.agreement import STABLE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
