@@ -71,7 +71,7 @@ def test_a_description_holds_what_the_functions_say(described):
     found = summary.correctness.quadrants
     parts_of_all = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
     assert sum(share.value for share in parts_of_all) == pytest.approx(1)
-    assert summary.drift.tests.drifting_voxels == 0
+    assert summary.drift.tests.trending_voxels == 0
     assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 

@@ -197,7 +197,9 @@ class Reach:
 class DriftTests:
     """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
 
-    trend_excess  the trend less that in random order
+    sbd_p, trend_p   whether stretches of time could have come in any order: so many `stretches`, over `voxels`
+    trend_excess     the trend less that in random order
+    trending_voxels  of the tested ones: their disagreement goes one way in time
     """
 
     sbd_p: float
@@ -205,9 +207,11 @@ class DriftTests:
     trend_null: float
     trend_excess: Estimate
     trend_p: float
+    stretches: int
+    voxels: int
     tested_voxels: int
     unusual_sbd_voxels: int
-    drifting_voxels: int
+    trending_voxels: int
 
 
 @dataclass(frozen=True)

@@ -59,17 +59,18 @@ from semstab.statistics.drift import (
     benjamini_hochberg,
     expected_sbd,
     flips,
-    scene_drift,
     trend_columns,
     voxel_drift,
 )
 from semstab.statistics.looks import Sample, correlogram, reach_of
+from semstab.statistics.scene_drift import scene_drift
+from semstab.statistics.steady import steady
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 FALSE_DISCOVERIES = 0.05
-"""Rate at which drifting voxels are named."""
+"""Rate at which trending voxels are named."""
 
 Float64 = npt.NDArray[np.float64]
 Maps = dict[str, npt.NDArray[Any]]
@@ -132,7 +133,7 @@ def analyse(
     again = table.op >= 2
     blocks = spatial_blocks(table.index[again], table.voxel_size)
     means = _Means(again, BlockBootstrap(blocks, seed=seed))
-    maps: Maps = {"psa": psa(table)}
+    maps: Maps = {"psa": psa(table), "stable": steady(table)}
     known = None if truth is None else join_truth(table, truth)
     agreement = _agreement(table, events, means, maps)
     drift = _drift(table, events, means, maps, seed)
@@ -259,9 +260,11 @@ def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, 
         trend_null=scene.trend_null,
         trend_excess=means.function(excess, ratio_of, (-1.0, 1.0)),
         trend_p=scene.trend_p,
+        stretches=scene.stretches,
+        voxels=scene.voxels,
         tested_voxels=int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
         unusual_sbd_voxels=_discoveries(maps["drift_q"]),
-        drifting_voxels=_discoveries(maps["trend_q"]),
+        trending_voxels=_discoveries(maps["trend_q"]),
     )
 
 

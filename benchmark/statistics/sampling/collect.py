@@ -13,14 +13,11 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
-from semstab.statistics.correctness import STABLE
 from semstab.statistics.sampling.influence import MOST_CELLS, MOST_CLASSES, MOST_GROUPS, InfluenceSums, layout
+from semstab.statistics.steady import steady
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-
-NEARLY = STABLE - 1e-9
-"""A place is stable from this PSA on."""
 
 
 def influence_sums(
@@ -93,6 +90,7 @@ def _sums_of_log(
     order = again[np.argsort(of, kind="stable")]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
     truth = np.full(len(table), -1) if true_label is None else true_label
+    likely = np.zeros(len(table)) if true_label is None else np.nan_to_num(steady(table))
     options = (table.K <= MOST_CLASSES, true_label is not None)
     in_chunks(
         loops.add_influences,
@@ -104,7 +102,7 @@ def _sums_of_log(
         table.K,
         group,
         truth,
-        STABLE,
+        likely,
         *options,
         sums,
     )
@@ -129,11 +127,11 @@ def _sums_of_table(table: VoxelTable, again: Int64, of: Int64, cells: int, true_
     if true_label is not None:
         label = true_label[again]
         known, right = label >= 0, label == dominant(table)[again]
-        steady = known & (agreement >= NEARLY) & (recurrent > 0)
+        stable = known * np.nan_to_num(steady(table))[again] * recurrent
         looks = np.take_along_axis(e, np.maximum(label, 0)[:, None], axis=1)[:, 0]
         values |= {
             "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
-            "stable": steady, "stable_wrong": steady & ~right,
+            "stable": stable, "stable_wrong": stable * ~right,
         }  # fmt: skip
         if table.K <= MOST_CLASSES:
             true = (label[:, None] == np.arange(table.K)).astype(np.float64)
