@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -78,6 +78,18 @@ class Prediction:
     scores: npt.NDArray[np.float32] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Streamed:
+    """A prediction whose scores come class by class, so that they never are in memory at once.
+
+    labels  as of a `Prediction`
+    maps    gives the scores (H, W) float32 of each class in order, anew at each call
+    """
+
+    labels: Labels
+    maps: Callable[[], Iterator[npt.NDArray[np.float32]]]
+
+
 class Backbone(Protocol):
     """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
 
@@ -88,6 +100,7 @@ class Backbone(Protocol):
                     sequence in order, all of them, from the first one after `reset`
     wants_geometry  whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and pose at
                     the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour
+    streams         whether `stream` keeps less in memory than `predict`: it is asked where scores are many
     """
 
     label_space: LabelSpace | None = None
@@ -95,6 +108,7 @@ class Backbone(Protocol):
     fit_frames: int = 0
     sequential: bool = False
     wants_geometry: bool = False
+    streams: bool = False
 
     def fit(self, images: Sequence[Image]) -> Backbone:
         """The backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
@@ -114,12 +128,25 @@ class Backbone(Protocol):
         """
         ...
 
+    def stream(self, image: Image) -> Streamed:
+        """What `predict` says with scores, these class by class."""
+        (prediction,) = self.predict([image], scores=True)
+        return streamed(prediction)
+
     def identity(self) -> dict[str, Any]:
         """All that its output depends on beside the image, for JSON: settings, and what they name by its content.
 
         Predictions are kept and reused under it.
         """
         ...
+
+
+def streamed(prediction: Prediction) -> Streamed:
+    """A prediction whose scores, where it has any, are handed out class by class."""
+    scores = prediction.scores
+    if scores is None:
+        return Streamed(prediction.labels, lambda: iter(()))
+    return Streamed(prediction.labels, lambda: (scores[..., k] for k in range(scores.shape[2])))
 
 
 def ask(

@@ -6,13 +6,14 @@ import dataclasses
 import functools
 import importlib.resources
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from semstab.backbones import Backbone, Image, Prediction
+from semstab.backbones import Backbone, Image, Prediction, Streamed
 from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
@@ -98,6 +99,7 @@ class InTaxonomy(Wrapped):
         if backbone.label_space is None:
             raise ConfigError("regions without classes cannot be brought into a taxonomy; leave it out")
         super().__init__(backbone)
+        self.streams = backbone.streams
         self._mapping = class_mapping(backbone.label_space, target, leniency)
         self.label_space = dataclasses.replace(target, ids=tuple(range(len(target))))
 
@@ -107,10 +109,24 @@ class InTaxonomy(Wrapped):
         """See `Backbone`."""
         return [self._mapped(prediction) for prediction in self.ask(images, scores, geometry)]
 
+    def stream(self, image: Image) -> Streamed:
+        """See `Backbone`; the target's maps are in memory at once."""
+        found = self.inner.stream(image)
+        labels = self._mapping.labels(found.labels, "prediction")
+        return Streamed(labels, lambda: self._maps(found, labels != ignore_id(labels)))
+
     def identity(self) -> dict[str, Any]:
         """That of the inner backbone, and where each class goes."""
         rows = list(self._mapping.rows)
         return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
+
+    def _maps(self, found: Streamed, said: npt.NDArray[np.bool_]) -> Iterator[npt.NDArray[np.float32]]:
+        """Those of classes that fall together added up, 0 where the label is ignored."""
+        totals = np.zeros((len(self._mapping.target), *said.shape), dtype=np.float32)
+        for row, scores in zip(self._mapping.rows, found.maps(), strict=True):
+            if row is not None:
+                totals[row] += scores
+        yield from (total * said for total in totals)
 
     def _mapped(self, prediction: Prediction) -> Prediction:
         labels = self._mapping.labels(prediction.labels, "prediction")

@@ -13,8 +13,8 @@ from semstab.model.frames import Frame
 class Wrapped(Backbone):
     """Another backbone, with something done to what it says; all that is not overridden is the inner one's.
 
-    What a sequence leaves behind belongs into attributes that `reset` makes anew: copies for other sequences (`fit`)
-    share them until then.
+    Where it leaves scores as they are, it may set `streams` to the inner one's. What a sequence leaves behind belongs
+    into attributes that `reset` makes anew: copies for other sequences (`fit`) share them until then.
     """
 
     def __init__(self, inner: Backbone) -> None:

@@ -1,5 +1,9 @@
 """The one exception root: what the command line reports in one line, with its exit code."""
 
+import re
+
+TERMINAL_CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
 LONGEST = 200
 """Characters of another library's error that are told."""
 
@@ -53,6 +57,6 @@ def _escaped(text: str) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """What another library's error says, without its line breaks and in bounds; its type where it says nothing."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    """What another library's error says, in bounds, without line breaks and colours; or its type."""
+    text = " ".join(TERMINAL_CODES.sub("", str(error)).split()) or type(error).__name__
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

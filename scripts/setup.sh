@@ -56,7 +56,7 @@ link_folders() {
     local tree path link
     tree=$(cat .venv/lib/python*/site-packages/__editable__.semstab-*.pth)/semstab
     mkdir -p "$tree"
-    for path in benchmark/* backends backbones datasets configs; do
+    for path in benchmark/* backends backbones datasets configs conformance; do
         link=$tree/${path##*/}
         [ -L "$link" ] || { rm -rf "$link" && ln -s "$PWD/$path" "$link"; }
     done

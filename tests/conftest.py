@@ -1,5 +1,8 @@
+import atexit
 import os
+import shutil
 import signal
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,8 @@ from semstab.runtime.process import settle
 
 pytest.register_assert_rewrite("semstab.testing")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it starts in the background ignore Ctrl-C
+os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")
+atexit.register(shutil.rmtree, os.environ["SEMSTAB_CACHE"], ignore_errors=True)
 settle()  # threads that spin would take the time of the other workers' tests
 if not Path("/dev/nvidiactl").exists():
     os.environ["TRITON_INTERPRET"] = "1"  # before any test imports Triton: its kernels then run without a GPU

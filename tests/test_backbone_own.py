@@ -348,7 +348,7 @@ def test_a_class_that_is_no_backbone(monkeypatch):
     half = SimpleNamespace(label_space=None, predict=None, gives_scores=False)
     monkeypatch.setattr("semstab.predict.predictor.create", lambda name, **options: half)
     with pytest.raises(
-        ConfigError, match=r"^backbone 'x': a SimpleNamespace has no fit_frames, .*reset, identity; der"
+        ConfigError, match=r"^backbone 'x': a SimpleNamespace has no fit_frames, .*stream, identity; der"
     ):
         load_predictor(PredictorConfig(backbone="x"))
 

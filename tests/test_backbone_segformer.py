@@ -16,7 +16,7 @@ from semstab.backbones.pretrained import segmenter
 from semstab.backbones.pretrained.checkpoint import bilinear
 from semstab.backbones.pretrained.heads import working_size
 from semstab.backbones.pretrained.segmenter import label_space, largest_upsampled
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 
 IMAGES = [blobs(shift=k) for k in range(3)]
 
@@ -179,11 +179,27 @@ def test_lower_precision_is_nearly_the_same():
 # --- ONNX Runtime -----------------------------------------------------------------------------------------------------
 
 
-def test_onnx_runtime_gives_the_same_labels(folder, backbone):
+def test_onnx_runtime_gives_the_same_labels_and_is_exported_once(folder, backbone, monkeypatch):
     onnx = create("segformer", model=str(folder), image_size=64, engine="onnx")
     for a, b in zip(backbone.predict(IMAGES, scores=True), onnx.predict(IMAGES, scores=True), strict=True):
         np.testing.assert_allclose(a.scores, b.scores, atol=1e-3)
         assert (a.labels != b.labels).mean() < 1e-3
+    monkeypatch.delattr(torch.onnx, "export")
+    again = create("segformer", model=str(folder), image_size=64, engine="onnx")
+    np.testing.assert_array_equal(again.predict(IMAGES[:1])[0].labels, onnx.predict(IMAGES[:1])[0].labels)
+
+
+def test_what_cannot_be_exported_is_one_line(monkeypatch, tmp_path):
+    def export(model, pixels, **told):
+        raise RuntimeError("\x1b[31mUnsupported\x1b[0m:\naten::odd")
+
+    kept = tmp_path / "cache"
+    monkeypatch.setenv("SEMSTAB_CACHE", str(kept))
+    monkeypatch.setattr(torch.onnx, "export", export)
+    model = create("segformer", model=str(tiny("segformer")), engine="onnx", image_size=32)
+    with pytest.raises(DataError, match=r"cannot be exported to ONNX \(Unsupported: aten::odd\); use engine torch$"):
+        model.predict(IMAGES[:1])
+    assert not list(kept.rglob("*.onnx"))
 
 
 @pytest.mark.parametrize("option", [{"dtype": "bfloat16"}, {"device": "meta"}])

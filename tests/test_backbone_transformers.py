@@ -55,6 +55,8 @@ def test_universal_segmentation_is_that_of_transformers(universal, images):
         np.testing.assert_array_equal(prediction.labels, wanted.segmentation)
         np.testing.assert_allclose(prediction.scores, (values / values.sum(0)).permute(1, 2, 0), atol=2e-6)
         seen |= set(np.unique(prediction.labels))
+    streamed = np.stack(list(backbone.stream(images[0]).maps()), axis=2)
+    np.testing.assert_array_equal(streamed, backbone.predict(images[:1], scores=True)[0].scores)
     assert len(seen) > 1
     assert backbone.label_space.classes == tuple(tiny_models.NAMES.values())
 

@@ -12,7 +12,7 @@ from pathlib import Path
 SOURCE = Path(__file__).parents[1]
 PACKAGES = {
     "benchmark": "semstab",
-    **{folder: f"semstab/{folder}" for folder in ("backends", "backbones", "datasets", "configs")},
+    **{folder: f"semstab/{folder}" for folder in ("backends", "backbones", "datasets", "configs", "conformance")},
 }
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
 

@@ -17,7 +17,9 @@ from command_line import bench, error_of
 from PIL import Image
 from posed_config import configure, dataset_of
 
-from semstab.backbones import Backbone, Prediction, create
+from semstab.backbones import Backbone, Prediction, Streamed, create
+from semstab.backbones.class_names import InTaxonomy
+from semstab.backbones.outside.border import Checked
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
@@ -122,6 +124,81 @@ def test_scores_in_full_precision(scene):
     with np.load(scene / "scores/clusters/000.npz") as file:
         assert file["scores"].dtype == np.float32
         assert file["scores"].shape == (3, 48, 80)
+
+
+class Streaming(Shifting):
+    """Says how many maps it has given; scores of a pixel are 3/6, 2/6, 1/6 from its label on."""
+
+    streams = True
+    shares = np.float32([3, 2, 1]) / 6
+
+    def __init__(self):
+        super().__init__()
+        self.given = 0
+
+    def soft(self, labels, k):
+        return self.shares[(k - labels.astype(int)) % 3]
+
+    def predict(self, images, *, scores=False):
+        (prediction, *_) = super().predict(images)
+        soft = np.dstack([self.soft(prediction.labels, k) for k in range(3)])
+        return [Prediction(prediction.labels, soft if scores else None)] * len(images)
+
+    def stream(self, image):
+        (prediction,) = self.predict([image])
+
+        def maps():
+            for k in range(3):
+                self.given += 1
+                yield self.soft(prediction.labels, k)
+
+        return Streamed(prediction.labels, maps)
+
+
+@pytest.mark.parametrize("depth_scale", [1, 2])
+@pytest.mark.parametrize("inside", [False, True])
+def test_scores_that_are_many_go_to_disk_class_by_class(tmp_path, monkeypatch, depth_scale, inside):
+    folder = predicted_scene.write(tmp_path / "flight", frames=1, depth_scale=depth_scale)
+    space = LabelSpace("two", ("ab", "c"), members=(("a", "b"), ()))
+    stored = []
+    for size in (1 << 28, 0):
+        monkeypatch.setattr("semstab.predict.sequence.SCORE_BYTES", size)
+        inner = Streaming()
+        model = InTaxonomy(Checked(inner, "mine"), space, "strict") if inside else Checked(inner, "mine")
+        predict(folder, model, indices=[0], scores=True, name=f"x{size}", score_type="float32")
+        with np.load(folder / f"scores/x{size}/000.npz") as file:
+            stored.append(file["scores"])
+        assert inner.given == (0 if size else 3)
+    np.testing.assert_array_equal(stored[0], stored[1])
+    assert stored[0].shape == (2 if inside else 3, 48 // depth_scale, 80 // depth_scale)
+    np.testing.assert_allclose(stored[0].sum(0), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "kept"), [(1, [3]), (2, [2, 3]), (3, [1, 2, 3])])
+def test_only_the_largest_scores_are_kept(scene, count, kept):
+    predict(scene, Streaming(), indices=[0], scores=True, top_k=count, score_type="float32")
+    with np.load(scene / "scores/clusters/000.npz") as file:
+        scores = np.sort(6 * file["scores"][:, 5, 7])
+    np.testing.assert_allclose(scores, [0] * (3 - count) + kept, atol=1e-6)
+    assert manifest(scene / "scores/clusters")["settings"]["top_k"] == count
+    with pytest.raises(ConfigError, match=r"other settings \(top_k: "):
+        predict(scene, Streaming(), indices=[0], scores=True, score_type="float32")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda k: np.zeros((3, 3), np.float32), r"gave scores of shape \(3, 3\) or below 0"),
+        (lambda k: np.full((48, 80), k - 1, np.float32), "or below 0"),
+        (lambda k: np.full((48, 80), 0.5, np.float32), "gave 3 maps of scores that do not sum to 1"),
+    ],
+)
+def test_scores_class_by_class_are_looked_at_too(monkeypatch, wrong, message):
+    inner = Streaming()
+    monkeypatch.setattr(inner, "soft", lambda labels, k: wrong(k))
+    found = Checked(inner, "mine").stream(predicted_scene.image(0))
+    with pytest.raises(DataError, match=message):
+        list(found.maps())
 
 
 def test_the_manifest_says_what_the_maps_depend_on(scene):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -9,14 +11,15 @@ from concurrent.futures import ThreadPoolExecutor
 import looking_down as down
 import numpy as np
 import pytest
-from command_line import bench, error_of
-from dataset_writers import write_colmap
+from dataset_writers import write_colmap, write_transforms
 from posed_config import configure, dataset_of
 from posed_scene import fails
 from posed_writer import write_posed
+from rich.console import Console
 
 import semstab
-from semstab.check import quick_check
+from semstab.check import check, quick_check
+from semstab.check.display import print_check
 from semstab.datasets import open_dataset
 from semstab.datasets.surfaces import surface as surfaces
 from semstab.datasets.surfaces.casting import View
@@ -150,6 +153,15 @@ def test_other_datasets_need_no_depth_either(mesh, tmp_path) -> None:
     scene = open_dataset("colmap", {"root": tmp_path / "col", "surface": mesh, "casts": False}).scene("col")
     assert scene.missing(1) == []
     np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
+    write_transforms(tmp_path / "trans", frames)
+    content = json.loads((tmp_path / "trans/transforms.json").read_text()) | {"w": down.W, "h": down.H}
+    for entry in content["frames"]:
+        del entry["depth_file_path"]
+    (tmp_path / "trans/transforms.json").write_text(json.dumps(content))
+    scene = open_dataset("transforms_json", {"root": tmp_path / "trans", "surface": mesh, "casts": False}).scene(
+        "trans"
+    )
+    np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
 
 
 # --- what the images say ----------------------------------------------------------------------------------------------
@@ -197,10 +209,13 @@ def test_without_images_nothing_is_claimed_of_a_surface(photographs, mesh, tmp_p
     assert "without images of overlapping frames nothing tells whether they fit" in verdict.text
 
 
-def test_the_check_says_what_depth_is_cast_at(photographs, mesh, tmp_path) -> None:
-    options = ("--set", f"dataset.options.surface={mesh}", "--set", "dataset.options.casts=false")
-    said = " ".join(bench("check", "--data", photographs, *options, cwd=tmp_path).stdout.split())
-    assert f"from rays cast at {mesh}" in said
+def test_the_check_says_what_depth_is_cast_at(photographs, mesh) -> None:
+    config = configure(photographs, dataset=dataset_of(photographs, surface=str(mesh), casts=False))
+    (checked,) = check(config)
+    console = Console(record=True, width=80, file=io.StringIO())
+    print_check(checked, console)
+    said = " ".join(console.export_text().split())
+    assert f"from rays cast at {mesh}".replace(" ", "") in said.replace(" ", "")
     assert "field: sound: neighbouring images match" in said
     assert "reprojected into each other" not in said
 
@@ -218,8 +233,7 @@ def test_a_surface_in_other_coordinates_than_the_poses_says_how_far_off(flight, 
     fails(DataError, match, dataset.scene("field").geometry, 1)
     config = configure(flight, dataset=dataset_of(flight, surface=str(path), casts=False))
     fails(DataError, match, semstab.engine.run, config)
-    options = ("--set", f"dataset.options.surface={path}", "--set", "dataset.options.casts=false")
-    assert re.search(match, error_of("check", "--data", flight, *options, cwd=tmp_path))
+    fails(DataError, match, list, check(config))
 
 
 def test_cameras_that_look_elsewhere_are_told_so(flight, mesh) -> None:

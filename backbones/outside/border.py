@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backbones import Image, Prediction
+from semstab.backbones import Image, Prediction, Streamed
 from semstab.backbones.wrapped import Wrapped
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace, ignore_id
 
 MEMBERS = (
-    "label_space", "gives_scores", "fit_frames", "sequential", "wants_geometry", "fit", "reset", "predict", "identity",
+    "label_space", "gives_scores", "fit_frames", "sequential", "wants_geometry", "streams", "fit", "reset", "predict",
+    "stream", "identity",
 )  # fmt: skip
 
 SUM_TOLERANCE = 0.01
@@ -37,6 +38,7 @@ class Checked(Wrapped):
                 " semstab.backbones.Backbone"
             )
         super().__init__(backbone)
+        self.streams = backbone.streams
         if not isinstance(self.label_space, LabelSpace | None):
             what = type(self.label_space).__name__
             raise ConfigError(f"backbone '{name}': label_space is a {what}; make it a semstab.LabelSpace, or None")
@@ -57,6 +59,12 @@ class Checked(Wrapped):
             what = f"{len(found)} predictions" if isinstance(found, Sequence) else _kind(found)
             raise self._wrong(f"gave {what} for {len(images)} images; give a list with one each")
         return [self._checked(prediction, image, scores) for prediction, image in zip(found, images, strict=True)]
+
+    def stream(self, image: Image) -> Streamed:
+        """See `Backbone`."""
+        found = self.inner.stream(image)
+        self._check_labels(found.labels, image.shape[:2])
+        return Streamed(found.labels, lambda: self._maps(found, image.shape[:2]))
 
     def identity(self) -> dict[str, Any]:
         """That of the backbone, which JSON must hold."""
@@ -79,6 +87,20 @@ class Checked(Wrapped):
             return Prediction(prediction.labels)
         self._check_scores(prediction.scores, image.shape[:2])
         return prediction
+
+    def _maps(self, found: Streamed, shape: tuple[int, ...]) -> Iterator[npt.NDArray[np.float32]]:
+        """The maps, looked at as they come."""
+        K, count, total = len(self.label_space or ()), 0, np.zeros((*shape, 1), dtype=np.float32)
+        for scores in found.maps():
+            count += 1
+            if scores.shape != shape or not (scores >= 0).all():
+                raise self._wrong(
+                    f"gave scores of shape {scores.shape} or below 0; give one of 0 or more for each pixel"
+                )
+            total[..., 0] += scores
+            yield scores
+        if count != K or not _add_up(total):
+            raise self._wrong(f"gave {count} maps of scores that do not sum to 1; give {K}, one a class, that do")
 
     def _check_labels(self, labels: Any, shape: tuple[int, ...]) -> None:
         if not isinstance(labels, np.ndarray) or labels.dtype not in (np.uint8, np.uint16):

@@ -28,21 +28,24 @@ SQUARE = ("dpt", "tipsv2_dpt", "data2vec-vision")
 
 
 class Head(Protocol):
-    """A loaded checkpoint. `names` are its classes in the order of `maps`."""
+    """A loaded checkpoint.
+
+    names    its classes in the order of `maps`
+    softmax  whether scores are the softmax of the maps; else each map's share of their sum
+    """
 
     names: Mapping[int, str]
+    softmax: bool
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
         """(K, h, w) of each image, of whatever size."""
         ...
 
-    def shares(self, maps: torch.Tensor) -> torch.Tensor:
-        """Maps (K, H, W) at the image's size as shares that sum to 1 over the classes."""
-        ...
-
 
 class SemanticHead:
     """Logits of each class: SegFormer, BEiT, DPT, UPerNet, ..., run by torch or by ONNX Runtime."""
+
+    softmax = True
 
     def __init__(self, checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> None:
         self._options = options
@@ -50,7 +53,7 @@ class SemanticHead:
         model = checkpoint.load_model(AutoModelForSemanticSegmentation, options)
         self.names: Mapping[int, str] = model.config.id2label
         self._size = _square(kind, model.config, self._processor, options) if kind in SQUARE else options.image_size
-        self.engine = _engine(model, options)
+        self.engine = _engine(model, options, checkpoint.revision)
         self._kind = kind
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
@@ -72,10 +75,6 @@ class SemanticHead:
                 " that it was made for"
             ) from error
 
-    def shares(self, maps: torch.Tensor) -> torch.Tensor:
-        """Softmax."""
-        return maps.softmax(dim=0)
-
     def _seen(self, image: tuple[int, ...]) -> tuple[int, int]:
         """(height, width) at which the model sees an image of that size."""
         if isinstance(self._size, tuple):
@@ -90,6 +89,8 @@ class UniversalHead:
     """
 
     KINDS: ClassVar = ("mask2former", "maskformer", "oneformer", "eomt", "eomt_dinov3")
+
+    softmax = False
 
     MASKS: ClassVar = {"mask2former": (384, 384)}
     """The size to which transformers brings masks before they are added up."""
@@ -130,14 +131,11 @@ class UniversalHead:
             return [each[:, :height, :width] for each in sums]
         return sums
 
-    def shares(self, maps: torch.Tensor) -> torch.Tensor:
-        """Of the sum over all classes; 0 where no mask is."""
-        total = maps.sum(dim=0)
-        return torch.where(total > 0, maps / total, 0.0)
-
 
 class PromptedHead:
     """CLIPSeg: a logit of each prompt, which stand in `prompts` (Lüddecke and Ecker 2022, CVPR)."""
+
+    softmax = True
 
     def __init__(self, checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> None:
         from transformers import CLIPSegForImageSegmentation
@@ -162,10 +160,6 @@ class PromptedHead:
         told = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._seen}
         pixels = self._processor(**told)["pixel_values"].to(self._model.device, self._model.dtype)
         return [self._maps(image) for image in pixels]
-
-    def shares(self, maps: torch.Tensor) -> torch.Tensor:
-        """Softmax."""
-        return maps.softmax(dim=0)
 
     def _maps(self, pixels: torch.Tensor) -> torch.Tensor:
         K = len(self._asked)
@@ -212,12 +206,12 @@ def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
     return height, width
 
 
-def _engine(model: Any, options: SegmenterOptions) -> Logits:
+def _engine(model: Any, options: SegmenterOptions, revision: str) -> Logits:
     """What turns pixels (N, 3, h, w) into logits (N, K, h', w')."""
     if options.engine == "onnx":
         from semstab.backbones.pretrained.onnx_engine import OnnxEngine
 
-        return OnnxEngine(model, options)
+        return OnnxEngine(model, options, revision)
     return lambda pixels: torch.as_tensor(model(pixel_values=pixels.to(model.device, model.dtype)).logits)
 
 

@@ -1,15 +1,18 @@
-"""ONNX Runtime in the place of torch: the same model, exported when an image size is first seen."""
+"""ONNX Runtime in the place of torch: the same model, exported once for each image size and kept."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import warnings
 from typing import Any
 
 import torch
+import transformers
 
 from semstab.backbones.pretrained.checkpoint import ModelOptions
 from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.runtime.files import atomic_path, cache_folder, content_key
 
 INSTALL = "pip install 'semstab[onnx]'"
 
@@ -17,10 +20,11 @@ INSTALL = "pip install 'semstab[onnx]'"
 class OnnxEngine:
     """Pixels (N, 3, h, w) to logits (N, K, h', w') on the CPU in float32, an image at a time.
 
+    What was exported of that version of a model is kept in the cache folder, where it can be written.
     Raises ConfigError for another device or dtype, MissingDependencyError without onnxruntime.
     """
 
-    def __init__(self, model: torch.nn.Module, options: ModelOptions) -> None:
+    def __init__(self, model: torch.nn.Module, options: ModelOptions, revision: str) -> None:
         if options.device != "cpu" or options.dtype != "float32":
             raise ConfigError(
                 f"engine onnx runs on the cpu in float32, not on {options.device} in {options.dtype}; use engine torch"
@@ -35,6 +39,7 @@ class OnnxEngine:
         if options.threads is not None:
             self._settings.intra_op_num_threads = options.threads
         self._model = _Logits(model)
+        self._revision = revision
         self._sessions: dict[tuple[int, ...], Any] = {}
 
     def __call__(self, pixels: torch.Tensor) -> torch.Tensor:
@@ -49,9 +54,16 @@ class OnnxEngine:
     def _session(self, example: torch.Tensor) -> Any:
         import onnxruntime
 
-        return onnxruntime.InferenceSession(
-            _export(self._model, example), self._settings, providers=["CPUExecutionProvider"]
-        )
+        said = {"revision": self._revision, "shape": list(example.shape)}
+        versions = {"torch": torch.__version__, "transformers": transformers.__version__}
+        file = cache_folder() / "onnx" / f"{content_key(said | versions)}.onnx"
+        told = {"sess_options": self._settings, "providers": ["CPUExecutionProvider"]}
+        with contextlib.suppress(Exception):  # it is not there, or damaged
+            return onnxruntime.InferenceSession(file, **told)
+        content = _export(self._model, example)
+        with contextlib.suppress(OSError), atomic_path(file) as temporary:
+            temporary.write_bytes(content)
+        return onnxruntime.InferenceSession(content, **told)
 
 
 class _Logits(torch.nn.Module):
@@ -77,10 +89,10 @@ def _export(model: torch.nn.Module, example: torch.Tensor) -> bytes:
             program = torch.onnx.export(
                 model, (example.clone(),), input_names=["pixels"], output_names=["logits"], verbose=False
             )
-    except torch.onnx.OnnxExporterError as error:
+        assert program is not None
+        content: bytes = program.model_proto.SerializeToString()
+    except Exception as error:  # the exporter's own; and what protobuf says of more than 2 GB
         raise DataError(f"the model cannot be exported to ONNX ({one_line(error)}); use engine torch") from error
     finally:
         notes.setLevel(level)
-    assert program is not None
-    content: bytes = program.model_proto.SerializeToString()
     return content

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from pydantic import BaseModel
 
-from semstab.backbones import Backbone, Image, Prediction, narrowed
+from semstab.backbones import Backbone, Image, Prediction, Streamed, narrowed
 from semstab.backbones.pretrained.checkpoint import Checkpoint, bilinear
 from semstab.backbones.pretrained.heads import load_head
 from semstab.backbones.pretrained.options import SegmenterOptions
@@ -16,7 +18,7 @@ from semstab.backbones.pretrained.preprocessing import model_type
 from semstab.errors import ConfigError
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
-CHUNK_BYTES = 1 << 28
+CHUNK_BYTES = 1 << 26
 """Memory for upsampled maps at a time."""
 
 
@@ -28,6 +30,7 @@ class Segmenter(Backbone):
 
     Options: type[BaseModel] = SegmenterOptions
     gives_scores = True
+    streams = True
 
     def __init__(self, options: SegmenterOptions) -> None:
         self.options = options
@@ -41,25 +44,56 @@ class Segmenter(Backbone):
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`."""
-        size = images[0].shape[:2]
-        return [self._prediction(maps, size, scores) for maps in self.head.maps(images)]
+        found = [self._streamed(maps, images[0].shape[:2]) for maps in self.head.maps(images)]
+        K = len(self.head.names)
+        return [Prediction(each.labels, _gathered(each, K) if scores else None) for each in found]
+
+    @torch.inference_mode()
+    def stream(self, image: Image) -> Streamed:
+        """See `Backbone`."""
+        (maps,) = self.head.maps([image])
+        return self._streamed(maps, image.shape[:2])
 
     def identity(self) -> dict[str, Any]:
         """The checkpoint's revision and the settings."""
         return {"revision": self.checkpoint.revision, **self.options.identity()}
 
-    def _prediction(self, maps: torch.Tensor, size: tuple[int, ...], scores: bool) -> Prediction:
+    def _streamed(self, maps: torch.Tensor, size: tuple[int, ...]) -> Streamed:
         best, label = largest_upsampled(maps, size)
+        sure = None
         if self.options.threshold is not None:
-            unsure = best.sigmoid() < self.options.threshold
-            label = torch.where(unsure, IGNORE_8BIT if len(maps) <= IGNORE_8BIT else IGNORE_16BIT, label)
+            sure = best.sigmoid() >= self.options.threshold
+            label = torch.where(sure, label, IGNORE_8BIT if len(maps) <= IGNORE_8BIT else IGNORE_16BIT)
         labels = narrowed(label.cpu().numpy(), len(maps))
-        if not scores:
-            return Prediction(labels)
-        shares = self.head.shares(bilinear(maps.float(), size)).permute(1, 2, 0).contiguous().cpu().numpy()
-        if self.options.threshold is not None:
-            shares[unsure.cpu().numpy()] = 0
-        return Prediction(labels, shares)
+        return Streamed(labels, lambda: _shares(maps, size, best if self.head.softmax else None, sure))
+
+
+def _shares(
+    maps: torch.Tensor, size: tuple[int, ...], largest: torch.Tensor | None, sure: torch.Tensor | None
+) -> Iterator[npt.NDArray[np.float32]]:
+    """Of each class the share (H, W) that its upsampled map has of all: the softmax where the largest is given.
+
+    0 where no class has any, or where the label is not sure. Each map is upsampled twice, and none is kept.
+    """
+
+    def weight(k: int) -> torch.Tensor:
+        upsampled = bilinear(maps[k : k + 1].float(), size)[0]
+        return upsampled if largest is None else (upsampled - largest).exp()
+
+    total = weight(0)
+    for k in range(1, len(maps)):
+        total = total + weight(k)
+    said = total > 0 if sure is None else sure & (total > 0)
+    for k in range(len(maps)):
+        yield torch.where(said, weight(k) / total, 0.0).cpu().numpy()
+
+
+def _gathered(found: Streamed, classes: int) -> npt.NDArray[np.float32]:
+    """All its scores, (H, W, K)."""
+    scores = np.empty((*found.labels.shape, classes), dtype=np.float32)
+    for k, values in enumerate(found.maps()):
+        scores[..., k] = values
+    return scores
 
 
 def label_space(id2label: Mapping[int, str], name: str) -> LabelSpace:

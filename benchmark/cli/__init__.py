@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from semstab import __version__
+from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
 from semstab.cli.interrupt import interruptible
@@ -94,6 +95,7 @@ for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (che
     app.command(name)(command)
 app.command("export")(export)
 app.command("relabel")(relabel)
+app.command("conform")(conform)
 app.command("view")(view)
 app.command("list")(list_)
 

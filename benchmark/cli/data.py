@@ -53,6 +53,9 @@ def predict(
     taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
     mapping: Annotated[str | None, typer.Option(help="strict, or lenient: near classes count as well.")] = None,
     scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
+    top_k: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.KEY=VALUE."),
@@ -87,6 +90,7 @@ def predict(
         batch=batch,
         overwrite=overwrite,
         quiet=quiet,
+        top_k=top_k,
     )
 
 

@@ -23,6 +23,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.records import (
     EVENTS,
     FRAMES,
+    INFLUENCE,
     LOOKS,
     OVERVIEW,
     RECORDING_PARTS,
@@ -53,7 +54,7 @@ LAYOUT = "# semstab, folder layout 2"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, OVERVIEW, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, "tables", "figures")
 """Folders into which files are written."""
 
 
@@ -176,6 +177,8 @@ class Folder:
     def _wanted(self, planned: PlannedUnit) -> list[str]:
         unit: Unit = planned.unit
         wanted = [f"{VOXELS}/{unit.slug}.parquet", f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
+        if planned.kept and planned.judged:
+            wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and planned.logged:
             wanted.append(f"{EVENTS}/{unit.slug}.parquet")
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])

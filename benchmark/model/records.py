@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
-LOOKS = "looks"
+LOOKS, INFLUENCE = "looks", "influence"
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
-where the dataset has it, color (H, W, 3)."""
+where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
 
 RECORDING_PARTS = "recording"
 """Folder of a recording that several processes write, until it is one file."""
@@ -125,6 +125,11 @@ class Record:
     def events_file(self) -> Path | None:
         """File of its log of observations, which is there where it was asked for and its backend keeps one."""
         return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
+
+    @property
+    def influence_file(self) -> Path | None:
+        """File of its sums by frame and cube of space, which is there where its map was judged."""
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / INFLUENCE / self.voxels_file.name
 
 
 class Tables:

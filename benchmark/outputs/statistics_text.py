@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import DriftTests, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
+from semstab.model.statistics import NEXT_FLIGHT, DriftTests, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -26,12 +26,13 @@ def lines(found: MapStatistics) -> list[str]:
     head = [
         *textwrap.wrap(found.verdict.line, WIDTH),
         "",
-        f"{repeated.voxels} of {found.voxels} voxels seen twice or more; intervals at 95 % from"
-        f" {blocks.count} blocks of {blocks.size:.4g} m",
+        f"{repeated.voxels} of {found.voxels} voxels seen twice or more, in {blocks.count} cubes of space",
+        f"intervals at 95 %, for this map; errors depend on each other within blocks of {blocks.size:.4g} m",
         "",
         f"{'':<34}{'value':>9}   {'interval':<20}",
     ]
-    rows = [*_agreement(found), *_drift(found), *_uncertainty(found), *_geometry(found), *_correctness(found)]
+    sections = (_agreement, _judged, _drift, _uncertainty, _geometry, _correctness)
+    rows = [row for section in sections for row in section(found)]
     return [*head, *(_line(*row) for row in rows), *_tables(found)]
 
 
@@ -99,6 +100,20 @@ def _agreement(found: MapStatistics) -> list[Row]:
         *([] if found.reach is None else _reach(found.reach)),
         *([] if found.correlogram is None else _standard(found.correlogram.standard)),
     ]
+
+
+def _judged(found: MapStatistics) -> list[Row]:
+    """What may be said of the next flight, if anything."""
+    judged = found.judged
+    rows = {
+        "PSA": judged.psa,
+        "alpha": judged.alpha,
+        "alpha between frames": judged.alpha_between,
+        "VSS at OP >= 3": judged.vss,
+        "accuracy": judged.accuracy,
+        "wrong of the stable places": judged.wrong_of_stable,
+    }
+    return [(name, own, "the next flight") for name, own in rows.items() if own.question == NEXT_FLIGHT]
 
 
 def _reach(reach: Reach) -> list[Row]:

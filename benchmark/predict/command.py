@@ -30,19 +30,23 @@ def run(
     batch: int,
     overwrite: bool,
     quiet: bool,
+    top_k: int | None = None,
 ) -> list[SequenceReport]:
     """Predict what is selected. Raises ConfigError, DataError, MissingDependencyError; what was finished stays.
 
     predictor  settings of `PredictorConfig` without options
     options    of the backbone
+    top_k      how many scores a pixel keeps; None for all
     dataset    resolved, where the images are those of scenes
     """
+    if top_k is not None and not predictor.get("scores"):
+        raise ConfigError("--top-k says how many scores a pixel keeps; add --scores, or leave it out")
     config = validated(PredictorConfig, {**predictor, "options": options}).resolved()
     selection = validated(FrameSelection, frames)
     jobs = _jobs(images, dataset, scenes, selection, out)
     backbone = load_predictor(config)
     sequence_options = SequenceOptions(
-        config.label_name, config.scores, batch=batch, overwrite=overwrite, command=sys.argv
+        config.label_name, config.scores, top_k=top_k, batch=batch, overwrite=overwrite, command=sys.argv
     )
     bar = PredictionBar(Console(stderr=True, quiet=quiet))
     reports = []

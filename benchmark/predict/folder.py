@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from semstab.datasets.files.templates import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
-from semstab.runtime.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png
+from semstab.runtime.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png, write_stack
 
 SCHEMA = 1
 """Version of predictions.json."""
@@ -38,6 +38,7 @@ class PredictionFolder:
     settings  all that the maps depend on beside the image, for JSON
     about     what else the manifest says
     space     the classes; None for regions
+    top_k     how many scores a pixel keeps; None for all
 
     Raises ConfigError where the folder holds maps of other settings or of other origin.
     """
@@ -51,13 +52,17 @@ class PredictionFolder:
         space: LabelSpace | None,
         *,
         score_type: ScoreType = "float16",
+        top_k: int | None = None,
         overwrite: bool = False,
     ) -> None:
         self.path = path
         self.kind = kind
         self._suffix = ".npz" if kind == "scores" else ".png"
         self._score_type = np.dtype(score_type)
+        self._compressed = top_k is not None  # most of it is 0
         said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
+        if top_k is not None and kind == "scores":
+            said["top_k"] = top_k
         self._content: dict[str, Any] = {
             "schema": SCHEMA,
             "kind": kind,
@@ -79,18 +84,17 @@ class PredictionFolder:
         return inside(self.path, self.path, f"{name}{self._suffix}", f"image {name[:80]!r}")
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
-        """Keep a frame's map: ids (H, W), or scores (H, W, K)."""
-        if self._lock is None:
-            self._lock = FolderLock(self.path)
-            self._save()  # before the first map: without it, maps are taken for somebody else's
-        if self.kind == "scores":
-            with atomic_path(self.file(name)) as temporary:
-                np.savez(temporary, scores=values.transpose(2, 0, 1).astype(self._score_type))
-        else:
-            write_png(self.file(name), values)
-        self._frames[name] = {"image": image, "seconds": round(seconds, 4)}
-        if time.monotonic() - self._saved > SAVE_SECONDS:
-            self.save()
+        """Keep a frame's map of ids (H, W)."""
+        self._claimed()
+        write_png(self.file(name), values)
+        self._done(name, image, seconds)
+
+    def write_scores(self, name: str, image: str, maps: Iterable[npt.NDArray[Any]], seconds: float) -> None:
+        """Keep a frame's scores, which come class by class (H, W); one of them is in memory at a time."""
+        self._claimed()
+        with atomic_path(self.file(name)) as temporary:
+            write_stack(temporary, "scores", maps, len(self._space or ()), self._score_type, self._compressed)
+        self._done(name, image, seconds)
 
     def save(self) -> None:
         """Write the classes and the manifest, once there is a map: what is not in the manifest is predicted again."""
@@ -102,6 +106,16 @@ class PredictionFolder:
         self.save()
         if self._lock is not None:
             self._lock.release()
+
+    def _claimed(self) -> None:
+        if self._lock is None:
+            self._lock = FolderLock(self.path)
+            self._save()  # before the first map: without it, maps are taken for somebody else's
+
+    def _done(self, name: str, image: str, seconds: float) -> None:
+        self._frames[name] = {"image": image, "seconds": round(seconds, 4)}
+        if time.monotonic() - self._saved > SAVE_SECONDS:
+            self.save()
 
     def _save(self) -> None:
         if self._space is not None:

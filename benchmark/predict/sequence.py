@@ -12,15 +12,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from semstab.backbones import Backbone, Prediction, ask
-from semstab.datasets.views.same_view import fitted
+from semstab.backbones import Backbone, Streamed, ask, streamed
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType
 from semstab.predict.images import ImageSequence, Picture, first_images, picture
 from semstab.predict.region_series import RegionSeries, region_series
+from semstab.predict.score_maps import largest_only, resized
 from semstab.runtime.files import content_key
 from semstab.runtime.prefetch import prefetch
 
 REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers", "onnxruntime")
+
+
+SCORE_BYTES = 1 << 28
+"""Memory for the scores of an image; more are taken class by class, where a backbone gives them so."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,7 @@ class SequenceOptions:
 
     name        what the predictions are called
     scores      also keep soft scores, in `score_type`
+    top_k       of these only the largest of each pixel, so many; None for all
     batch       images that the model sees at once
     threads     threads that decode images ahead
     overwrite   replace predictions of other settings
@@ -38,6 +43,7 @@ class SequenceOptions:
     name: str
     scores: bool = False
     score_type: ScoreType = "float16"
+    top_k: int | None = None
     batch: int = 1
     threads: int | None = None
     overwrite: bool = False
@@ -171,7 +177,13 @@ class _Work:
         started = time.perf_counter()
         geometry = [frame for picture in pictures for frame in picture.geometry]
         images = [picture.pixels for picture in pictures]
-        found = ask(self.backbone, images, scores=self.options.scores, geometry=geometry)
+        if self._too_large(pictures[0]):
+            found = [self.backbone.stream(image) for image in images]
+        else:
+            found = [
+                streamed(prediction)
+                for prediction in ask(self.backbone, images, scores=self.options.scores, geometry=geometry)
+            ]
         seconds = time.perf_counter() - started
         self._model_seconds += seconds
         for shown, prediction in zip(pictures, found, strict=True):
@@ -191,26 +203,27 @@ class _Work:
             self.sequence.name, paths, self._predicted, self._kept, self._model_seconds, seconds, series
         )
 
-    def _write(self, picture: Picture, prediction: Prediction, seconds: float) -> None:
-        placed = _placed(self.sequence, picture, prediction)
+    def _too_large(self, picture: Picture) -> bool:
+        """Whether all scores of an image would take too much memory, and the backbone can give them one by one."""
+        size = 4 * picture.pixels.shape[0] * picture.pixels.shape[1] * len(self.backbone.label_space or ())
+        return self.options.scores and self.backbone.streams and size > SCORE_BYTES
+
+    def _write(self, picture: Picture, found: Streamed, seconds: float) -> None:
+        """At the pixels that the scene's label files have."""
+        alike = self.sequence.labels_like_depth
+        frame = self.sequence.predicted(picture.index, labels=found.labels) if alike else None
         for folder in self.folders:
-            values = placed.scores if folder.kind == "scores" else placed.labels
-            assert values is not None
-            folder.write(picture.name, picture.digest, values, seconds)
+            if folder.kind != "scores":
+                labels = found.labels if frame is None else frame.predicted
+                folder.write(picture.name, picture.digest, labels, seconds)
+                continue
+            maps = found.maps if frame is None else resized(found.maps, frame.shape, picture.name)
+            maps = maps if self.options.top_k is None else largest_only(maps, self.options.top_k)
+            folder.write_scores(picture.name, picture.digest, maps(), seconds)
 
     def _tell(self, kept: bool) -> None:
         for observer in self.observers:
             observer.frame_done(kept)
-
-
-def _placed(sequence: ImageSequence, picture: Picture, prediction: Prediction) -> Prediction:
-    """The prediction at the pixels that the scene's label files have."""
-    frame = sequence.predicted(picture.index, labels=prediction.labels) if sequence.labels_like_depth else None
-    if frame is None:
-        return prediction
-    assert frame.labels is not None
-    scores = None if prediction.scores is None else fitted(prediction.scores, frame.shape, picture.name)
-    return Prediction(frame.labels, scores)
 
 
 def _folders(
@@ -231,6 +244,7 @@ def _folders(
             about,
             space,
             score_type=options.score_type,
+            top_k=options.top_k,
             overwrite=options.overwrite,
         )
         for kind in kinds

@@ -10,12 +10,14 @@ import math
 import os
 import stat
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+import zipfile
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import yaml
 
@@ -102,6 +104,30 @@ def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
 
     with atomic_path(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def write_stack(
+    path: Path, key: str, layers: Iterable[npt.NDArray[Any]], count: int, dtype: np.dtype[Any], compressed: bool
+) -> None:
+    """An .npz file of one array, of `count` layers of one shape that come one after the other."""
+    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with (
+        zipfile.ZipFile(path, "w", method, compresslevel=1) as archive,
+        archive.open(f"{key}.npy", "w", force_zip64=True) as file,
+    ):
+        for number, layer in enumerate(layers):
+            if number == 0:
+                shape = (count, *layer.shape)
+                header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(file, header)
+            file.write(np.ascontiguousarray(layer, dtype=dtype).data)
+
+
+def cache_folder() -> Path:
+    """Where what can be made again is kept: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
+    if own := os.environ.get("SEMSTAB_CACHE"):
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab"
 
 
 def content_key(settings: Mapping[str, Any]) -> str:

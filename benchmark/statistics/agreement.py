@@ -22,6 +22,9 @@ ALPHA_BETWEEN = Quantity(
     key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(2, 4)
 )
 
+STABLE = 0.8
+"""A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
+
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""
 

@@ -15,12 +15,12 @@ from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
 from semstab.model.measures import MeasureMeans, Quantity, dominant, measures, vss
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNDEFINED, Correctness, Estimate, Quadrants, Reliability, RuleMeans
+from semstab.model.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import ratio_of
-from semstab.statistics.blocks import BlockBootstrap
+from semstab.statistics.agreement import STABLE, ratio_of
 from semstab.statistics.fusion_rules import Fused
-from semstab.statistics.steady import LIKELY, STABLE, steady
+from semstab.statistics.sampling.places import Places
+from semstab.statistics.steady import LIKELY, steady
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -158,18 +158,18 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
     return tuple(_correctness(judged.rows(where), name) for name, where in rows)
 
 
-def quadrants(table: VoxelTable, truth: Truth, bootstrap: BlockBootstrap, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
     A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
-    places were seen. `bootstrap` is over blocks of the table's voxels.
+    places were seen. `places` are those of all of the table's voxels.
     """
     counted, likely, right = _masks(table, truth, stable)
     if not counted.any():
-        return Quadrants(0, *[UNDEFINED] * 5)
+        return Quadrants(0, *[UNKNOWN] * 5)
 
-    def share(part: Float64, of: Float64) -> Estimate:
-        return bootstrap.estimate(np.stack([part * of, of], axis=1), ratio_of, (0.0, 1.0))
+    def share(part: Float64, of: Float64) -> Interval:
+        return places.estimate(np.stack([part * of, of], axis=1), ratio_of)
 
     every = counted.astype(np.float64)
     return Quadrants(

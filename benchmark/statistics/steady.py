@@ -13,11 +13,9 @@ import numpy.typing as npt
 
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import STABLE
 
 Float64 = npt.NDArray[np.float64]
-
-STABLE = 0.8
-"""A place is stable where two frames agree with at least this probability: of ten frames at most one disagrees."""
 
 LIKELY = 0.5
 """A place is called stable from this probability on."""

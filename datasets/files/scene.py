@@ -14,24 +14,17 @@ import numpy.typing as npt
 
 from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.label_ids import translated, without_labels, without_scores
+from semstab.datasets.files.label_maps import LabelMaps
 from semstab.datasets.files.label_source import (
-    LABEL_SPACE_FILE,
-    LabelSource,
     ScenePlace,
-    find_masks,
-    find_regions,
-    find_sources,
     label_paths,
-    label_space,
 )
-from semstab.datasets.files.messages import listed, nearest
 from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.templates import Folders, inside
 from semstab.datasets.formats import disk
-from semstab.datasets.formats.images import read_color, read_labels, read_mask, read_scores
+from semstab.datasets.formats.images import read_color
 from semstab.datasets.formats.text_files import read_pose
-from semstab.datasets.scene import GROUND_TRUTH, Scene
+from semstab.datasets.scene import Scene
 from semstab.datasets.surfaces.casting import View
 from semstab.datasets.surfaces.surface import Surface
 from semstab.datasets.views.cameras import Camera
@@ -78,18 +71,12 @@ class FileScene(Scene):
         self.skips_incomplete = options.incomplete == "skip"
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
-        self._class_ids = class_ids or {}
-        aliases = {frame.name: (frame.name, *frame.aliases) for frame in frames}
-        labels = find_sources(options, place, aliases)
-        regions = find_regions(options, place, aliases, labels)
-        self._sources = {**labels, **regions}
-        self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
-        self.ground_truth = GROUND_TRUTH in labels
-        self.regions = tuple(regions)
+        self._maps = LabelMaps(options, place, frames, class_ids or {}, self._read)
+        self.backbones = self._maps.backbones
+        self.ground_truth = self._maps.ground_truth
+        self.regions = self._maps.regions
         self.label_paths = tuple(label_paths(options, place, names))
-        self._masks = find_masks(options, place, aliases)
         self._folders = Folders()
-        self._spaces: dict[str, LabelSpace | None] = {}
         self._digests: dict[Path, bytes] = {}
         self._depth: DepthSource = (
             StoredDepth(options, self._read) if surface is None else CastDepth(surface, options, self._views)
@@ -119,7 +106,7 @@ class FileScene(Scene):
         frame = self._frame(index)
         files = [self._depth.path(frame), *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
-        lost += [path for name in sources for path in self._source(name).missing(frame.name)]
+        lost += [path for name in sources for path in self._maps.source(name).missing(frame.name)]
         if color and self._color_file(frame) is None:
             lost.append(f"{self.folder}: the colour of {frame.name}" if frame.color is None else str(frame.color))
         if color and frame.label_lens is not None and not self._folders.has(frame.photograph or Path()):
@@ -141,18 +128,7 @@ class FileScene(Scene):
 
         Raises DataError where nothing says them, ConfigError where there is no such source, or it has none.
         """
-        source = self._source(backbone)
-        if backbone in self.regions:
-            raise ConfigError(f"{self.folder}: '{backbone}' holds regions without classes, which cannot be fused")
-        space = self._space(backbone)
-        if space is None:
-            where = next(iter(source.files.values())).parent
-            raise DataError(
-                f"{self.settings_file or self.folder}: the classes of '{backbone}' are not known; set classes:"
-                f" [name, ...] in id order, taxonomy: NAME, or taxonomies: {{{backbone}: NAME}}, or put a"
-                f" {LABEL_SPACE_FILE} into {where}"
-            )
-        return space
+        return self._maps.label_space(backbone, self.settings_file or self.folder)
 
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
         """Frame 0 <= index < len with that source's labels or scores, and colour where there is any and it is wanted.
@@ -160,10 +136,13 @@ class FileScene(Scene):
         Labels of another size than the depth are brought to its pixels. Raises DataError that names the file,
         ConfigError where there is no such frame or backbone.
         """
-        file, kind = self._label_file(self._frame(index), backbone), self._source(backbone).kind
-        depth = self.depth(index)
-        labels = self._labels(index, backbone, file, depth.shape) if kind == "labels" else None
-        scores = self._scores(index, backbone, file, depth.shape) if kind == "scores" else None
+        file, kind = self._maps.file(self._frame(index).name, backbone), self._maps.source(backbone).kind
+        depth, labels, scores = self.depth(index), None, None
+        if kind == "labels":
+            labels = self._stored(index, self._maps.labels(backbone, file), depth.shape, file, "labels are")
+        else:
+            stored = self._maps.scores(backbone, file, (depth.shape[0], depth.shape[1]))
+            scores = self._stored(index, stored, depth.shape, file, "scores are")
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
@@ -248,21 +227,19 @@ class FileScene(Scene):
 
         Of the images it is the content that `frame` read, where it did; others are read for it.
         """
-        space = self._space(backbone)
+        space = self._maps.space(backbone)
         settings = self.options.model_dump(mode="json", exclude=PLACES)
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
-        if backbone in self._class_ids:
-            digest.update(self._class_ids[backbone].tobytes())
+        digest.update(self._maps.table_bytes(backbone))
         for index in indices:
             source = self._frame(index)
             digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
-            mask = [self._masks[source.name]] if source.name in self._masks else []
-            depth = self._depth.digest(source)
-            paths = [*([source.depth] if depth is None else []), self._label_file(source, backbone), *mask]
+            mask, depth = self._maps.mask_file(source.name), self._depth.digest(source)
             digest.update(depth or b"")
-            for path in paths:
-                digest.update(self._digests.get(path) or disk.file_digest(path))
+            for path in (source.depth if depth is None else None, self._maps.file(source.name, backbone), mask):
+                if path is not None:
+                    digest.update(self._digests.get(path) or disk.file_digest(path))
         return digest.hexdigest()
 
     def _views(self) -> Iterator[View]:
@@ -284,7 +261,7 @@ class FileScene(Scene):
         """The frame with labels or scores that have the depth's pixels."""
         source, timestamps = self._frame(index), self.timestamps
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
-        mask = self._masks.get(source.name)
+        mask = self._maps.mask_file(source.name)
         shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
         known = {"depth": self._depth.path(source), "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
@@ -301,24 +278,9 @@ class FileScene(Scene):
             files={what: str(path) for what, path in known.items() if path is not None},
         )
 
-    def _labels(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Labels:
-        labels = read_labels(path, self._space(backbone), self._read)
-        if backbone in self._class_ids:
-            labels = translated(labels, self._class_ids[backbone], path)
-        if void := self.options.void_ids.get(backbone):
-            labels = without_labels(labels, void)
-        return self._stored(index, labels, shape, path, "labels are")
-
-    def _scores(self, index: int, backbone: str, path: Path, shape: tuple[int, ...]) -> Scores:
-        scores = read_scores(path, self.options.scores_layout or "KHW", (shape[0], shape[1]), self._read)
-        if void := self.options.void_ids.get(backbone):
-            space = self._space(backbone)
-            scores = without_scores(scores, range(scores.shape[2]) if space is None else space.ids, void)
-        return self._stored(index, scores, shape, path, "scores are")
-
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
         """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
-        mask = read_mask(path, self._read).astype(np.uint8)
+        mask = self._maps.mask(path)
         masked: npt.NDArray[np.bool_] = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
@@ -354,28 +316,6 @@ class FileScene(Scene):
 
     def _stored_pose(self, source: FrameSource) -> Poses:
         return read_pose(source.pose_file) if source.pose is None else source.pose
-
-    def _space(self, backbone: str) -> LabelSpace | None:
-        """The classes of a label source, None where nothing says them; what says them is read once."""
-        if backbone not in self._spaces:
-            source = self._source(backbone)
-            none = backbone in self.regions
-            self._spaces[backbone] = None if none else label_space(self.options, self.folder, backbone, source)
-        return self._spaces[backbone]
-
-    def _source(self, backbone: str) -> LabelSource:
-        known = self._sources
-        if backbone not in known:
-            hint = nearest(backbone, known) if known else "put its label maps into labels/NAME/, or set option labels"
-            raise ConfigError(f"{self.folder}: backbone '{backbone}' is not there; {hint}")
-        return known[backbone]
-
-    def _label_file(self, source: FrameSource, backbone: str) -> Path:
-        labels = self._source(backbone)
-        if source.name not in labels.files:
-            lost = [path for frame in self._frames for path in labels.missing(frame.name)]
-            raise DataError(f"{self.folder}: {listed(lost)}; choose frames that have them, or add them")
-        return labels.files[source.name]
 
     def _color_file(self, source: FrameSource) -> Path | None:
         """The colour image of a frame, where there is one."""

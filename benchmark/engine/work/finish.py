@@ -25,7 +25,7 @@ from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, summarise
 from semstab.model.measures import dominant, measures
-from semstab.model.records import EVENTS, FRAMES, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
+from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
 from semstab.model.results import STAGES, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
@@ -122,6 +122,8 @@ def _savers(
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
         save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
     )
+    if found is not None:
+        savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found.sums.save
     savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
     if one.sampler is not None:
         savers[f"{LOOKS}/{unit.slug}.parquet"] = one.sampler.looks(table.classes).save

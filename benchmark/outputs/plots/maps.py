@@ -19,7 +19,7 @@ from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.outputs.plots.topdown import EMPTY, Float64, FromAbove, Int64
-from semstab.statistics import decompose, psa
+from semstab.statistics import decompose
 from semstab.statistics.steady import LIKELY, steady
 
 if TYPE_CHECKING:
