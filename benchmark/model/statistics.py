@@ -374,6 +374,18 @@ class StratumStatistics:
     entropy_between: float
 
 
+@dataclass(frozen=True)
+class BeyondCoin:
+    """What a coin tossed as often as places were seen would not show; 0 for it, whatever the OP.
+
+    disagreement  PSA of the places that two frames saw less that of the places that more saw
+    settling      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
+    """
+
+    disagreement: Interval
+    settling: Interval
+
+
 # --- One map ----------------------------------------------------------------------------------------------------------
 
 
@@ -401,6 +413,7 @@ class MapStatistics:
     correctness: CorrectnessStatistics | None
     fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
+    beyond_coin: BeyondCoin
 
     @property
     def sections(self) -> int:

@@ -15,6 +15,7 @@ from semstab.metrics.matching import require_same_map
 from semstab.metrics.summary import STRATA
 from semstab.model.measures import MeasureMeans, dominant, mean, measures, sbd, vss
 from semstab.model.statistics import (
+    BeyondCoin,
     BlockCut,
     CorrectnessStatistics,
     DriftStatistics,
@@ -181,6 +182,7 @@ def analyse(
         correctness=right,
         fusion_rules=None if events is None else _fusion_rules(table, events, known),
         strata=_strata(table, maps, edges),
+        beyond_coin=_beyond_coin(table, means, maps),
     )
     return Analysis(summary, maps, sums)
 
@@ -331,6 +333,21 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tup
         relabelled = fusion_rules.labels(fused.evidence) != usual
         rows.append(RuleOutcome(rule, rule_means(fused, again, truth), mean(relabelled[again])))
     return tuple(rows)
+
+
+def _beyond_coin(table: VoxelTable, means: _Means, maps: Maps) -> BeyondCoin:
+    """PSA does not depend on OP for a coin, nor does SBD on the order."""
+    op, agreement = table.op[means.again], maps["psa"][means.again]
+    excess = np.where(table.op > 2, maps["sbd_excess"], np.nan)
+    groups = [np.stack([agreement * where, where], axis=1) for where in (op == 2, op > 2)]
+    return BeyondCoin(
+        means.function(np.concatenate(groups, axis=1), _less, (-1.0, 1.0)), means.mean(-excess, (-1.0, 1.0))
+    )
+
+
+def _less(sums: Float64) -> Float64:
+    """A ratio less another, (...,) from sums (..., 4)."""
+    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
 
 
 def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> tuple[StratumStatistics, ...]:
