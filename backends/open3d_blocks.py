@@ -17,7 +17,7 @@ from open3d.t.geometry import VoxelBlockGrid
 
 from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator
-from semstab.backends.shared.association import Int64, check_frame, check_settings
+from semstab.backends.shared.association import Int64, check_depth, check_frame, check_settings
 from semstab.backends.shared.columns import update_rows
 from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
@@ -75,6 +75,7 @@ class Open3DBlocks(FusionBackend):
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
         started = time.perf_counter()
+        check_depth(frame)
         if frame.scores is not None:
             check_frame(frame, self.num_classes)
         seen = self._pixels.observe(frame)

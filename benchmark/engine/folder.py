@@ -166,6 +166,7 @@ class Folder:
             has = has and (
                 not planned.judged or (content.summary is not None and content.summary.statistics is not None)
             )
+            has = has and (content.checked is not None or not planned.sampled)
             wanted = self._wanted(planned)
         else:
             has, wanted = content.regions is not None, []

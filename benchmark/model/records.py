@@ -14,7 +14,7 @@ from semstab.model import tabular
 from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
 from semstab.model.measures import measures
-from semstab.model.results import Agreement, Unit, UnitSummary
+from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.json_form import INLINE
@@ -172,6 +172,8 @@ class UnitContent:
     up       the scene's up axis, where it is known or could be estimated
     files    digests of the unit's other files, by their path in the folder
     regions  of a source of regions, instead of a summary
+    advice   where its voxel size lies, where that was looked at
+    checked  how far it agrees with the reference on a sample of its voxels, where it was checked so
     """
 
     input: str
@@ -180,6 +182,8 @@ class UnitContent:
     up: tuple[float, float, float] | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None
+    checked: Agreement | None = None
+    advice: VoxelAdvice | None = None
 
 
 @dataclass(frozen=True)
@@ -201,6 +205,8 @@ class Result:
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
     georeference  by scene, where it lies on Earth, where that is known
     regions    flicker of the label sources that are regions without classes
+    compared   the same of each other backend and the base one, which need not agree
+    advice     where the voxel size lies, scene by scene, for data of files
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
 
@@ -214,6 +220,8 @@ class Result:
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
     comparisons: tuple[BackboneComparison, ...] = ()
+    compared: tuple[Agreement, ...] = ()
+    advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None

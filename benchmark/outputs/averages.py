@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from semstab.metrics import macro_mean, pool
+from semstab.metrics import macro_mean, pool, split_last
 from semstab.model.measures import Measure
 from semstab.model.records import Record, Result, Variation
 from semstab.model.results import Means
@@ -27,6 +27,7 @@ class Pooled:
     recurrent  those with OP >= 3
     strata     by OP, as the units have them
     classes    by dominant class, in order of appearance
+    well_seen  the last stratum in parts, where most voxels are in it
 
     Of the voxels with OP >= 2, macro means over the units, NaN where none has statistics:
     psa        pairwise semantic agreement
@@ -43,6 +44,7 @@ class Pooled:
     recurrent: Means
     strata: tuple[Means, ...]
     classes: tuple[Means, ...]
+    well_seen: tuple[Means, ...]
     fuse_ms_per_frame: float
     psa: float = math.nan
     alpha: float = math.nan
@@ -88,6 +90,7 @@ def pooled(records: Sequence[Record]) -> Pooled:
         recurrent=pool([table.recurrent for table in tables], voxels),
         strata=strata,
         classes=tuple(pool(rows, voxels) for rows in of_class),
+        well_seen=tuple(split_last(tables)),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
         psa=_macro(records, lambda found: found.agreement.psa),
         alpha=_macro(records, lambda found: found.agreement.alpha),

@@ -17,9 +17,9 @@ Float64 = npt.NDArray[np.float64]
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
-ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(2, 4))
+ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
 ALPHA_BETWEEN = Quantity(
-    key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(2, 4)
+    key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(3, 4)
 )
 
 STABLE = 0.8

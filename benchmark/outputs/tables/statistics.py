@@ -26,7 +26,7 @@ Number = Callable[[MapStatistics], float | Estimate]
 
 
 def temporal_agreement(result: Result) -> list[Table]:
-    """Do frames agree about a place? Measures that do not depend on OP."""
+    """Do frames agree about a place? Measures that random thinning of the frames does not change."""
     columns = (
         REPEATED,
         *map(Column.of, (VSS, PSA, KAPPA, ALPHA)),

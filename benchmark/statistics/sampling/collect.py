@@ -206,5 +206,5 @@ def _sums_of_table(
             true = (label[:, None] == np.arange(table.K)).astype(np.float64)
             values |= {"class_known": true, "class_right": true * right[:, None]}
     names = layout(table.K, truth=true_label is not None)
-    columns = np.concatenate([np.asarray(values[name], float).reshape(len(T), -1) for name in names], axis=1)
+    columns = np.column_stack([np.asarray(values[name], float) for name in names])
     return np.stack([np.bincount(of, weights=column, minlength=cells) for column in columns.T], axis=1)
