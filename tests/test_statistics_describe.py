@@ -78,7 +78,7 @@ def test_a_description_holds_what_the_functions_say(described):
 def test_every_map_has_a_value_for_every_voxel(described):
     assert {len(values) for values in described.maps.values()} == {SIDE**2}
     assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(described.maps)
-    assert described.maps["stable_wrong"].sum() > 10
+    assert 0 <= np.nanmin(described.maps["stable"]) < np.nanmax(described.maps["stable"]) <= 1
 
 
 def test_the_same_seed_gives_the_same_description():
