@@ -291,6 +291,12 @@ def test_a_raster_of_another_projection_or_turned_is_told_what_to_do(tmp_path) -
     fails(DataError, "t.tif: the raster is rotated", Surface(path, georeference=placed()).depth, view())
 
 
+def test_heights_need_z_to_be_up(flight, tmp_path) -> None:
+    path = down.write_raster(tmp_path / "dsm.tif")
+    dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "up_axis": "-y"})
+    fails(ConfigError, "dsm.tif: is a surface over x and y, but up_axis is -y; turn it", dataset.scene, "field")
+
+
 def test_a_grid_that_is_too_fine_is_refused(tmp_path) -> None:
     path = down.write_points(tmp_path / "c.ply")
     fails(DataError, "too many .* set a larger surface_cell", Surface(path, cell=0.001).depth, view())

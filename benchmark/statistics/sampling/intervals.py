@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Judged, Question
 from semstab.statistics.blocks import LEVEL
@@ -65,6 +64,8 @@ def difference(
                  paired if both maps have the same
     Each map counts with all its voxels: those of the cubes that only one holds add to the variance.
     """
+    from scipy import stats
+
     a, b = aligned(a, b)
     found = value(a, key, k) - value(b, key, k)
     one, other = grid_of(a, key, k), grid_of(b, key, k)
@@ -143,6 +144,8 @@ def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
 
 def _share_ends(p: float, spread: TwoWay, units: int, level: float) -> tuple[float, float]:
     """Of a share, or of a mean of numbers from 0 to 1, by the looks that it is worth (Korn and Graubard 1998)."""
+    from scipy import stats
+
     p = min(max(p, 0.0), 1.0)
     looks: float = units
     if spread.total > TINY and 0 < p < 1:
