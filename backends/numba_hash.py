@@ -28,7 +28,7 @@ from semstab.backends.numba_parts.loops import (
     update,
 )
 from semstab.backends.shared.aggregator import Aggregator
-from semstab.backends.shared.association import check_frame, check_settings
+from semstab.backends.shared.association import check_depth, check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import columns_of_keys, index_of_keys
 from semstab.backends.shared.observed import Observed
@@ -103,6 +103,7 @@ class NumbaHash:
         nb.set_num_threads(self.threads or threads)
         try:
             started = time.perf_counter()
+            check_depth(frame)
             if frame.scores is not None:
                 check_frame(frame, self.num_classes)
             seen = self._pixels.observe(frame)

@@ -6,12 +6,28 @@ import time
 
 import numpy as np
 
-from semstab.backends.shared.association import Int64, Observations, check_frame, check_settings, observe
+from semstab.backends.shared.association import (
+    Int64,
+    Mask,
+    Observations,
+    back_project,
+    check_depth,
+    check_frame,
+    check_settings,
+    observe,
+    voxel_index,
+)
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable, index_columns
+
+ONE_IN = 16
+"""Of so many voxels the sample holds one."""
+
+ODD = np.array([[-0x61C8864680B583EB], [-0x3D4D51C2D82B14B1], [0x165667B19E3779F9]])
+"""Of each axis, to mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
 
 class NumpyReference:
@@ -37,8 +53,9 @@ class NumpyReference:
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""
         started = time.perf_counter()
+        check_depth(frame)
         check_frame(frame, self.num_classes)
-        seen = observe(frame, self.voxel_size, self.num_classes)
+        seen = observe(frame, self.voxel_size, self.num_classes, self._pixels(frame))
         rows = self._rows(seen)
         before = self._evidence[rows]
         after = before + seen.s_bar
@@ -72,6 +89,10 @@ class NumpyReference:
             voxel_size=self.voxel_size,
         )
 
+    def _pixels(self, frame: Frame) -> Mask:
+        """Those of the frame that are observed: the valid ones."""
+        return frame.valid
+
     def _rows(self, seen: Observations) -> Int64:
         """The rows of the frame's voxels, new ones added."""
         voxels = map(tuple, seen.index.tolist())
@@ -81,3 +102,20 @@ class NumpyReference:
             self._evidence = np.pad(self._evidence, ((0, room), (0, 0)))
             self._op = np.pad(self._op, (0, room))
         return rows
+
+
+class NumpySample(NumpyReference):
+    """The reference on one in `ONE_IN` of the voxels, drawn at random by their index, through all frames."""
+
+    def _pixels(self, frame: Frame) -> Mask:
+        chosen = frame.valid.copy()
+        chosen[chosen] = in_sample(voxel_index(back_project(frame), self.voxel_size, frame))
+        return chosen
+
+
+def in_sample(index: Int64) -> Mask:
+    """Whether the voxels of that index (3, n) are in the sample."""
+    with np.errstate(over="ignore"):
+        mixed = (index * ODD).sum(axis=0)
+    drawn: Mask = (mixed >> 40) % ONE_IN == 0
+    return drawn

@@ -19,7 +19,7 @@ from open3d.t.geometry import PointCloud, VoxelBlockGrid
 
 from semstab.backends.open3d_blocks import Open3DBlocks
 from semstab.backends.shared.aggregator import Aggregator
-from semstab.backends.shared.association import Float64, Int64, check_frame
+from semstab.backends.shared.association import Float64, Int64, check_depth, check_frame
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.observed import Observed
 from semstab.errors import ConfigError
@@ -82,6 +82,7 @@ class Projector(Aggregator):
 
         Raises DataError for a label outside the classes, or a point more than 2^20 voxels from the origin.
         """
+        check_depth(frame)
         check_frame(frame, self.num_classes)
         blocks = self._touched(frame)
         step = max(1, CHUNK // len(self._local))

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 
 from semstab.backends import FusionBackend
+from semstab.backends.shared.association import check_depth
 from semstab.backends.torch_parts.maps import TorchMaps
 from semstab.backends.torch_parts.storage import SLOT_BYTES
 from semstab.backends.torch_parts.views import DepthView, Image, TensorPrediction, evidence_of_frame
@@ -64,6 +65,7 @@ class TorchMap(FusionBackend):
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame, copied to the device."""
         started = time.perf_counter()
+        check_depth(frame)
         view, said = DepthView.of_frame(frame, self.device), evidence_of_frame(frame, self.device)
         return self.maps.fuse(view, {"": said}, started)[""]
 

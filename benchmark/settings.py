@@ -42,7 +42,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
     path = _find(str(study))
     content = _over(read_yaml(path), overrides or {})
     own = {"name": path.stem, "check": None}
-    return Config.build(merge(own, merge(dataset_defaults(content), content)), str(path))
+    return Config.build(merge(merge(dataset_defaults(content), own), content), str(path))
 
 
 def shipped_studies() -> tuple[str, ...]:

@@ -15,6 +15,6 @@ def dataset_of(root: Path, **options: Any) -> dict[str, Any]:
 
 
 def configure(root: Path, **settings: Any) -> Config:
-    """Fused by the reference into voxels of 0.25 m, unless the settings say otherwise."""
-    usual = {"dataset": dataset_of(root), "backends": ["numpy"], "voxel_size": 0.25}
+    """Fused by the reference into voxels of 0.25 m, and checked against it, unless the settings say otherwise."""
+    usual = {"dataset": dataset_of(root), "backends": ["numpy"], "check": "numpy", "voxel_size": 0.25}
     return resolve(load_config(overrides={**usual, **settings}))

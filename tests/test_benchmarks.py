@@ -11,7 +11,7 @@ import pytest
 
 PERF = Path(__file__).parent / "perf"
 SMALL = {
-    "bench_fusion.py": ["--sizes", "96x54", "--classes", "7", "--rounds", "1"],
+    "bench_fusion.py": ["--sizes", "96x54", "--rounds", "1", "--conditions", "noise 0.3 %"],
     "bench_scaling.py": ["--size", "96x54", "--voxels", "1000", "5000"],
     "bench_casting.py": ["--size", "96x54", "--triangles", "200", "--rounds", "1"],
     "bench_end_to_end.py": ["--size", "96x54", "--frames", "3", "--runs", "1", "--noise", "0", "--backend", "numpy"],

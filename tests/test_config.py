@@ -13,7 +13,8 @@ from semstab.settings import load_config, resolve
 def test_defaults_are_the_papers() -> None:
     config = Config()
     assert (config.voxel_size, config.strata, config.dataset.name) == (0.2, [1, 2, 5], "city")
-    assert [backend.name for backend in config.fused_by()] == ["numba", "numpy"]
+    assert [backend.name for backend in config.fused_by()] == ["numba"]
+    assert [backend.name for backend in load_config().fused_by()] == ["numba", "numpy"]  # the city is checked whole
 
 
 def test_the_checking_backend_is_not_fused_twice() -> None:

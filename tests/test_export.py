@@ -228,6 +228,8 @@ def las_cloud(path, points, point_format=7, crs=CRS):
     cloud.x, cloud.y, cloud.z = points.T
     cloud.intensity, cloud.views = np.arange(len(points)), np.arange(len(points)) % 7
     cloud.classification = np.full(len(points), 2)
+    if point_format > 5:
+        cloud.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("surveyor", 7, "", b"mine"), laspy.VLR("copc", 1000)])
     cloud.write(path)
     return path
 
@@ -244,6 +246,7 @@ def test_a_las_cloud_is_classified_and_keeps_its_fields(fused, table, points, po
     assert np.array(after.classification).tolist() == [*[1] * (len(table) + 1), 0]
     assert after.op.tolist() == [*table.op, table.op[-1], 0]
     np.testing.assert_allclose(after.vss, [*vss(table), vss(table)[-1], 0], rtol=1e-6)
+    assert [vlr.user_id for vlr in after.evlrs or ()] == ["surveyor"] * (point_format > 5)
     assert done.content == f"{len(points)} points, {(len(points) - 1) / len(points):.1%} of them classified"
     export(fused / "run", fused / "none.laz", backbone="a", onto=fused / "onto.laz", radius=0)
     again = laspy.read(fused / "none.laz")
@@ -286,19 +289,22 @@ def test_clouds_that_cannot_be_classified(fused, points):
         export(fused / "run", fused / to, backbone="a", onto=cloud)
 
     there = las_cloud(fused / "there.laz", points[-1:] + 1000)
-    fails(DataError, "no point lies in the map: it spans .* m, the map .*; mend", classify, there)
-    fails(
-        DataError,
-        "is in EPSG:32616, the run in EPSG:32615",
-        classify,
-        las_cloud(fused / "z.laz", points, crs="EPSG:32616"),
-    )
+    fails(DataError, "no point lies in the map: it spans .* m, the map .*; mend the cloud", classify, there)
+    beside = fused / "nowhere", fused / "never.laz"
+    fails(DataError, "give the run's dataset a georeference", export, *beside, backbone="a", onto=there)
+    elsewhere = las_cloud(fused / "elsewhere.laz", points, crs="EPSG:32616")
+    fails(DataError, "is in EPSG:32616, the run in EPSG:32615; reproject", classify, elsewhere)
     fails(ConfigError, "stays what it is; write .*never.las", classify, las_cloud(fused / "c.las", points), "never.ply")
     fails(ConfigError, "is the cloud itself", classify, fused / "c.las", "c.las")
     fails(ConfigError, "a cloud is a .las", classify, fused / "cloud.e57")
     damaged = fused / "damaged.laz"
-    damaged.write_bytes(there.read_bytes()[:300])
-    fails(DataError, "damaged.laz: cannot be read", classify, damaged)
+    for size in (100, 300, -200):
+        damaged.write_bytes(las_cloud(fused / "z.laz", points).read_bytes()[:size])
+        fails(DataError, "damaged.laz: cannot be read", classify, damaged)
+    las = las_cloud(fused / "c.las", points, point_format=3)
+    header = laspy.read(las).header
+    las.write_bytes(las.read_bytes()[: header.offset_to_point_data + 10 * header.point_format.size])
+    fails(DataError, f"c.las: ends after 10 of {len(points)} points", classify, las)
     short = ply_cloud(fused / "short.ply", points)
     short.write_bytes(short.read_bytes()[:-30])
     fails(DataError, "it is cut short", classify, short, "never.ply")

@@ -4,11 +4,11 @@ import sys
 
 import pytest
 import tiny_scene
-from command_line import bench
 from posed_config import configure, dataset_of
 from posed_scene import fails
 
 import semstab
+from semstab.convert import convert
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.model.georeference import Georeference, wkt
@@ -40,10 +40,8 @@ def test_a_finished_run_knows_where_its_scenes_lie(root, tmp_path) -> None:
 
 
 def test_a_conversion_keeps_it(root, tmp_path) -> None:
-    option = (f"dataset.options.{text}" for text in ("crs=EPSG:32615", "offset=[576714, 5188162, 0]"))
-    bench(
-        "convert", "--data", root, *(word for text in option for word in ("--set", text)), "--out", "out", cwd=tmp_path
-    )
+    config = configure(root, dataset=dataset_of(root, crs="EPSG:32615", offset=OFFSET))
+    assert [done.scene for done in convert(config, tmp_path / "out")] == ["wall"]
     converted = open_dataset("posed_folder", {"root": tmp_path / "out" / "wall"})
     assert converted.scene("wall").georeference == Georeference(wkt(UTM, "x"), OFFSET)
     assert open_dataset("posed_folder", {"root": root}).scene("wall").georeference is None

@@ -307,7 +307,7 @@ def test_a_map_agrees_with_itself():
     assert (row.scene, row.backbone, row.backends) == ("s", "b", ("numpy", "open3d"))
     assert (row.voxels, row.only_in) == ((3, 3), (0, 0))
     assert {name: (d.max, d.mean) for name, d in row.differences.items()} == dict.fromkeys(
-        ["op", *(measure.key for measure in measures()), "evidence"], (0, 0)
+        ["op", *(measure.key for measure in measures()), "evidence", "label"], (0, 0)
     )
 
 
@@ -317,7 +317,7 @@ def test_a_map_agrees_with_itself():
         ("op", 2, 5, {"op", "sbd"}),
         ("drift_sum", 1, 0.4, {"sbd"}),
         ("evidence", 1, [2, 2], {"evidence"}),
-        ("evidence", 2, [1, 3], {"evidence"}),
+        ("evidence", 2, [1, 3], {"evidence", "label"}),
         ("evidence", 2, [2, 2], {"evidence", "vss", "entropy", "margin"}),
     ],
 )

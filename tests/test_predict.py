@@ -758,7 +758,7 @@ def test_run_with_a_model_from_the_command_line(scene, tmp_path):
             "--image-size big: write the shorter side",
         ),
         (("-m", "colour-clusters", "--data", "flight", "--name", ".."), "name: it names a folder"),
-        (("-m", "colour-clusters", "--data", "flight", "--set", "dataset.depth_skale=2"), "did you mean 'depth_scale'"),
+        (("-m", "colour-clusters", "--data", "flight", "--option", "depth_skale=2"), "did you mean 'depth_scale'"),
         (
             ("-m", "segformer", "--data", "flight", "--model", "nowhere/at/all"),
             "nowhere/at/all: there is no such folder",

@@ -12,12 +12,12 @@ from simulated_events import grid, log_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.comparison import BackboneComparison
-from semstab.model.statistics import UNDEFINED, ClassReach, FrameAgreement, MapStatistics, Reach
+from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, ClassReach, Interval, Judged, MapStatistics, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.statistics_text import comparison_lines, lines
 from semstab.runtime.files import read_json, write_json
 from semstab.runtime.json_form import from_json, to_json
-from semstab.statistics import Estimate, analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
+from semstab.statistics import analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
 from semstab.statistics.agreement import PSA
 
 SIDE, F = 24, 8
@@ -71,21 +71,22 @@ def test_a_description_holds_what_the_functions_say(described):
     found = summary.correctness.quadrants
     parts_of_all = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
     assert sum(share.value for share in parts_of_all) == pytest.approx(1)
-    assert summary.drift.tests.drifting_voxels == 0
+    assert summary.drift.tests.trending_voxels == 0
     assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 
 def test_every_map_has_a_value_for_every_voxel(described):
     assert {len(values) for values in described.maps.values()} == {SIDE**2}
     assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(described.maps)
-    assert described.maps["stable_wrong"].sum() > 10
+    assert 0 <= np.nanmin(described.maps["stable"]) < np.nanmax(described.maps["stable"]) <= 1
 
 
 def test_the_same_seed_gives_the_same_description():
     events = backbone(0.2, 3)
     a, b, other = (describe(events.table(), events, seed=seed) for seed in (4, 4, 5))
     assert to_json(a) == to_json(b)
-    assert a.agreement.psa.low != other.agreement.psa.low
+    assert a.drift.tests.trend_p != other.drift.tests.trend_p
+    assert a.agreement == other.agreement
 
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
@@ -141,19 +142,17 @@ def test_one_backbone_cannot_be_compared():
 
 
 def between(low, high):
-    return Estimate((low + high) / 2, low, high)
+    return Interval((low + high) / 2, low, high, question=NEXT_FLIGHT, frames=60)
 
 
-def judged(low, high, wrong=UNDEFINED, voxels=5000, blocks=40, ceiling=None, classes=()):
+def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, classes=()):
     """By alpha between frames as it is, or where there is a ceiling by the share of it that is reached."""
     middle = between(low, high)
-    agreement = FrameAgreement(*[middle] * 8, classes=())
+    numbers = Judged(*[middle] * 5, wrong_of_stable=wrong)
     reach = (
         None if ceiling is None else Reach("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
     )
-    return verdict(
-        "net", agreement=agreement, reach=reach, voxels=voxels, share=0.5, blocks=blocks, wrong_of_stable=wrong
-    )  # fmt: skip
+    return verdict("net", judged=numbers, reach=reach, voxels=voxels, share=0.5, blocks=blocks)
 
 
 def of_class(name, low, high, *, matters=True):
@@ -172,9 +171,9 @@ def test_the_interval_decides_the_level(low, high, level):
 
 
 def test_what_is_stably_wrong_is_not_called_stable():
-    assert judged(0.9, 0.95, Estimate(0.2, 0.1, 0.3)).level == "misleading"
-    assert judged(0.9, 0.95, Estimate(0.06, 0.04, 0.1)).level == "stable"
-    assert "20% of the stable places are wrong (10% to 30%)" in judged(0.9, 0.95, Estimate(0.2, 0.1, 0.3)).line
+    assert judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).level == "misleading"
+    assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"
+    assert "20% of the stable places are wrong (10% to 30%)" in judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).line
 
 
 def test_there_is_no_verdict_from_few_places():
@@ -187,8 +186,19 @@ def test_the_line_says_what_to_do_and_why():
     assert judged(0.5, 0.6).line == (
         "net: unstable, do not act on its labels: two frames agree on 55% of the places (50% to 60%),"
         " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 places seen twice or more, 50% of"
-        " the map"
+        " the map; intervals are for the next flight, from 60 frames"
     )
+
+
+def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames_are_said():
+    events = backbone(0.1, 3)
+    few = describe(events.table(), events).verdict.line
+    assert "intervals are for these 8 frames: fly 40 or more to tell of the next flight" in few
+    assert "these frames: keep a log" in describe(events.table()).verdict.line
+    alike = Interval(0.9, 0.85, 0.95, undecided="errors reach as far as the scene: fly more of it")
+    found = verdict("net", judged=Judged(*[alike] * 5, UNKNOWN), reach=None, voxels=5000, share=0.5, blocks=40)
+    assert found.level == "undecided"
+    assert "fly more of it" in found.line
 
 
 def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():

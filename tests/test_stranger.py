@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 
 import numpy as np
 import pytest
 import tiny_scene
-from posed_config import configure
+from posed_config import configure, dataset_of
+from posed_writer import write_posed
 from rich.console import Console
 
 import semstab
+from semstab.backends.numba_hash import NumbaHash
+from semstab.backends.numpy_reference import NumpyReference, NumpySample, in_sample
+from semstab.check import check
+from semstab.config import read_yaml
+from semstab.errors import DataError
+from semstab.metrics import split_last, summarise
+from semstab.metrics.matching import rows_of
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.voxels import Events
+from semstab.outputs.report.reading import reading
+from semstab.outputs.tables import tables
 from semstab.outputs.terminal import print_summary
+from semstab.settings import load_config, resolve
+from semstab.testing.builders import assert_same_map, random_frames
 
 
 def printed(result) -> str:
@@ -33,3 +48,163 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     result = semstab.run(configure(folder))
     assert result.select()[0].summary.frames_empty == 1
     assert "scene, a: 1 of 3 frames hold no pixel with both depth and a label" in printed(result)
+
+
+# --- The check against the reference ----------------------------------------------------------------------------------
+
+
+def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
+    folder = tiny_scene.write(tmp_path / "scene", frames=12)
+    config = configure(folder, backends=["numba"], check="sample", voxel_size=0.05)
+    result = semstab.run(config, out=tmp_path / "run", report=False)
+    assert [record.unit.backend for record in result.records] == ["numba", "numba"]
+    for row in result.agreement:
+        assert row.agrees
+        assert (row.backends, row.one_in) == (("numba", "numpy"), 16)
+        assert 0 < row.voxels[0] == row.voxels[1] < result.select()[0].summary.table.voxels / 4
+    assert "numba against the numpy reference on" in printed(result)
+    assert semstab.run(config, out=tmp_path / "run", report=False).manifest["units"]["kept"] == 2
+
+
+def test_the_sample_finds_a_backend_that_is_wrong(tmp_path, monkeypatch) -> None:
+    """One that counts a pixel too much in every tenth voxel."""
+    right = NumbaHash.table
+
+    def wrong(self):
+        table = right(self)
+        return dataclasses.replace(table, evidence=table.evidence + (table.ix[:, None] % 10 == 0) * [1.0, 0, 0])
+
+    monkeypatch.setattr(NumbaHash, "table", wrong)
+    folder = tiny_scene.write(tmp_path / "scene", backbones=("a",), frames=40)
+    result = semstab.run(configure(folder, backends=["numba"], check="sample", voxel_size=0.05))
+    assert not result.agrees
+    assert "DISAGREE" in printed(result)
+
+
+def test_the_sample_is_part_of_the_reference() -> None:
+    frames, K = random_frames(1), 4
+    whole, sample = NumpyReference(0.2, K), NumpySample(0.2, K)
+    for frame in frames:
+        whole.integrate(frame)
+        sample.integrate(frame)
+    drawn = rows_of(whole.table(), in_sample(whole.table().index.T.astype(np.int64)))
+    assert 0 < len(drawn) < len(whole.table()) / 4
+    assert_same_map(sample.table(), drawn, 0)
+
+
+# --- Backends that differ by design -----------------------------------------------------------------------------------
+
+
+def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_path) -> None:
+    config = configure(scene, backends=["numba", "open3d-projective"], check=None, backbones=["a"], voxel_size=0.25)
+    result = semstab.run(config, out=tmp_path / "run", report=False)
+    (row,) = result.compared
+    assert row.backends == ("numba", "open3d-projective")
+    assert result.agreement == ()
+    assert result.agrees
+    assert semstab.load_result(tmp_path / "run").compared == result.compared
+    told = printed(result)
+    assert "backends that differ by design" in told
+    assert told.count("open3d-projective") == 2
+    assert {table.name for table in tables(result)} >= {"fusion", "fusion_compared"}
+    assert "agreement" not in {table.name for table in tables(result)}
+    assert any(sentence.startswith("open3d-projective, which") for sentence in reading(result, ()))
+
+
+# --- The voxel size ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory):
+    """Frames of 64x48 pixels that overlap, of a wall with relief; nearly all of it is background."""
+    rng, frames = np.random.default_rng(0), {"net": []}
+    relief = rng.uniform(1.9, 2.1, (48, 64 + 20)).round(3).astype(np.float32)
+    for k in range(8):
+        T = np.eye(4)
+        T[:3, 3] = [2 / 60 * k, 0.013, 0.017]
+        labels = np.zeros((48, 64), np.uint8)
+        labels[:8] = rng.integers(0, 3, (8, 64))
+        camera = Intrinsics(60, 60, 31.5, 23.5)
+        frames["net"].append(Frame(k, relief[:, k : k + 64], camera, T, labels=labels))
+    folder = tmp_path_factory.mktemp("data") / "wide"
+    return write_posed(folder, [f"{k}" for k in range(8)], frames, classes=["background", "door", "window"])
+
+
+def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) -> None:
+    config = resolve(load_config({"dataset": dataset_of(wide), "check": None}))
+    (checked,) = check(config)
+    result = semstab.run(config, out=tmp_path / "run", report=False)
+    size = result.advice["wide"].voxel_size
+    assert size == checked.suggestion.voxel_size == result.select()[0].summary.table.voxel_size
+    assert f"voxels of {size:g} m: the smallest in which half of the points fall again" in printed(result)
+    assert read_yaml(tmp_path / "run" / "config.yaml")["voxel_size"] == size
+    assert checked.persistence[1].voxel_size == size
+
+
+def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
+    result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0))
+    assert not result.advice["wide"].chosen
+    told = printed(result)
+    assert "voxels of 1 m: " in told
+    assert "m would do, and tell apart what these blur" in told
+    assert [size.voxel_size for size in result.select()[0].summary.sizes] == [0.5, 1, 2]
+    assert "over voxel sizes, from 8 frames: alpha" in told
+    assert "'background' is" in told
+    assert "--set 'exclude.classes=[background]' leaves it out" in told
+
+
+# --- Strata -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_crowded_last_stratum_is_split_by_its_op() -> None:
+    rng = np.random.default_rng(0)
+    op = np.concatenate([np.ones(10, int), rng.integers(6, 120, 990)])
+    events = simulated(op, rng)
+    table = summarise(events.table())
+    parts = split_last([table])
+    assert [row.name for row in table.strata] == ["OP=1", "OP=2", "3<=OP<=5", "OP>5"]
+    assert 2 <= len(parts) <= 3
+    assert sum(part.voxels for part in parts) == table.strata[-1].voxels
+    assert parts[0].name.startswith("6<=OP<=")
+    assert all(part.voxels > 150 for part in parts)
+    several = split_last([table, table])
+    assert [part.voxels for part in several] == [2 * part.voxels for part in parts]
+    few = summarise(simulated(np.repeat([1, 2, 7], [50, 30, 20]), rng).table())
+    assert split_last([few]) == []
+
+
+def test_what_was_hardly_ever_seen_once_needs_no_remark(scene) -> None:
+    said = "were seen once: they say nothing"
+    assert said in printed(semstab.run(configure(scene, backbones=["a"])))
+    assert said not in printed(semstab.run(configure(scene, backbones=["a"], voxel_size=4.0)))
+
+
+def simulated(op, rng) -> Events:
+    """One-hot events of voxels that are seen that often."""
+    rows, n = np.repeat(np.arange(len(op)), op), int(op.sum())
+    zeros = np.zeros(len(op), np.int32)
+    frame = np.concatenate([np.arange(count) for count in op]).astype(np.int32)
+    evidence = np.eye(3)[rng.integers(0, 3, n)]
+    ones = np.ones(n, np.int64)
+    return Events(
+        ix=np.arange(len(op), dtype=np.int32), iy=zeros, iz=zeros, voxel=rows, frame=frame, evidence=evidence,
+        pixels=ones, voxel_size=0.1,
+    )  # fmt: skip
+
+
+# --- What cannot be meant ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["numpy", "numba", "open3d", "open3d-projective", "torch"])
+def test_depth_that_cannot_be_metres_is_refused(name) -> None:
+    def fuse(depth):
+        camera, labels = Intrinsics(60, 60, 32, 32), np.zeros(depth.shape, np.uint8)
+        fused = semstab.backends.create(name, voxel_size=0.5, num_classes=2)
+        fused.integrate(Frame(3, depth, camera, np.eye(4), labels=labels))
+        return fused.table()
+
+    with pytest.raises(DataError, match="frame 3, depth: depth is finite nowhere"):
+        fuse(np.full((64, 64), np.nan))
+    with pytest.raises(DataError, match="frame 3, depth: depth looks like millimetres, whole numbers up to 4595"):
+        fuse(np.arange(500.0, 4596.0).reshape(64, 64))
+    assert len(fuse(np.full((64, 64), 400.0)))  # one whole number of metres is a depth

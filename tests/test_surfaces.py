@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import io
+import json
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import looking_down as down
 import numpy as np
 import pytest
-from command_line import bench, error_of
-from dataset_writers import write_colmap
+from dataset_writers import write_colmap, write_transforms
 from posed_config import configure, dataset_of
 from posed_scene import fails
 from posed_writer import write_posed
+from rich.console import Console
 
 import semstab
-from semstab.check import quick_check
+from semstab.check import check, quick_check
+from semstab.check.display import print_check
 from semstab.datasets import open_dataset
 from semstab.datasets.surfaces import surface as surfaces
 from semstab.datasets.surfaces.casting import View
@@ -131,6 +135,14 @@ def test_a_posed_folder_gives_the_voxels_of_its_depth_files(flight, mesh, tmp_pa
     assert stored.manifest["depth_from"] == {}
 
 
+def test_intrinsics_are_those_of_the_depth_files_that_a_surface_stands_for(flight, mesh, tmp_path) -> None:
+    other = shutil.copytree(flight, tmp_path / "field")
+    for path in (other / "color").iterdir():
+        cv2.imwrite(str(path), np.zeros((7, 9, 3), np.uint8))
+    scene = open_dataset("posed_folder", {"root": other, "surface": mesh, "casts": False}).scene("field")
+    np.testing.assert_allclose(scene.depth(1), down.plane_depth(down.pose(1)), atol=2e-5)
+
+
 def test_a_run_is_kept_while_its_surface_is_the_same(flight, mesh, tmp_path) -> None:
     def units(surface):
         dataset = dataset_of(flight, surface=str(surface), casts=False)
@@ -149,6 +161,15 @@ def test_other_datasets_need_no_depth_either(mesh, tmp_path) -> None:
     (tmp_path / "col/sparse/cameras.txt").write_text(text.replace("48 32", f"{down.W} {down.H}"))
     scene = open_dataset("colmap", {"root": tmp_path / "col", "surface": mesh, "casts": False}).scene("col")
     assert scene.missing(1) == []
+    np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
+    write_transforms(tmp_path / "trans", frames)
+    content = json.loads((tmp_path / "trans/transforms.json").read_text()) | {"w": down.W, "h": down.H}
+    for entry in content["frames"]:
+        del entry["depth_file_path"]
+    (tmp_path / "trans/transforms.json").write_text(json.dumps(content))
+    scene = open_dataset("transforms_json", {"root": tmp_path / "trans", "surface": mesh, "casts": False}).scene(
+        "trans"
+    )
     np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
 
 
@@ -197,10 +218,13 @@ def test_without_images_nothing_is_claimed_of_a_surface(photographs, mesh, tmp_p
     assert "without images of overlapping frames nothing tells whether they fit" in verdict.text
 
 
-def test_the_check_says_what_depth_is_cast_at(photographs, mesh, tmp_path) -> None:
-    options = ("--set", f"dataset.options.surface={mesh}", "--set", "dataset.options.casts=false")
-    said = " ".join(bench("check", "--data", photographs, *options, cwd=tmp_path).stdout.split())
-    assert f"from rays cast at {mesh}" in said
+def test_the_check_says_what_depth_is_cast_at(photographs, mesh) -> None:
+    config = configure(photographs, dataset=dataset_of(photographs, surface=str(mesh), casts=False))
+    (checked,) = check(config)
+    console = Console(record=True, width=80, file=io.StringIO())
+    print_check(checked, console)
+    said = " ".join(console.export_text().split())
+    assert f"from rays cast at {mesh}".replace(" ", "") in said.replace(" ", "")
     assert "field: sound: neighbouring images match" in said
     assert "reprojected into each other" not in said
 
@@ -218,8 +242,7 @@ def test_a_surface_in_other_coordinates_than_the_poses_says_how_far_off(flight, 
     fails(DataError, match, dataset.scene("field").geometry, 1)
     config = configure(flight, dataset=dataset_of(flight, surface=str(path), casts=False))
     fails(DataError, match, semstab.engine.run, config)
-    options = ("--set", f"dataset.options.surface={path}", "--set", "dataset.options.casts=false")
-    assert re.search(match, error_of("check", "--data", flight, *options, cwd=tmp_path))
+    fails(DataError, match, list, check(config))
 
 
 def test_cameras_that_look_elsewhere_are_told_so(flight, mesh) -> None:
@@ -268,6 +291,12 @@ def test_a_raster_of_another_projection_or_turned_is_told_what_to_do(tmp_path) -
     fails(DataError, "t.tif: the raster is rotated", Surface(path, georeference=placed()).depth, view())
 
 
+def test_heights_need_z_to_be_up(flight, tmp_path) -> None:
+    path = down.write_raster(tmp_path / "dsm.tif")
+    dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "up_axis": "-y"})
+    fails(ConfigError, "dsm.tif: is a surface over x and y, but up_axis is -y; turn it", dataset.scene, "field")
+
+
 def test_a_grid_that_is_too_fine_is_refused(tmp_path) -> None:
     path = down.write_points(tmp_path / "c.ply")
     fails(DataError, "too many .* set a larger surface_cell", Surface(path, cell=0.001).depth, view())
@@ -283,7 +312,8 @@ def test_without_the_extra_it_is_said_what_to_install(tmp_path, monkeypatch) -> 
 
 def test_without_a_size_it_is_said_what_to_set(flight, mesh, tmp_path) -> None:
     bare = shutil.copytree(flight, tmp_path / "field")
-    shutil.rmtree(bare / "color")
+    for folder in ("color", "depth"):
+        shutil.rmtree(bare / folder)
     options = {"root": bare, "surface": mesh, "casts": False}
     scene = open_dataset("posed_folder", options).scene("field")
     fails(DataError, "no colour image says the size of depth; set intrinsics_size", scene.depth, 0)

@@ -13,7 +13,7 @@ from semstab.backends.shared.association import INDEX_LIMIT, check_frame, voxel_
 from semstab.backends.shared.entries import find_entries
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
-from semstab.backends.shared.merging import compact, group, merge_scores, scatter, sort_labels, sum_scores
+from semstab.backends.shared.merging import HALVES, compact, group, merge_scores, scatter, sort_labels, sum_scores
 from semstab.backends.shared.observed import Observed, WorkSpace
 from semstab.backends.shared.pixel_keys import frame_terms
 from semstab.backends.shared.tiles import Tiles
@@ -143,7 +143,7 @@ class Aggregator:
         base = np.concatenate([[0], np.cumsum(at.entries)])
         sums = np.zeros((total, K))
         where = at.where[: frame.depth.size].reshape(frame.shape)
-        sum_scores(fixed(_widened(frame.scores)), where, at.rows, base, sums)
+        sum_scores(_readable(frame.scores), HALVES, where, at.rows, base, sums)
         weights = np.zeros((n, K))
         merge_scores(order, edges, voxel, bounds, at.room, base, sums, merged_key, merged_pixels, keys, pixels, weights)
         start = np.arange(n + 1, dtype=np.int64) * K
@@ -163,9 +163,9 @@ class Aggregator:
         return origin.astype(np.int64)
 
 
-def _widened(scores: Any) -> Any:
-    """Half-precision scores as float32: numba knows no float16."""
-    return scores.astype(np.float32) if scores.dtype == np.float16 else scores
+def _readable(scores: Any) -> Any:
+    """Half-precision scores as their bits."""
+    return fixed(scores).view(np.uint16) if scores.dtype == np.float16 else fixed(scores)
 
 
 def slots_for(entries: int) -> int:

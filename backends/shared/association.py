@@ -17,8 +17,15 @@ from semstab.model.frames import Frame
 INDEX_LIMIT = 2**31
 """Voxel indices are int32."""
 
+LOOKED_AT = 2**12
+"""Pixels of a depth map, about, that are looked at for its unit; of one as large some must be finite."""
+
+FAR, DISTINCT = 100.0, 8
+"""Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +66,46 @@ def check_frame(frame: Frame, num_classes: int) -> None:
             )
 
 
-def observe(frame: Frame, voxel_size: float, num_classes: int) -> Observations:
-    """The frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q."""
-    points = back_project(frame)
+def check_depth(frame: Frame) -> None:
+    """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
+    depth = frame.depth
+    step = max(1, int(np.sqrt(depth.size / LOOKED_AT)))
+    some = depth[::step, ::step]
+    if depth.size >= LOOKED_AT and not np.isfinite(some).any() and not np.isfinite(depth).any():
+        raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
+    if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
+        raise DataError(
+            f"{frame.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
+            " divide it by 1000, or set depth_scale"
+        )
+
+
+def _whole_millimetres(depth: npt.NDArray[np.float32]) -> bool:
+    """Whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
+    if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
+        return False
+    return len(np.unique(depth)) >= DISTINCT
+
+
+def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:
+    """The frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q.
+
+    Only of some of its valid `pixels` (H, W), where these are given.
+    """
+    chosen = frame.valid if pixels is None else pixels
+    points = back_project(frame, chosen)
     if not points.shape[1]:
         nothing = np.zeros((0, 3), dtype=np.int64), np.zeros((0, num_classes)), np.zeros(0, dtype=np.int64)
         return Observations(*nothing)
     key, low, size = pack(voxel_index(points, voxel_size, frame), frame)
-    voxels, inverse, pixels = np.unique(key, return_inverse=True, return_counts=True)
+    voxels, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
     s_sum = np.zeros((len(voxels), num_classes))
-    np.add.at(s_sum, inverse, evidence_of(frame, num_classes))
-    return Observations(unpack(voxels, low, size), s_sum / pixels[:, None], pixels)
+    np.add.at(s_sum, inverse, evidence_of(frame, num_classes, chosen))
+    return Observations(unpack(voxels, low, size), s_sum / count[:, None], count)
 
 
-def back_project(frame: Frame) -> Float64:
-    """World coordinates (3, n), metres, of the frame's valid pixels in row order.
+def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
+    """World coordinates (3, n), metres, of the frame's valid pixels, or of some of them (H, W), in row order.
 
     x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1).
 
@@ -85,7 +117,7 @@ def back_project(frame: Frame) -> Float64:
     with np.errstate(invalid="ignore", over="ignore"):
         x = ((np.arange(W) - K.cx) / K.fx) * d
         y = (((np.arange(H) - K.cy) / K.fy)[:, None]) * d
-    valid = frame.valid
+    valid = frame.valid if pixels is None else pixels
     x, y, z = x[valid], y[valid], d[valid]
     return np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
 
@@ -125,12 +157,16 @@ def unpack(key: Int64, low: Int64, size: tuple[int, ...]) -> Int64:
     return np.stack(np.unravel_index(key, size), axis=1) + low
 
 
-def evidence_of(frame: Frame, num_classes: int) -> Float64:
-    """Evidence vectors s (n, K) of the valid pixels in row order: one-hot labels, or scores normalised to sum 1."""
+def evidence_of(frame: Frame, num_classes: int, pixels: Mask | None = None) -> Float64:
+    """Evidence vectors s (n, K) of the valid pixels, or of some of them (H, W), in row order.
+
+    One-hot labels, or scores normalised to sum 1.
+    """
+    valid = frame.valid if pixels is None else pixels
     if frame.scores is not None:
-        s = frame.scores[frame.valid].astype(np.float64)
+        s = frame.scores[valid].astype(np.float64)
         normalised: Float64 = s / s.sum(axis=1, keepdims=True)
         return normalised
     assert frame.labels is not None
-    one_hot: Float64 = np.eye(num_classes)[frame.labels[frame.valid]]
+    one_hot: Float64 = np.eye(num_classes)[frame.labels[valid]]
     return one_hot

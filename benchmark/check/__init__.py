@@ -1,5 +1,6 @@
 """Does a dataset make sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
+from semstab.check.advice import advise, with_voxel_size
 from semstab.check.geometry import Verdict
 from semstab.check.scene_check import (
     SCHEMA,
@@ -7,8 +8,21 @@ from semstab.check.scene_check import (
     check,
     check_scene,
     quick_check,
+    quick_look,
     refuse_unsound,
     require_sound,
 )
 
-__all__ = ["SCHEMA", "SceneCheck", "Verdict", "check", "check_scene", "quick_check", "refuse_unsound", "require_sound"]
+__all__ = [
+    "SCHEMA",
+    "SceneCheck",
+    "Verdict",
+    "advise",
+    "check",
+    "check_scene",
+    "quick_check",
+    "quick_look",
+    "refuse_unsound",
+    "require_sound",
+    "with_voxel_size",
+]

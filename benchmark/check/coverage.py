@@ -230,9 +230,14 @@ def _without_labels(view: View, pixel_stride: int) -> Frame:
     return Frame(view.index, view.depth, view.camera.every(view.stride), view.T_wc, labels=labels).every(step)
 
 
+def suggested_size(coverage: Coverage) -> float | None:
+    """The smallest voxel size in which points fall again, metres; None where frames do not see the same."""
+    return next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
+
+
 def suggest(coverage: Coverage, overlaps: Sequence[Overlap], stride: int) -> Suggestion:
     """Voxel size, pixel stride and frame stride that suit the data; `stride` is the selected frames' own."""
-    voxel_size = next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
+    voxel_size = suggested_size(coverage)
     views = coverage.sample.views.values()
     far = float(np.percentile(np.concatenate([view.depth[view.v, view.u] for view in views]), 95))
     footprint = far / min(view.camera.fx for view in views)

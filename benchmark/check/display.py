@@ -62,7 +62,7 @@ def _tables(checked: SceneCheck) -> Iterator[tuple[str, Table]]:
     if checked.overlaps:
         yield "what frames share, by their distance among the selected ones", _overlap_table(checked)
     if checked.persistence:
-        every = f", every {checked.fused_stride}. pixel of each axis" if checked.fused_stride > 1 else ""
+        every = f", every {_ordinal(checked.fused_stride)} pixel of each axis" if checked.fused_stride > 1 else ""
         whose = "all" if checked.fused_frames == checked.selected else f"{checked.fused_frames} evenly spaced"
         yield f"observation persistence, {whose} frames fused{every}", _persistence_table(checked)
     if checked.labels:
@@ -170,3 +170,12 @@ def _metres(value: float) -> str:
     if math.isnan(value):
         return NOTHING
     return f"{value:.3g} m" if value >= 1 else f"{100 * value:.3g} cm" if value >= 0.1 else f"{1e3 * value:.3g} mm"
+
+
+def _ordinal(n: int) -> str:
+    """'2nd', '3rd', '11th'."""
+    last = 0 if n % 100 in (11, 12, 13) else n % 10
+    return f"{n}{_ENDINGS.get(last, 'th')}"
+
+
+_ENDINGS = {1: "st", 2: "nd", 3: "rd"}

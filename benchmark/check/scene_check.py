@@ -52,7 +52,7 @@ LABELLED_FRAMES = 8
 """Frames in which the labels of every backbone but the first are counted."""
 
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
-"""Voxel sizes for which the distribution of OP is told, relative to the configured one."""
+"""Voxel sizes for which the distribution of OP is told, relative to the configured or the suggested one."""
 
 
 @dataclass(frozen=True)
@@ -149,19 +149,27 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
 
 
 def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
-    """Do depth and poses of a scene agree? Reads four frames, and only before it calls them unsound some more.
+    """Do depth and poses of a scene agree? Reads a few frames, and only before it calls them unsound some more.
 
     `options` are the dataset's, for the advice. A frame that cannot be read is passed over: whoever needs it says so.
     """
-    verdict = Verdict("unclear", "it takes two frames to tell whether depth and poses agree")
+    return quick_look(scene, indices, options)[0]
+
+
+def quick_look(
+    scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None
+) -> tuple[Verdict, Sample | None]:
+    """The verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
+    verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
     for count in (1, CONFIRMING_CLUSTERS):
         look = Look(scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
         if len(look.views) < 2:
             continue
+        sample = look.sample(options or {})
         verdict = look.verdict(options or {}, thorough=False)
         if verdict.state != "unsound":
             break
-    return verdict
+    return verdict, sample
 
 
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
@@ -265,7 +273,11 @@ def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Conf
     noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
     views = [look.views[position] for position in look.fused]
     stride = fused_stride(checked.size, config.pixel_stride)
-    fused = [_persistence(views, coverage, config.voxel_size * factor, stride) for factor in VOXEL_FACTORS]
+    suggestion = None if noise is None else suggest(coverage, overlaps, config.frames.stride)
+    size = config.voxel_size
+    if not config.sets_voxel_size and suggestion is not None and suggestion.voxel_size is not None:
+        size = suggestion.voxel_size
+    fused = [_persistence(views, coverage, size * factor, stride) for factor in VOXEL_FACTORS]
     return dataclasses.replace(
         checked,
         overlaps=tuple(overlaps),
@@ -273,7 +285,7 @@ def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Conf
         fused_frames=len(views),
         fused_stride=stride,
         persistence=tuple(row for row in fused if row is not None),
-        suggestion=None if noise is None else suggest(coverage, overlaps, config.frames.stride),
+        suggestion=suggestion,
     )
 
 

@@ -85,7 +85,7 @@ def _version(value: bool) -> None:
 @app.callback()
 def root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+        bool, typer.Option("--version", metavar="", callback=_version, is_eager=True, help="Say the version.")
     ] = False,
 ) -> None:
     """Options that stand before the command."""

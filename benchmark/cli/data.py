@@ -8,12 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
+from semstab.cli import completion
 from semstab.cli.options import (
     Backbones,
     Classes,
     ConfigFile,
     DataFolder,
     DatasetName,
+    DatasetOptions,
     DatasetSettings,
     Frames,
     Quiet,
@@ -23,13 +25,20 @@ from semstab.cli.options import (
     select_dataset,
     selection,
     slice_of,
+    with_options,
 )
 from semstab.errors import ConfigError, DataError
 
 
 def predict(
     backbone: Annotated[
-        str, typer.Option("--backbone", "-m", help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.")
+        str,
+        typer.Option(
+            "--backbone",
+            "-m",
+            help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.",
+            autocompletion=completion.models,
+        ),
     ],
     images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
     data: DataFolder = None,
@@ -37,13 +46,16 @@ def predict(
     scene: Scenes = None,
     frames: Frames = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder above labels/ and scores/; the scene's own by default.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder above labels/ and scores/.", show_default="the scene's own"),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="What the predictions are called; the model's name here.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="What the predictions are called.", show_default="the model's name")
+    ] = None,
     model: Annotated[str | None, typer.Option(help="Folder that save_pretrained wrote, or a hub id.")] = None,
     revision: Annotated[str | None, typer.Option(help="Branch, tag or commit on the hub.")] = None,
-    device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.")] = None,
-    dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16; float32 by default.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.", show_default="cpu")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16.", show_default="float32")] = None,
     image_size: Annotated[
         str | None, typer.Option(metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")
     ] = None,
@@ -51,16 +63,21 @@ def predict(
     batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
     taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
-    mapping: Annotated[str | None, typer.Option(help="strict, or lenient: near classes count as well.")] = None,
-    scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
+    mapping: Annotated[
+        str | None, typer.Option(help="strict, or lenient: near classes count as well.", show_default="strict")
+    ] = None,
+    scores: Annotated[bool, typer.Option("--scores", metavar="", help="Also keep soft scores.")] = False,
     top_k: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.KEY=VALUE."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.options.KEY=VALUE."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
+    options: DatasetOptions = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", metavar="", help="Replace predictions of other settings.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
@@ -70,18 +87,21 @@ def predict(
     named = {"model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads}
     named["classes"] = classes
     size = None if image_size is None else _image_size(image_size)
-    options = overrides({**named, "image_size": size}, settings or [])
+    of_model = overrides({**named, "image_size": size}, with_options(settings, options))
     chosen: dict[str, Any] = {}
     select_dataset(chosen, dataset, data, None)
-    of_dataset = options.pop("dataset", {})
+    given = of_model.pop("dataset", {"options": {}})
+    of_dataset = given.get("options") if isinstance(given, dict) and len(given) == 1 else None
     if not isinstance(of_dataset, dict):
-        raise ConfigError("--set dataset: write dataset.KEY=VALUE, or --dataset NAME")
+        raise ConfigError("--set dataset: write --option KEY=VALUE (dataset.options.KEY), or --dataset NAME")
     if chosen:
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
+    elif of_dataset:
+        raise ConfigError("--option says how a dataset is read; choose one with --data or --dataset")
     said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
     command.run(
         predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
-        options=options,
+        options=of_model,
         images=images,
         dataset=resolve(load_config(None, chosen)).dataset if chosen else None,
         scenes=None if scene == ["all"] else scene,
@@ -103,6 +123,7 @@ def check(
     voxel_size: VoxelSize = None,
     frames: Frames = None,
     settings: DatasetSettings = None,
+    options: DatasetOptions = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -116,7 +137,7 @@ def check(
 
     named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
     console, found = Console(quiet=quiet), []
-    for checked in check_scenes(selection(config, named, settings, dataset, data, frames)):
+    for checked in check_scenes(selection(config, named, with_options(settings, options), dataset, data, frames)):
         print_check(checked, console)
         found.append(checked)
     if json_file is not None:
@@ -135,6 +156,7 @@ def convert(
     backbone: Backbones = None,
     frames: Frames = None,
     settings: DatasetSettings = None,
+    options: DatasetOptions = None,
     depth_error: Annotated[
         float, typer.Option(min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")
     ] = 0.0,
@@ -146,7 +168,9 @@ def convert(
     from semstab.convert import convert
     from semstab.convert.display import frame_bar, print_converted
 
-    chosen = selection(config, {"scenes": scene, "backbones": backbone}, settings, dataset, data, frames)
+    chosen = selection(
+        config, {"scenes": scene, "backbones": backbone}, with_options(settings, options), dataset, data, frames
+    )
     console = Console(quiet=quiet, markup=False)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         for converted in convert(chosen, out, depth_error=depth_error, progress=bar):

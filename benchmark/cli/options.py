@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from semstab.cli import completion
 from semstab.errors import ConfigError, told
 
 if TYPE_CHECKING:
@@ -14,35 +15,67 @@ if TYPE_CHECKING:
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")]
 DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
+DatasetOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE."
+    ),
+]
 DatasetSettings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000."),
 ]
-DatasetName = Annotated[str | None, typer.Option(help="Dataset, as named by `semstab-bench list`.")]
-Scenes = Annotated[list[str] | None, typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.")]
+DatasetName = Annotated[
+    str | None,
+    typer.Option(
+        help="Dataset, as named by `semstab-bench list`.",
+        show_default="posed_folder with --data, else city",
+        autocompletion=completion.datasets,
+    ),
+]
+Scenes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=completion.scenes
+    ),
+]
 Backbones = Annotated[
-    list[str] | None, typer.Option("--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.")
+    list[str] | None,
+    typer.Option(
+        "--backbone",
+        "-m",
+        help="Label source; repeatable; or 'all'; 'gt': truth.",
+        show_default="all",
+        autocompletion=completion.label_sources,
+    ),
 ]
 Classes = Annotated[
     str | None,
     typer.Option(metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them."),
 ]
-VoxelSize = Annotated[float | None, typer.Option(help="Edge of a voxel, metres.")]
-Frames = Annotated[str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.")]
+VoxelSize = Annotated[
+    float | None, typer.Option(help="Edge of a voxel, metres.", show_default="what `check` suggests; city: 0.2")
+]
+Frames = Annotated[
+    str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.", show_default="all")
+]
 TrustGeometry = Annotated[
-    bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
+    bool, typer.Option("--trust-geometry", metavar="", help="Fuse also where depth and poses contradict each other.")
 ]
 Rerun = Annotated[
     str | None,
     typer.Option(
         metavar="FILE|spawn|connect|URL|serve|off",
-        help="Recording: a file, OUT/recording.rrd by default; and a viewer to start, to connect to, or to serve.",
+        help="Recording: a file, and a viewer to start, to connect to, or to serve.",
+        show_default="OUT/recording.rrd; of a study off",
     ),
 ]
 Report = Annotated[str, typer.Option(metavar="on|off", help="Write tables, figures and report.html.")]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.")]
-Scheduler = Annotated[str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar="", help="Print nothing but errors.")]
 
 
 def selection(
@@ -71,6 +104,14 @@ def chosen(
     content = overrides(named, settings or [])
     select_dataset(content, dataset, data, seed)
     return content if frames is None else content | {"frames": slice_of(frames)}
+
+
+def with_options(settings: list[str] | None, options: list[str] | None) -> list[str]:
+    """What --set and --option say, as --set says it."""
+    for option in options or ():
+        if "=" not in option:
+            raise ConfigError(f"--option {option}: write KEY=VALUE")
+    return [*(settings or []), *(f"dataset.options.{option}" for option in options or [])]
 
 
 def overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from semstab.cli import completion
 from semstab.cli.options import (
     Backbones,
     Classes,
     ConfigFile,
     DataFolder,
     DatasetName,
+    DatasetOptions,
     Frames,
     Jobs,
     Quiet,
@@ -28,6 +30,7 @@ from semstab.cli.options import (
     chosen,
     overrides,
     say,
+    with_options,
 )
 from semstab.errors import ConfigError
 
@@ -42,30 +45,63 @@ DISAGREE = 3
 
 
 def run(
-    backend: Annotated[list[str] | None, typer.Option("--backend", "-b", help="Fusion backend; repeatable.")] = None,
+    backend: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--backend",
+            "-b",
+            help="Fusion backend; repeatable.",
+            show_default="numba",
+            autocompletion=completion.backends,
+        ),
+    ] = None,
     config: ConfigFile = None,
     data: DataFolder = None,
     dataset: DatasetName = None,
     scene: Scenes = None,
     backbone: Backbones = None,
-    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse in: a name or a YAML file.")] = None,
+    taxonomy: Annotated[
+        str | None,
+        typer.Option(
+            help="Taxonomy to fuse in: a name or a YAML file.",
+            show_default="the dataset's; city: uavid7",
+            autocompletion=completion.taxonomies,
+        ),
+    ] = None,
     voxel_size: VoxelSize = None,
-    pixel_stride: Annotated[int | None, typer.Option(help="Use every n-th pixel of each axis.")] = None,
+    pixel_stride: Annotated[
+        int | None, typer.Option(help="Use every n-th pixel of each axis.", show_default="1")
+    ] = None,
     frames: Frames = None,
-    device: Annotated[str | None, typer.Option(help="CPU:0, or CUDA:0 for backends that take a device.")] = None,
-    check: Annotated[str | None, typer.Option(help="Backend to check against, or 'none'.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.")] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own"),
+    ] = None,
+    check: Annotated[
+        str | None,
+        typer.Option(
+            metavar="sample|BACKEND|none",
+            help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
+            show_default="sample; of the built-in city numpy",
+        ),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.", show_default="0")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640."),
     ] = None,
+    options: DatasetOptions = None,
     trust_geometry: TrustGeometry = False,
-    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
+    events: Annotated[
+        bool | None, typer.Option("--events", metavar="", help="Also write the log of observations.")
+    ] = None,
     statistics: Annotated[
         bool | None,
-        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
+        typer.Option(
+            "--statistics", metavar="", help="Also test drift, judge by ground truth, compare backbones; takes longer."
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; runs/TIME by default.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: Rerun = None,
     report: Report = "on",
     jobs: Jobs = 1,
@@ -93,7 +129,7 @@ def run(
         "statistics": statistics,
         "check_geometry": False if trust_geometry else None,
     }
-    content = chosen(named, settings, dataset, data, frames, seed)
+    content = chosen(named, with_options(settings, options), dataset, data, frames, seed)
     if check in ("none", "off"):
         content["check"] = None
     resolved = _load(config, content, predict or [], classes)
@@ -103,8 +139,13 @@ def run(
 
 
 def study(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Study file, or a shipped study: see `list`.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; studies/NAME by default.")] = None,
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE", help="Study file, or a shipped study: see `list`.", autocompletion=completion.studies
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder.", show_default="studies/NAME")] = None,
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
     only: Annotated[
@@ -114,6 +155,7 @@ def study(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
     ] = None,
+    options: DatasetOptions = None,
     rerun: Rerun = "off",
     report: Report = "on",
     trust_geometry: TrustGeometry = False,
@@ -123,7 +165,9 @@ def study(
     from semstab.model.results import slug
     from semstab.settings import load_study
 
-    config = load_study(file, overrides({"check_geometry": False if trust_geometry else None}, settings or []))
+    config = load_study(
+        file, overrides({"check_geometry": False if trust_geometry else None}, with_options(settings, options))
+    )
     if only is not None:
         config = config.only(only)
     _execute(config, out or Path("studies") / slug(config.name), _executor(jobs, scheduler), rerun, report, quiet)
@@ -137,8 +181,18 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
 
     recording = run / "recording.rrd" if run.is_dir() else run
     if not recording.is_file():
-        raise ConfigError(f"{recording}: there is no recording; run again without --rerun off")
+        raise ConfigError(_why_no_recording(run))
     raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
+
+
+def _why_no_recording(run: Path) -> str:
+    """What is there instead, and how to get one."""
+    if not run.exists():
+        return f"{run}: there is no such run or file; name the folder that --out gave, or one of runs/"
+    if run.is_dir() and not (run / "summary.json").exists():
+        return f"{run}: holds no finished run; name the folder that --out gave, or one of runs/"
+    shown = f"open {run / 'report.html'}, or " if (run / "report.html").exists() else ""
+    return f"{run}: was not recorded (a study is only where it is asked for); {shown}start it again with --rerun FILE"
 
 
 def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:

@@ -45,6 +45,9 @@ SHARED = "shared_taxonomy"
 BACKENDS = "backends"
 """The base units fused by the other backends."""
 
+SAMPLE = "sample"
+"""The check that follows a random set of voxels, not all of them."""
+
 
 class DatasetConfig(Settings):
     """Which dataset, with the options of its own."""
@@ -107,12 +110,19 @@ class Config(Settings):
         description="fusion backends: the first one fuses every unit, the others the same frames of the base units",
     )
     check: str | None = Field(
-        "numpy", description="backend that the others are checked against, on all base units; null for none"
+        SAMPLE,
+        description="what the backends are checked against: sample, the numpy reference on one in 16 voxels; or a"
+        " backend that fuses all base units beside them, numpy for one; null for nothing",
     )
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
     taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
     shared_taxonomy: str | None = Field(None, description="label space in which backbones are compared; null: none")
-    voxel_size: float = Field(0.2, ge=1e-9, le=1e9, description="edge of a voxel, metres")
+    voxel_size: float = Field(
+        0.2,
+        ge=1e-9,
+        le=1e9,
+        description="edge of a voxel, metres; where it is not given, what `check` suggests for data of files",
+    )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
     frames: FrameSelection = FrameSelection()
     scene_frames: dict[str, FrameSelection] = Field(
@@ -227,10 +237,15 @@ class Config(Settings):
         except ValidationError as error:
             raise ConfigError(f"{where}: {explain(error, cls)}") from error
 
+    @property
+    def sets_voxel_size(self) -> bool:
+        """Whether it says a voxel size, or leaves it to the data."""
+        return "voxel_size" in self.model_fields_set
+
     def fused_by(self) -> list[BackendConfig]:
         """The backends that fuse the base units: those named, and the one they are checked against."""
         named = [backend.name for backend in self.backends]
-        extra = [BackendConfig(name=self.check)] if self.check and self.check not in named else []
+        extra = [BackendConfig(name=self.check)] if self.check not in (None, SAMPLE, *named) else []
         return [*self.backends, *extra]
 
     def only(self, parts: Sequence[str]) -> Config:

@@ -12,22 +12,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semstab.backends import REGISTRY
-from semstab.check import Verdict, quick_check, refuse_unsound
+from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
 from semstab.config import BACKENDS, BASE, Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.evaluation import comparison
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
-from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan, must_agree
 from semstab.engine.work.executors import Executor, InProcess
 from semstab.engine.work.jobs import Job, Request, split
 from semstab.engine.work.passes import lend
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
-from semstab.model.results import Agreement
+from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
@@ -86,11 +85,13 @@ def _execute(
     """The result, and what failing units raised in this process, by its message."""
     started, told = time.perf_counter(), Observers(observers)
     config = resolve(config)
+    config, advice = with_voxel_size(config)
     plan = make_plan(config)
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
         found = _compute(plan, folder, executor, told)
+        found.advice = advice or _advice(plan, found.contents)
         result = _result(plan, folder, found)
         found.watch.seconds["all"] = time.perf_counter() - started
         content = manifest(config, found.inputs(plan), found.watch.seconds, command)
@@ -111,12 +112,14 @@ class _Found:
     """What is known of the units, by their identity: the content of their files, or why they failed.
 
     geometry  of the scenes of which something was computed
+    advice    where the voxel size lies in them
     causes    what was raised in this process, by its message
     """
 
     contents: dict[str, UnitContent]
     kept: int
     geometry: dict[str, Verdict] = field(default_factory=dict)
+    advice: dict[str, VoxelAdvice] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
     causes: dict[str, BaseException] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
@@ -147,7 +150,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
     missing = [each for identity, each in units.items() if identity not in contents]
     if plan.config.check_geometry:
         with watch("check"):
-            found.geometry = _checked(plan.config, missing, told)
+            found.geometry, found.advice = _checked(plan.config, missing, told)
     with folder.started() as start, lend(start, plan.scenes):
         _work_off(plan, folder, start, executor, told, found, missing)
     return found
@@ -170,9 +173,11 @@ def _work_off(
         for outcome in (outcome for _, outcomes in finished for outcome in outcomes):
             each = units[outcome.identity]
             if outcome.content is not None:
+                content = dataclasses.replace(outcome.content, advice=found.advice.get(each.unit.scene))
+                outcome = dataclasses.replace(outcome, content=content)  # noqa: PLW2901
                 with found.watch("keep"):
                     folder.save(outcome)
-                found.contents[outcome.identity] = outcome.content
+                found.contents[outcome.identity] = content
             else:
                 found.errors[outcome.identity] = outcome.error or ""
                 folder.save_trace(outcome)
@@ -199,20 +204,27 @@ def _tell_done(each: Planned, error: str | None, executor: Executor, told: Obser
     told.tell(lambda observer: observer.unit_done(each, error))
 
 
-def _checked(config: Config, missing: Sequence[Planned], told: Observers) -> dict[str, Verdict]:
-    """The geometry of each scene with units to compute; what cannot be read is left to these to report.
+def _checked(
+    config: Config, missing: Sequence[Planned], told: Observers
+) -> tuple[dict[str, Verdict], dict[str, VoxelAdvice]]:
+    """The geometry of each scene with units to compute, and where the voxel size lies.
+
+    What cannot be read is left to the units to report.
 
     Raises DataError where depth and poses contradict each other.
     """
     found: dict[str, Verdict] = {}
+    advice: dict[str, VoxelAdvice] = {}
     tasks = {each.task.scene.name: each.task for each in reversed(missing) if isinstance(each, PlannedUnit)}
     for task in reversed(tasks.values()):
         with contextlib.suppress(DataError):
-            found[task.scene.name] = quick_check(task.scene, task.indices, config.dataset.options)
+            found[task.scene.name], sample = quick_look(task.scene, task.indices, config.dataset.options)
+            if (told_of := advise(sample, config)) is not None:
+                advice[task.scene.name] = told_of
     for scene, verdict in found.items():
         refuse_unsound(scene, verdict)
         told.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]
-    return found
+    return found, advice
 
 
 def _jobs(
@@ -234,7 +246,8 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
     tables = Tables(most=len({record.unit.backend for record in records}))
     with found.watch("agreement"):
-        agreement = tuple(_agreement(plan.config, records, tables))
+        agreement = (*_samples(plan, contents), *_agreement(plan.config, records, tables))
+        compared = tuple(_compared(plan.config, records, tables))
     with found.watch("comparisons"):
         comparisons = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
     return Result(
@@ -251,23 +264,54 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
         up=_up_axes(plan.units, contents),
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(_regions(plan, contents)),
+        compared=compared,
+        advice=found.advice,
     )
+
+
+def _advice(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, VoxelAdvice]:
+    """Where the voxel size lies in each scene, as it was looked at when its base units were computed."""
+    return {
+        each.unit.scene: content.advice
+        for each in plan.units
+        if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.advice is not None
+    }
+
+
+def _samples(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[Agreement]:
+    """Of units with the reference, on a sample of their voxels."""
+    for each in plan.units:
+        content = contents.get(each.identity)
+        if each.sampled and content is not None and content.checked is not None:
+            yield content.checked
 
 
 def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
     """Of each pair of backends that must agree, on each scene and backbone that both fused."""
-    checked = {backend.name for backend in config.fused_by() if _must_agree(backend.name, backend.check)}
-    groups: dict[tuple[str, str], list[Record]] = {}
-    for record in records:
-        if record.variation.sweep in (BASE, BACKENDS) and record.unit.backend in checked:
-            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
-    for group in groups.values():
-        for a, b in itertools.combinations(group, 2):
+    checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
+    for group in _by_backend(records).values():
+        there = [record for record in group if record.unit.backend in checked]
+        for a, b in itertools.combinations(there, 2):
             yield compare(tables.of(a), tables.of(b), (a.unit, b.unit), tolerance=config.tolerance)
 
 
-def _must_agree(name: str, check: bool | None) -> bool:
-    return getattr(REGISTRY.load(name), "pointwise", True) if check is None else check
+def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
+    """Of the first backend and each other one, where one of the two need not agree."""
+    free = {backend.name for backend in config.fused_by() if not must_agree(backend)}
+    for first, *others in _by_backend(records).values():
+        for other in others:
+            if free & {first.unit.backend, other.unit.backend}:
+                units = (first.unit, other.unit)
+                yield compare(tables.of(first), tables.of(other), units, tolerance=config.tolerance)
+
+
+def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
+    """The records at the base settings of each scene and backbone, those of the first backend first."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.variation.sweep in (BASE, BACKENDS):
+            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
+    return groups
 
 
 def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:

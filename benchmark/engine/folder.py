@@ -20,9 +20,11 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.jobs import Outcome, shared_marker
 from semstab.errors import ConfigError, DataError
+from semstab.model.measures import measures
 from semstab.model.records import (
     EVENTS,
     FRAMES,
+    INFLUENCE,
     LOOKS,
     OVERVIEW,
     RECORDING_PARTS,
@@ -53,7 +55,7 @@ LAYOUT = "# semstab, folder layout 2"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, OVERVIEW, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, "tables", "figures")
 """Folders into which files are written."""
 
 
@@ -165,6 +167,7 @@ class Folder:
             has = has and (
                 not planned.judged or (content.summary is not None and content.summary.statistics is not None)
             )
+            has = has and (content.checked is not None or not planned.sampled)
             wanted = self._wanted(planned)
         else:
             has, wanted = content.regions is not None, []
@@ -176,6 +179,8 @@ class Folder:
     def _wanted(self, planned: PlannedUnit) -> list[str]:
         unit: Unit = planned.unit
         wanted = [f"{VOXELS}/{unit.slug}.parquet", f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
+        if planned.kept and planned.judged:
+            wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and planned.logged:
             wanted.append(f"{EVENTS}/{unit.slug}.parquet")
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
@@ -194,6 +199,8 @@ def load_result(folder: str | Path) -> Result:
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: not a summary of this version of semstab; run it again, into another folder")
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
+    if problem := _contradiction(result):
+        raise DataError(f"{path}: {problem}; it is damaged, or another version's; run it again")
     records = tuple(
         dataclasses.replace(
             record,
@@ -202,7 +209,21 @@ def load_result(folder: str | Path) -> Result:
         )
         for record in result.records
     )
-    return dataclasses.replace(result, records=records, manifest=read_json(folder / "manifest.json"))
+    manifest = from_json(dict[str, Any], read_json(folder / "manifest.json"), folder / "manifest.json")
+    return dataclasses.replace(result, records=records, manifest=manifest)
+
+
+def _contradiction(result: Result) -> str | None:
+    """What in a result refers to something that is not in it; None where nothing does."""
+    if result.records and not any(record.unit.backend == result.backend for record in result.records):
+        return f"no run is fused by the base backend '{result.backend}'"
+    quantities = {"op", "evidence", *(measure.key for measure in measures())}
+    for row in result.agreement:
+        if lost := quantities - row.differences.keys():
+            return f"the agreement on {row.scene} lacks {min(lost)}"
+    files = (file for record in result.records for file in (record.voxels_file, record.truth_file) if file is not None)
+    outside = (file for file in files if file.is_absolute() or ".." in file.parts)
+    return next((f"{file} is not in the folder" for file in outside), None)
 
 
 def _in(folder: Path, records: Sequence[Record]) -> tuple[Record, ...]:

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-from semstab.backends import create, keeps_log
+from semstab.backends import REGISTRY, create, keeps_log
 from semstab.config import (
     BACKENDS,
     BASE,
+    SAMPLE,
     SHARED,
     BackendConfig,
     Config,
@@ -53,6 +54,7 @@ class PlannedUnit:
     image_space  whether its stability in image coordinates is wanted
     kept         whether its voxels and its time series are kept
     judged       whether the statistics say something of its map: not of the one that others are only checked against
+    sampled      whether its map is checked against the reference on a sample of its voxels
     """
 
     variation: Variation
@@ -62,6 +64,7 @@ class PlannedUnit:
     image_space: bool
     kept: bool
     judged: bool = True
+    sampled: bool = False
 
     @property
     def unit(self) -> Unit:
@@ -87,6 +90,7 @@ class PlannedUnit:
             image_space=other.image_space or self.image_space,
             kept=other.kept or self.kept,
             judged=other.judged or self.judged,
+            sampled=other.sampled or self.sampled,
         )
 
     @property
@@ -207,7 +211,21 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
         for task in tasks_of(scene, settings):
             _check_classes(config.critical_classes, task)
             one = settings.model_copy(update={"backbones": [task.backbone]})
-            yield PlannedUnit(Variation(BASE), one, task, identity(one, task), image_space=True, kept=True)
+            sampled = _is_sampled(config, config.backends[0])
+            yield PlannedUnit(
+                Variation(BASE), one, task, identity(one, task), image_space=True, kept=True, sampled=sampled
+            )
+
+
+def _is_sampled(config: Config, backend: BackendConfig) -> bool:
+    """Whether what that backend fuses is checked against a sample: not the reference itself."""
+    return config.check == SAMPLE and backend.name != "numpy" and must_agree(backend)
+
+
+def must_agree(backend: BackendConfig) -> bool:
+    """Whether it must agree with the others: as it is configured, or else if it associates pixel by pixel."""
+    pointwise: bool = getattr(REGISTRY.load(backend.name), "pointwise", True)
+    return pointwise if backend.check is None else backend.check
 
 
 def _check_classes(critical: Sequence[str], task: Task) -> None:
@@ -240,7 +258,8 @@ def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[s
             kept, (backend, *_) = variation.sweep == BACKENDS, varied.backends
             reference = kept and backend.name not in [named.name for named in config.backends]
             judged = varied.statistics or not reference
-            yield PlannedUnit(variation, varied, task, identity(varied, task), False, kept, judged)
+            sampled = kept and _is_sampled(config, backend)
+            yield PlannedUnit(variation, varied, task, identity(varied, task), False, kept, judged, sampled)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Change]]:

@@ -4,7 +4,7 @@ from semstab.metrics.agreement import compare
 from semstab.metrics.category import CATEGORIES, CATEGORY_COLORS, CategoryThresholds, categories, category_shares
 from semstab.metrics.flicker import CompensatedFlicker, compensated_flicker, flicker_percent
 from semstab.metrics.regions import RegionChange, matched_region_flicker
-from semstab.metrics.summary import macro_mean, pool, strata, summarise
+from semstab.metrics.summary import macro_mean, pool, split_last, strata, summarise
 from semstab.metrics.video import SelfConsistency, VideoConsistency
 from semstab.model.measures import dominant, entropy, op, sbd, vss
 
@@ -28,6 +28,7 @@ __all__ = [
     "op",
     "pool",
     "sbd",
+    "split_last",
     "strata",
     "summarise",
     "vss",

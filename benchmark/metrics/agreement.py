@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import shared_rows
-from semstab.model.measures import measures
+from semstab.model.measures import dominant, measures
 from semstab.model.results import Agreement, Deviation, Unit
 from semstab.model.voxels import VoxelTable
 
@@ -19,6 +19,9 @@ Float64 = npt.NDArray[np.float64]
 
 CHUNK = 1 << 14
 """Voxels that are compared at a time: they stay in the processor's cache."""
+
+LABEL = "label"
+"""The share of voxels with another dominant class; no disagreement by itself, for a tie hangs on the last bit."""
 
 TOLERANCE = 1e-9
 """Largest difference allowed between float64 backends in any quantity of any voxel."""
@@ -41,7 +44,7 @@ def compare(
     differences = {name: _deviation([chunk[name] for chunk in chunks], len(in_a)) for name in chunks[0]}
     only_in = (len(a) - len(in_a), len(b) - len(in_b))
     same_voxels = sum(only_in) <= voxel_share * max(len(a), len(b))
-    same_values = all(not d.max > tolerance for d in differences.values())
+    same_values = all(not d.max > tolerance for name, d in differences.items() if name != LABEL)
     return Agreement(
         scene=units[0].scene,
         backbone=units[0].backbone,
@@ -69,7 +72,13 @@ class _Rows:
 def _differences(a: _Rows, b: _Rows) -> dict[str, tuple[float, float]]:
     """The largest difference of each quantity and the mean over the classes summed over the voxels."""
     found = {measure.key: _difference(measure.of(a), measure.of(b)) for measure in measures()}
-    return {"op": _difference(a.op, b.op), **found, "evidence": _difference(a.evidence, b.evidence)}
+    other = dominant(a) != dominant(b)
+    return {
+        "op": _difference(a.op, b.op),
+        **found,
+        "evidence": _difference(a.evidence, b.evidence),
+        LABEL: (float(other.max(initial=False)), float(other.sum())),
+    }
 
 
 def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> tuple[float, float]:

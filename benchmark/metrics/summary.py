@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,6 +17,12 @@ from semstab.model.voxels import VoxelTable
 STRATA = (1, 2, 5)
 """Upper edges of the paper's strata: OP=1, OP=2, 3<=OP<=5, OP>5."""
 
+STEPS = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
+"""Upper edges of OP by which the last stratum is told apart."""
+
+CROWDED, PARTS = 0.5, 3
+"""A last stratum that holds more than this share of the voxels is split into so many about equal parts."""
+
 
 def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     """Summarise a table (paper, tables of multi-scene, persistence-stratified and class-wise stability).
@@ -24,9 +32,12 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     """
     K, names = table.K, table.classes or tuple(str(k) for k in range(table.K))
     by_stratum, by_class, by_recurrence = _Sums(len(edges) + 1), _Sums(K), _Sums(2)
+    steps = [edges[-1], *(step for step in STEPS if step > edges[-1])]
+    by_step = _Sums(len(steps) + 1)
     for rows in chunks(table):
         values = {measure: measure.of(rows) for measure in measures()}
         by_stratum.add(values, rows.op, np.searchsorted(edges, rows.op))
+        by_step.add(values, rows.op, np.searchsorted(steps, rows.op))
         by_class.add(values, rows.op, dominant(rows))
         by_recurrence.add(values, rows.op, (rows.op >= RECURRENT).astype(np.int64))
     observations = int(table.op.sum(dtype=np.int64))
@@ -41,6 +52,11 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
         strata=tuple(by_stratum.means(name, g, len(table)) for g, (name, _, _) in enumerate(strata(edges))),
         recurrent=by_recurrence.means(f"OP>={RECURRENT}", 1, len(table)),
         classes=tuple(by_class.means(name, k, len(table)) for k, name in enumerate(names)),
+        well_seen=tuple(
+            by_step.means(name, g, len(table))
+            for g, (name, _, _) in enumerate(strata(steps))
+            if g and by_step.voxels[g]
+        ),
     )
 
 
@@ -85,6 +101,40 @@ def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
     lows = [1, *(edge + 1 for edge in edges)]
     rows = [(f"OP={low}" if low == high else f"{low}<=OP<={high}", low, high) for low, high in zip(lows, edges)]  # noqa: B905
     return [*rows, (f"OP>{edges[-1]}", lows[-1], np.iinfo(np.int32).max)]
+
+
+def split_last(tables: Sequence[TableSummary]) -> list[Means]:
+    """The last stratum of several tables together in about equal parts, where most of their voxels are in it.
+
+    Beside the strata, whose edges are the paper's: `well_seen` names the finer ones.
+    """
+    voxels = sum(table.voxels for table in tables)
+    steps: dict[str, list[Means]] = {}
+    for row in (row for table in tables for row in table.well_seen):
+        steps.setdefault(row.name, []).append(row)
+    ordered = [pool(steps[name], voxels) for name in sorted(steps, key=_lowest)]
+    seen = sum(row.voxels for row in ordered)
+    if seen <= CROWDED * voxels or len(ordered) < 2:
+        return []
+    parts: list[list[Means]] = [[]]
+    for row in ordered:
+        if sum(own.voxels for own in parts[-1]) + row.voxels / 2 > seen / PARTS and parts[-1] and len(parts) < PARTS:
+            parts.append([])
+        parts[-1].append(row)
+    if len(parts) < 2:
+        return []
+    return [dataclasses.replace(pool(part, voxels), name=_range(part[0].name, part[-1].name)) for part in parts]
+
+
+def _lowest(name: str) -> int:
+    """The lowest OP of a stratum, by its name."""
+    return int(re.findall(r"\d+", name)[0])
+
+
+def _range(first: str, last: str) -> str:
+    """The name of a stratum from the names of its first and last step."""
+    low, highest = _lowest(first), re.findall(r"\d+", last)[-1]
+    return f"{low}<=OP<={highest}" if "<=" in last else f"OP>={low}"
 
 
 def pool(groups: Sequence[Means], voxels: int) -> Means:

@@ -16,12 +16,6 @@ from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 
 RIGID_TOLERANCE = 1e-3
 
-LOOKED_AT = 2**12
-"""Pixels of a depth map, about, that are looked at for its unit; of one as large some must be finite."""
-
-FAR, DISTINCT = 100.0, 8
-"""Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
-
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -192,15 +186,6 @@ class Frame:
             raise DataError(
                 f"{self.where('depth')}: depth is {depth.dtype}; convert it to metres (float32) with its depth scale"
             )
-        step = max(1, int(np.sqrt(depth.size / LOOKED_AT)))
-        some = depth[::step, ::step]
-        if depth.size >= LOOKED_AT and not np.isfinite(some).any() and not np.isfinite(depth).any():
-            raise DataError(f"{self.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
-        if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
-            raise DataError(
-                f"{self.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
-                " divide it by 1000, or set depth_scale"
-            )
         return depth.astype(np.float32, copy=False)
 
     def _checked_pose(self) -> npt.NDArray[np.float64]:
@@ -279,13 +264,6 @@ def _intrinsics(given: Any, where: str) -> Intrinsics:
     except (TypeError, ValueError) as error:
         reason = error if isinstance(error, DataError) else "not a 3x3 matrix"
         raise DataError(f"{where}: {reason}; give Intrinsics(fx, fy, cx, cy) or a camera matrix") from error
-
-
-def _whole_millimetres(depth: npt.NDArray[Any]) -> bool:
-    """Whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
-    if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
-        return False
-    return len(np.unique(depth)) >= DISTINCT
 
 
 def _in_line(matrix: npt.NDArray[np.float64]) -> str:

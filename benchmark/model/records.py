@@ -14,7 +14,7 @@ from semstab.model import tabular
 from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
 from semstab.model.measures import measures
-from semstab.model.results import Agreement, Unit, UnitSummary
+from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.json_form import INLINE
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
-LOOKS = "looks"
+LOOKS, INFLUENCE = "looks", "influence"
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
-where the dataset has it, color (H, W, 3)."""
+where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
 
 RECORDING_PARTS = "recording"
 """Folder of a recording that several processes write, until it is one file."""
@@ -126,6 +126,11 @@ class Record:
         """File of its log of observations, which is there where it was asked for and its backend keeps one."""
         return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
 
+    @property
+    def influence_file(self) -> Path | None:
+        """File of its sums by frame and cube of space, which is there where its map was judged."""
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / INFLUENCE / self.voxels_file.name
+
 
 class Tables:
     """Voxel tables of records, the last few of them at hand: those that belong together are asked for together."""
@@ -167,6 +172,8 @@ class UnitContent:
     up       the scene's up axis, where it is known or could be estimated
     files    digests of the unit's other files, by their path in the folder
     regions  of a source of regions, instead of a summary
+    advice   where its voxel size lies, where that was looked at
+    checked  how far it agrees with the reference on a sample of its voxels, where it was checked so
     """
 
     input: str
@@ -175,6 +182,8 @@ class UnitContent:
     up: tuple[float, float, float] | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None
+    checked: Agreement | None = None
+    advice: VoxelAdvice | None = None
 
 
 @dataclass(frozen=True)
@@ -196,6 +205,8 @@ class Result:
     up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
     georeference  by scene, where it lies on Earth, where that is known
     regions    flicker of the label sources that are regions without classes
+    compared   the same of each other backend and the base one, which need not agree
+    advice     where the voxel size lies, scene by scene, for data of files
     comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
     """
 
@@ -209,6 +220,8 @@ class Result:
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
     comparisons: tuple[BackboneComparison, ...] = ()
+    compared: tuple[Agreement, ...] = ()
+    advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None

@@ -125,7 +125,8 @@ class Means:
 class TableSummary:
     """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
 
-    `summary[VSS]` is the mean of a measure over all voxels where it is defined.
+    `summary[VSS]` is the mean of a measure over all voxels where it is defined. `well_seen` is the last stratum in
+    finer steps of OP.
     """
 
     K: int
@@ -138,6 +139,7 @@ class TableSummary:
     strata: tuple[Means, ...]
     recurrent: Means
     classes: tuple[Means, ...]
+    well_seen: tuple[Means, ...] = ()
 
     def __getitem__(self, measure: Measure) -> float:
         return self.means[measure]
@@ -150,7 +152,8 @@ class UnitSummary:
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
     fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
     the fused ones of which no pixel was valid; statistics is what `semstab.statistics.describe` says of the map, None
-    where nothing was asked for.
+    where nothing was asked for; sizes tells whether half or twice the voxel size would say something else;
+    worst_frames are those that moved the map most, the worst first; reduced is there for soft scores.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -164,6 +167,9 @@ class UnitSummary:
     frames_left_out: int = 0
     frames_empty: int = 0
     statistics: MapStatistics | None = None
+    sizes: tuple[SizeAlpha, ...] = ()
+    worst_frames: tuple[FrameDrift, ...] = ()
+    reduced: ReducedScores | None = None
 
     def row(self) -> dict[str, str | int | float]:
         """What it is, how much there is, and the mean of every measure, of the recurrent voxels alone as well."""
@@ -179,6 +185,53 @@ class UnitSummary:
 
 
 @dataclass(frozen=True)
+class ReducedScores:
+    """What soft scores come to where each pixel is reduced to its likeliest class: what hard labels compare with.
+
+    vss, recurrent_vss  over all voxels, and over those with OP >= 3
+    alpha               Krippendorff's, of the voxels with OP >= 2
+    """
+
+    vss: float
+    recurrent_vss: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class FrameDrift:
+    """A frame that moved the beliefs which it met: mean drift in bits, and of how many voxels."""
+
+    frame: int
+    drift: float
+    voxels: int
+
+
+@dataclass(frozen=True)
+class VoxelAdvice:
+    """Where a voxel size lies, by the depth of a few frames reprojected into each other.
+
+    voxel_size  metres
+    stays       share of the points that fall into the same voxel when another frame sees them
+    suggested   the smallest size in which half of them do, metres; None where nothing can be told
+    chosen      whether it was chosen for that, and not given
+    """
+
+    voxel_size: float
+    stays: float
+    suggested: float | None
+    chosen: bool
+
+
+@dataclass(frozen=True)
+class SizeAlpha:
+    """Krippendorff's alpha of some frames, evenly spaced, in voxels of one size; NaN where it is not defined."""
+
+    voxel_size: float
+    frames: int
+    alpha: float
+
+
+@dataclass(frozen=True)
 class Deviation:
     """Largest and mean absolute difference of one quantity over the voxels that two tables share."""
 
@@ -190,7 +243,8 @@ class Deviation:
 class Agreement:
     """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
 
-    differences  of OP, of every measure and of the evidence, by their keys
+    differences  of OP, of every measure, of the evidence and of the label (1 where it is another), by their keys
+    one_in       of so many voxels, drawn at random, one was compared
     """
 
     scene: str
@@ -200,3 +254,4 @@ class Agreement:
     only_in: tuple[int, int]
     differences: Mapping[str, Deviation]
     agrees: bool
+    one_in: int = 1

@@ -63,6 +63,9 @@ class Interval(Estimate):
         return not self.undecided
 
 
+UNKNOWN = Interval(math.nan, math.nan, math.nan)
+
+
 @dataclass(frozen=True)
 class StabilityVerdict:
     """What the evidence says of a backbone on a scene: a key of ADVICE, and the line that gives the reason."""
@@ -81,7 +84,10 @@ class Repeated:
 
 @dataclass(frozen=True)
 class BlockCut:
-    """Into how many occupied blocks the voxels with OP >= 2 were cut, and their edge in metres."""
+    """How many cubes of space hold voxels with OP >= 2, and the edge of the blocks in which alpha's errors may depend.
+
+    size in metres: four times as far as errors were found to reach.
+    """
 
     count: int
     size: float
@@ -109,14 +115,14 @@ class FrameAgreement:
     each_place       the same with each voxel counting once, however often it was seen: weights that flights share
     """
 
-    psa: Estimate
-    kappa: Estimate
-    alpha: Estimate
-    vss: Estimate
-    within: Estimate
-    between: Estimate
-    alpha_between: Estimate
-    each_place: Estimate
+    psa: Interval
+    kappa: Interval
+    alpha: Interval
+    vss: Interval
+    within: Interval
+    between: Interval
+    alpha_between: Interval
+    each_place: Interval
     classes: tuple[ClassAgreement, ...]
 
 
@@ -133,7 +139,7 @@ class ClassReach:
     matters: bool
     alpha: float
     ceiling: float
-    reached: Estimate
+    reached: Interval
 
 
 @dataclass(frozen=True)
@@ -174,6 +180,8 @@ class Correlogram:
 class Reach:
     """Alpha between frames beside its ceiling, that of labels which do not depend on the view, in sampled voxels.
 
+    Intervals are as those of `Judged`.
+
     by       whose labels those are
     voxels   sampled ones with OP >= 2
     reached  alpha / ceiling: what is left to the model, whatever the size of the voxels
@@ -181,9 +189,9 @@ class Reach:
 
     by: str
     voxels: int
-    alpha: Estimate
-    ceiling: Estimate
-    reached: Estimate
+    alpha: Interval
+    ceiling: Interval
+    reached: Interval
     classes: tuple[ClassReach, ...]
 
     @property
@@ -194,30 +202,50 @@ class Reach:
 
 
 @dataclass(frozen=True)
+class Judged:
+    """The numbers that a verdict rests on, with intervals for the next flight: other frames and places like these.
+
+    Where frames are not known, or too few to tell, the intervals are for this map, as their `question` says. vss is at
+    OP >= 3; the last two are undefined without ground truth.
+    """
+
+    psa: Interval
+    alpha: Interval
+    alpha_between: Interval
+    vss: Interval
+    accuracy: Interval
+    wrong_of_stable: Interval
+
+
+@dataclass(frozen=True)
 class DriftTests:
     """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
 
-    trend_excess  the trend less that in random order
+    sbd_p, trend_p   whether stretches of time could have come in any order: so many `stretches`, over `voxels`
+    trend_excess     the trend less that in random order
+    trending_voxels  of the tested ones: their disagreement goes one way in time
     """
 
     sbd_p: float
     trend: float
     trend_null: float
-    trend_excess: Estimate
+    trend_excess: Interval
     trend_p: float
+    stretches: int
+    voxels: int
     tested_voxels: int
     unusual_sbd_voxels: int
-    drifting_voxels: int
+    trending_voxels: int
 
 
 @dataclass(frozen=True)
 class FlipRates:
     """Share of the steps at which the predicted class changes, that in random order; frames since the last change."""
 
-    rate: Estimate
-    null: Estimate
-    excess: Estimate
-    frames_since: Estimate
+    rate: Interval
+    null: Interval
+    excess: Interval
+    frames_since: Interval
 
 
 @dataclass(frozen=True)
@@ -225,9 +253,9 @@ class DriftStatistics:
     """SBD in bits beside that of the same observations in random order, over the `voxels` where that is known."""
 
     voxels: int
-    sbd: Estimate
-    null: Estimate
-    excess: Estimate
+    sbd: Interval
+    null: Interval
+    excess: Interval
     tests: DriftTests | None = None
     flips: FlipRates | None = None
 
@@ -236,9 +264,9 @@ class DriftStatistics:
 class EntropyParts:
     """Mean entropy of the belief, and of that what is there within each frame and between them."""
 
-    entropy: Estimate
-    within: Estimate
-    between: Estimate
+    entropy: Interval
+    within: Interval
+    between: Interval
 
 
 @dataclass(frozen=True)
@@ -292,18 +320,18 @@ class Quadrants:
     """
 
     voxels: int
-    stable_right: Estimate
-    stable_wrong: Estimate
-    unstable_right: Estimate
-    unstable_wrong: Estimate
-    wrong_of_stable: Estimate
+    stable_right: Interval
+    stable_wrong: Interval
+    unstable_right: Interval
+    unstable_wrong: Interval
+    wrong_of_stable: Interval
 
 
 @dataclass(frozen=True)
 class CorrectnessStatistics:
     """Right beside stable; strata has all voxels with a true class first, then each stratum of OP."""
 
-    accuracy: Estimate
+    accuracy: Interval
     strata: tuple[Correctness, ...]
     reliability: tuple[Reliability, ...]
     quadrants: Quadrants
@@ -346,6 +374,18 @@ class StratumStatistics:
     entropy_between: float
 
 
+@dataclass(frozen=True)
+class BeyondCoin:
+    """What a coin tossed as often as places were seen would not show; 0 for it, whatever the OP.
+
+    disagreement  PSA of the places that two frames saw less that of the places that more saw
+    settling      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
+    """
+
+    disagreement: Interval
+    settling: Interval
+
+
 # --- One map ----------------------------------------------------------------------------------------------------------
 
 
@@ -364,6 +404,7 @@ class MapStatistics:
     blocks: BlockCut
     verdict: StabilityVerdict
     agreement: FrameAgreement
+    judged: Judged
     reach: Reach | None
     correlogram: Correlogram | None
     drift: DriftStatistics
@@ -372,6 +413,7 @@ class MapStatistics:
     correctness: CorrectnessStatistics | None
     fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
+    beyond_coin: BeyondCoin
 
     @property
     def sections(self) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import Estimate, LagBin, MapStatistics, Reach, RuleOutcome
+from semstab.model.statistics import NEXT_FLIGHT, DriftTests, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -26,12 +26,13 @@ def lines(found: MapStatistics) -> list[str]:
     head = [
         *textwrap.wrap(found.verdict.line, WIDTH),
         "",
-        f"{repeated.voxels} of {found.voxels} voxels seen twice or more; intervals at 95 % from"
-        f" {blocks.count} blocks of {blocks.size:.4g} m",
+        f"{repeated.voxels} of {found.voxels} voxels seen twice or more, in {blocks.count} cubes of space",
+        f"intervals at 95 %, for this map; errors depend on each other within blocks of {blocks.size:.4g} m",
         "",
         f"{'':<34}{'value':>9}   {'interval':<20}",
     ]
-    rows = [*_agreement(found), *_drift(found), *_uncertainty(found), *_geometry(found), *_correctness(found)]
+    sections = (_agreement, _judged, _drift, _uncertainty, _geometry, _correctness)
+    rows = [row for section in sections for row in section(found)]
     return [*head, *(_line(*row) for row in rows), *_tables(found)]
 
 
@@ -101,6 +102,20 @@ def _agreement(found: MapStatistics) -> list[Row]:
     ]
 
 
+def _judged(found: MapStatistics) -> list[Row]:
+    """What may be said of the next flight, if anything."""
+    judged = found.judged
+    rows = {
+        "PSA": judged.psa,
+        "alpha": judged.alpha,
+        "alpha between frames": judged.alpha_between,
+        "VSS at OP >= 3": judged.vss,
+        "accuracy": judged.accuracy,
+        "wrong of the stable places": judged.wrong_of_stable,
+    }
+    return [(name, own, "the next flight") for name, own in rows.items() if own.question == NEXT_FLIGHT]
+
+
 def _reach(reach: Reach) -> list[Row]:
     return [
         ("alpha b.f., sampled voxels", reach.alpha, ""),
@@ -119,14 +134,14 @@ def _drift(found: MapStatistics) -> list[Row]:
     drift, tests, flips = found.drift, found.drift.tests, found.drift.flips
     rows: list[Row] = [
         ("SBD, bits", drift.sbd, ""),
-        ("SBD in random order", drift.null, ""),
-        ("excess drift", drift.excess, "" if tests is None else _p("p", tests.sbd_p)),
+        ("SBD in random order", drift.null, f"over {drift.voxels} voxels"),
+        ("excess drift", drift.excess, "" if tests is None else _order(tests)),
     ]
     if tests is not None:
-        drifting = f"{tests.drifting_voxels} of {tests.tested_voxels} voxels drift"
+        trending = f"{tests.trending_voxels} of {tests.tested_voxels} voxels do"
         rows += [
             ("disagreement that goes one way", tests.trend, ""),
-            ("  beyond random order", tests.trend_excess, f"{_p('p', tests.trend_p)}; {drifting}"),
+            ("  beyond random order", tests.trend_excess, f"{_p('p', tests.trend_p)}; {trending}"),
         ]
     if flips is not None:
         rows += [("flip rate", flips.rate, ""), ("  beyond random order", flips.excess, "")]
@@ -214,6 +229,13 @@ def _line(name: str, estimate: Estimate | float, note: str = "") -> str:
         return f"{name:<34}{_cell(estimate):>9}   {'':<20}{note}".rstrip()
     interval = f"{_cell(estimate.low)} to {_cell(estimate.high)}"
     return f"{name:<34}{_cell(estimate.value):>9}   {interval:<20}{note}".rstrip()
+
+
+def _order(tests: DriftTests) -> str:
+    """The p-value of the scene's SBD, and what was put in other orders for it."""
+    if math.isnan(tests.sbd_p):
+        return "no p: places are seen too shortly, or errors last too long"
+    return f"{_p('p', tests.sbd_p)}: {tests.stretches} stretches of time in other orders"
 
 
 def _p(name: str, value: float) -> str:

@@ -11,13 +11,24 @@ from rich.markup import escape
 from rich.table import Table
 
 from semstab.config import BACKENDS
-from semstab.metrics import macro_mean, pool
-from semstab.model.measures import measures
-from semstab.model.records import Result
+from semstab.metrics import macro_mean, pool, split_last
+from semstab.model.measures import VSS, measures
+from semstab.model.records import Record, Result
 from semstab.model.results import STAGES, Agreement, Means, UnitSummary
+from semstab.outputs.averages import Sweep, describe, levels, over_all, over_recurrent, pooled
+from semstab.outputs.remarks import remarks
 from semstab.outputs.statistics_text import comparison_lines, lines
 
 NOTHING = "-"
+
+HARDLY_ANY = 0.1
+"""A share of voxels seen once below which they need no remark."""
+
+RARE = 100
+"""Voxels below which a class is too rare to be called the worst."""
+
+MOST_CLASSES = 10
+"""So many classes a backbone are shown, the least steady first; the others are in the tables."""
 
 
 def print_summary(result: Result, console: Console) -> None:
@@ -25,11 +36,24 @@ def print_summary(result: Result, console: Console) -> None:
     shown = [record.summary for record in result.select()]
     console.print(_scene_table(shown))
     console.print(_strata_table(shown))
-    if result.agreement:
-        console.print(_agreement_table(result.agreement))
+    console.print(_class_table(result))
+    for sweep in result.sweeps():
+        console.print(_sweep_table(result, describe(sweep)))
+    if len(named := _named(result)) > len(shown):
+        console.print(_backends_table(named))
+    if result.compared:
+        console.print(_compared_table(result.compared))
+    drawn = [row for row in result.agreement if row.one_in > 1]
+    if told := [row for row in result.agreement if row not in drawn or not row.agrees]:
+        console.print(_agreement_table(told))
+    if drawn:
+        console.print(f"{_drawn(drawn)}\n", highlight=False, markup=False)
     console.print(_stages_line(shown))
     for text in _statistics(result):
         console.print(text, highlight=False, markup=False)
+    for text in remarks(result):
+        console.print(f"- {text}", highlight=False, markup=False)
+    console.print()
     for run in shown:
         if run.frames_left_out:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
@@ -39,6 +63,8 @@ def print_summary(result: Result, console: Console) -> None:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_empty} of {run.frames} frames hold no pixel"
             console.print(f"{text} with both depth and a label", soft_wrap=True, markup=False)
     once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
+    if once < HARDLY_ANY:
+        return
     console.print(
         f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
         f"Read {_listed([measure.word for measure in measures()])} by OP, or for OP>=3."
@@ -116,6 +142,8 @@ def _strata_table(runs: Sequence[UnitSummary]) -> Table:
         voxels = sum(run.table.voxels for run in rows)
         for strata in zip(*(run.table.strata for run in rows), strict=True):
             table.add_row(*_stratum_cells(pool(strata, voxels)))
+        for part in split_last([run.table for run in rows]):
+            table.add_row(*_stratum_cells(part), style="dim")
         table.add_row(*_stratum_cells(pool([run.table.recurrent for run in rows], voxels)), style="italic")
     return table
 
@@ -144,6 +172,86 @@ def _stages_line(runs: Sequence[UnitSummary]) -> str:
     return f"ms a frame: fusion {fusion} ({', '.join(known)}); beside them decode {_number(decode, 1)}\n"
 
 
+def _class_table(result: Result) -> Table:
+    """Classes that there are, by how well frames agree on them, the worst first; rare ones at the end."""
+    title = "by class, the least steady first" + (", all scenes pooled" if len(result.scenes) > 1 else "")
+    known = any(_class_alphas(result.select()).values())
+    table = _table(title, ("class",), ("voxels", "%", *_headers(), *(["alpha\n↑"] if known else [])))
+    for backbone in result.backbones:
+        records = result.select(backbone=backbone)
+        alphas = _class_alphas(records)
+        there = [row for row in pooled(records).classes if row.voxels]
+        there.sort(key=lambda row: (row.voxels < RARE, alphas.get(row.name, 1.0), row[VSS]))
+        table.add_row(escape(backbone), style="bold")
+        for row in there[:MOST_CLASSES]:
+            name, *cells = _stratum_cells(row)
+            table.add_row(escape(name), *cells, *([_number(alphas.get(row.name, math.nan), 2)] if known else []))
+        if len(there) > MOST_CLASSES:
+            table.add_row(f"  ... {len(there) - MOST_CLASSES} more")
+    return table
+
+
+def _class_alphas(records: Sequence[Record]) -> dict[str, float]:
+    """Krippendorff's alpha of each class, the macro mean over scenes, where it is known."""
+    found: dict[str, list[float]] = {}
+    for statistics in (record.statistics for record in records if record.statistics is not None):
+        for row in statistics.agreement.classes:
+            found.setdefault(row.name, []).append(row.alpha)
+    means = {name: macro_mean(values) for name, values in found.items()}
+    return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
+
+
+def _sweep_table(result: Result, sweep: Sweep) -> Table:
+    """What a sweep came to: of all voxels, of the recurrent ones, how many these are, and how far frames agree."""
+    numbers = (f"{VSS.word}\nall", f"{VSS.word}\nOP>=3", "OP>=3\n%", "alpha\n↑")
+    table = _table(sweep.title, (sweep.header,), numbers)
+    for backbone in result.backbones:
+        found = levels(result, sweep.name, backbone)
+        if found:
+            table.add_row(escape(backbone), style="bold")
+        for level in found:
+            means = (level.mean(over_all(VSS)), level.mean(over_recurrent(VSS)))
+            share, alpha = 100 * level.mean(lambda p: p.recurrent.share), level.mean(lambda p: p.alpha)
+            cells = (*(_number(mean, VSS.digits[0]) for mean in means), _number(share, 2), _number(alpha, 2))
+            table.add_row(f"  {sweep.text(level.value)}", *cells)
+    return table
+
+
+def _named(result: Result) -> list[UnitSummary]:
+    """The units of all backends that were asked for, not of one that others are only checked against."""
+    others = [record.summary for record in result.select(BACKENDS) if record.statistics is not None]
+    return [*(record.summary for record in result.select()), *others]
+
+
+def _backends_table(runs: Sequence[UnitSummary]) -> Table:
+    numbers = ("voxels", "mean\nOP", *_headers()[:2], "OP>=3\n%", "ms a\nframe")
+    title = "fusion backends, the same frames" + (", all scenes" if len(_scenes(runs)) > 1 else "")
+    table = _table(title, ("backend",), numbers)
+    for backbone, rows in _by_backbone(runs):
+        table.add_row(escape(backbone), style="bold")
+        for name in dict.fromkeys(run.unit.backend for run in rows):
+            own = [run for run in rows if run.unit.backend == name]
+            voxels, mean_op, *means, _, recurrent = _scene_cells(own)  # two measures leave room for the name
+            fusion = _number(macro_mean([run.fuse_ms_per_frame for run in own]), 1)
+            table.add_row(escape(f"  {name}"), voxels, mean_op, *means[:2], recurrent, fusion)
+    return table
+
+
+def _compared_table(compared: Sequence[Agreement]) -> Table:
+    """How backends differ that associate pixels and voxels in another way: mean differences of a voxel of both."""
+    symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures() if not measure.lowest_op > 1}}
+    numbers = ("first\nonly", "other\nonly", "label\ndiffers", *(f"mean\nΔ{s}" for s in symbols.values()))
+    table = _table("backends that differ by design, voxel by voxel", ("scene, backbone",), numbers)
+    for pair in dict.fromkeys(row.backends for row in compared):
+        table.add_row(escape("\n".join(pair)), style="bold")
+        for row in (row for row in compared if row.backends == pair):
+            share = [f"{100 * only / max(1, n):.1f}%" for only, n in zip(row.only_in, row.voxels, strict=True)]
+            means = [_number(row.differences[name].mean, 3) for name in symbols]
+            label = f"{100 * row.differences['label'].mean:.1f}%"
+            table.add_row(escape(f"  {row.scene}, {row.backbone}"), *share, label, *means)
+    return table
+
+
 def _agreement_table(agreement: Sequence[Agreement]) -> Table:
     symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures()}, "evidence": "e"}
     numbers = ("voxels\nin one", *(f"Δ{symbol}" for symbol in symbols.values()), "")
@@ -158,6 +266,17 @@ def _agreement_table(agreement: Sequence[Agreement]) -> Table:
             verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
             table.add_row(escape(f"  {row.scene}, {row.backbone}"), f"{sum(row.only_in):,}", *differences, verdict)
     return table
+
+
+def _drawn(sampled: Sequence[Agreement]) -> str:
+    """How the backends fared that were checked on a sample of the voxels."""
+    backends = _listed([*dict.fromkeys(row.backends[0] for row in sampled)])
+    voxels, bad = sum(row.voxels[1] for row in sampled), sum(not row.agrees for row in sampled)
+    found = f"{bad} of {len(sampled)} maps differ" if bad else "none differs"
+    return (
+        f"check: {backends} against the numpy reference on {voxels:,} voxels drawn at random, one in"
+        f" {sampled[0].one_in}: {found} (--check numpy: on all of them)"
+    )
 
 
 def _listed(words: Sequence[str]) -> str:

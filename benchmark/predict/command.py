@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from semstab.config import DatasetConfig, FrameSelection, validated
+from semstab.datasets import options_model
 from semstab.errors import ConfigError
 from semstab.predict.jobs import Job, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor
@@ -57,20 +59,45 @@ def run(
         bar.close()
     for report in reports:
         print_report(report, Console(quiet=quiet, markup=False))
-    if dataset is not None and out is None and backbone.label_space is not None:
-        hint = _next_command(config, dataset, selection)
+    if dataset is not None and backbone.label_space is not None:
+        hint = _next_command(config, dataset, scenes, selection, out, several=len(jobs) > 1)
         Console(quiet=quiet).print(hint, soft_wrap=True, highlight=False, markup=False)
     return reports
 
 
-def _next_command(predictor: PredictorConfig, dataset: DatasetConfig, frames: FrameSelection) -> str:
-    """What fuses the predictions: of the same frames, as the others have none."""
+def _next_command(
+    predictor: PredictorConfig,
+    dataset: DatasetConfig,
+    scenes: list[str] | None,
+    frames: FrameSelection,
+    out: Path | None,
+    *,
+    several: bool,
+) -> str:
+    """What fuses the predictions: of the same scenes and frames, read the same way, as the others have none."""
     words = ["semstab-bench", *([] if dataset.name == "posed_folder" else ["--dataset", dataset.name])]
     words += ["--data", str(dataset.options["root"])] if "root" in dataset.options else []
+    for key, value in _said(dataset).items():
+        words += ["--option", f"{key}={json.dumps(value)}" if not isinstance(value, str) else f"{key}={value}"]
+    if out is not None:
+        words += ["--option", f"labels_root={out}"]
+        words += ["--option", f"labels={'{scene}/' if several else ''}labels/{{backbone}}/{{name}}"]
+    for scene in scenes or ():
+        words += ["--scene", scene]
     words += ["--backbone", predictor.label_name]
     if frames != FrameSelection():
         words += ["--frames", f"{frames.start or ''}:{frames.stop or ''}:{frames.stride}"]
     return f"fuse them: {shlex.join(words)}"
+
+
+def _said(dataset: DatasetConfig) -> dict[str, Any]:
+    """The dataset's options that are not as they are by themselves, but for its root."""
+    usual = {
+        name: field.get_default(call_default_factory=True)
+        for name, field in options_model(dataset.name).model_fields.items()
+    }
+    plain = json.loads(json.dumps(usual, default=str))
+    return {key: value for key, value in dataset.options.items() if key != "root" and value != plain.get(key)}
 
 
 def _jobs(

@@ -17,10 +17,13 @@ Float64 = npt.NDArray[np.float64]
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
-ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(2, 4))
+ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
 ALPHA_BETWEEN = Quantity(
-    key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(2, 4)
+    key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(3, 4)
 )
+
+STABLE = 0.8
+"""A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
 
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""

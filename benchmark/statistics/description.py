@@ -15,15 +15,15 @@ from semstab.metrics.matching import require_same_map
 from semstab.metrics.summary import STRATA
 from semstab.model.measures import MeasureMeans, dominant, mean, measures, sbd, vss
 from semstab.model.statistics import (
-    UNDEFINED,
+    BeyondCoin,
     BlockCut,
     CorrectnessStatistics,
     DriftStatistics,
     DriftTests,
     EntropyParts,
-    Estimate,
     FlipRates,
     FrameAgreement,
+    Interval,
     MapStatistics,
     Repeated,
     RuleOutcome,
@@ -42,7 +42,6 @@ from semstab.statistics.agreement import (
     psa,
     ratio_of,
 )
-from semstab.statistics.blocks import BlockBootstrap, spatial_blocks
 from semstab.statistics.ceiling import losses
 from semstab.statistics.correctness import (
     Truth,
@@ -59,17 +58,19 @@ from semstab.statistics.drift import (
     benjamini_hochberg,
     expected_sbd,
     flips,
-    scene_drift,
     trend_columns,
     voxel_drift,
 )
 from semstab.statistics.looks import Sample, correlogram, reach_of
+from semstab.statistics.sampling import InfluenceSums, Places, influence_sums, judged_of
+from semstab.statistics.scene_drift import scene_drift
+from semstab.statistics.steady import steady
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 FALSE_DISCOVERIES = 0.05
-"""Rate at which drifting voxels are named."""
+"""Rate at which trending voxels are named."""
 
 Float64 = npt.NDArray[np.float64]
 Maps = dict[str, npt.NDArray[Any]]
@@ -77,10 +78,14 @@ Maps = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What the statistics say of a map; `maps` have one value a voxel (n,), NaN where undefined."""
+    """What the statistics say of a map; `maps` have one value a voxel (n,), NaN where undefined.
+
+    sums  by frame and cube of space, from which intervals and differences follow without voxels
+    """
 
     summary: MapStatistics
     maps: Maps
+    sums: InfluenceSums
 
 
 def describe(
@@ -123,32 +128,38 @@ def analyse(
     edges   upper bounds of the strata of OP
     critical  the classes that the verdict depends on; where none is named, all with enough places
 
-    Intervals are at 95 %, from a spatial block bootstrap over the voxels with OP >= 2; undefined numbers are NaN, and
-    a section that cannot be computed is None.
+    Intervals are at 95 %, for this map, but those of `judged` and `reach`; undefined numbers are NaN, and a section
+    that cannot be computed is None.
     Raises DataError where events, truth or limit do not belong to the table.
     """
     if events is not None:
         require_same_map(table, events)
     again = table.op >= 2
-    blocks = spatial_blocks(table.index[again], table.voxel_size)
-    means = _Means(again, BlockBootstrap(blocks, seed=seed))
-    maps: Maps = {"psa": psa(table)}
+    means = _Means(again, Places(table.index[again], table.voxel_size))
+    maps: Maps = {"psa": psa(table), "stable": steady(table)}
     known = None if truth is None else join_truth(table, truth)
     agreement = _agreement(table, events, means, maps)
     drift = _drift(table, events, means, maps, seed)
     uncertainty = _uncertainty(table, means, maps)
-    right = None if known is None else _correctness(table, known, means, maps, edges, seed)
+    right = None if known is None else _correctness(table, known, means, maps, edges)
+    sums = influence_sums(
+        table,
+        events,
+        None if known is None else known.label,
+        sample=None if sample is None else sample.shared(),
+        edge=means.places.edge,
+    )
+    judged = judged_of(sums)
     repeats = int(np.count_nonzero(again))
     repeated = Repeated(repeats, repeats / len(table) if len(table) else math.nan)
-    reach = None if sample is None else reach_of(sample, table, critical=critical, seed=seed)
-    judged = verdict(
+    reach = None if sample is None else reach_of(sample, table, sums, critical=critical)
+    said = verdict(
         name or "backbone",
-        agreement=agreement,
+        judged=judged,
         reach=reach,
         voxels=repeated.voxels,
         share=repeated.share,
-        blocks=blocks.count,
-        wrong_of_stable=UNDEFINED if right is None else right.quadrants.wrong_of_stable,
+        blocks=means.places.count,
     )
     summary = MapStatistics(
         schema=SCHEMA,
@@ -159,9 +170,10 @@ def analyse(
         voxels=len(table),
         observations=int(table.op.sum(dtype=np.int64)),
         repeated=repeated,
-        blocks=BlockCut(blocks.count, blocks.size),
-        verdict=judged,
+        blocks=BlockCut(means.places.count, judged.alpha.block_size),
+        verdict=said,
         agreement=agreement,
+        judged=judged,
         reach=reach,
         correlogram=None if sample is None else correlogram(sample),
         drift=drift,
@@ -170,40 +182,47 @@ def analyse(
         correctness=right,
         fusion_rules=None if events is None else _fusion_rules(table, events, known),
         strata=_strata(table, maps, edges),
+        beyond_coin=_beyond_coin(table, means, maps),
     )
-    return Analysis(summary, maps)
+    return Analysis(summary, maps, sums)
 
 
 # --- Sections ---------------------------------------------------------------------------------------------------------
 
 
 class _Means:
-    """Means over the voxels with OP >= 2, with their intervals from one bootstrap."""
+    """Means over the voxels with OP >= 2, with their intervals for this map."""
 
-    def __init__(self, again: npt.NDArray[np.bool_], bootstrap: BlockBootstrap) -> None:
+    def __init__(self, again: npt.NDArray[np.bool_], places: Places) -> None:
         self.again = again
-        self.bootstrap = bootstrap
+        self.places = places
 
-    def mean(self, values: Float64, bounds: tuple[float, float] = (0.0, 1.0)) -> Estimate:
+    def mean(self, values: Float64, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
         """Of values (n,) where they are defined."""
         own = values[self.again]
         defined = ~np.isnan(own)
-        return self.bootstrap.estimate(np.stack([np.where(defined, own, 0.0), defined], axis=1), ratio_of, bounds)
+        return self.places.estimate(np.stack([np.where(defined, own, 0.0), defined], axis=1), ratio_of, bounds)
 
     def function(
-        self, columns: Float64, statistic: Callable[[Float64], Float64], bounds: tuple[float, float]
-    ) -> Estimate:
+        self,
+        columns: Float64,
+        statistic: Callable[[Float64], Float64],
+        bounds: tuple[float, float] = (0.0, 1.0),
+    ) -> Interval:
         """Of a statistic of the sums of columns (m, C) of the m voxels with OP >= 2."""
-        return self.bootstrap.estimate(columns, statistic, bounds)
+        return self.places.estimate(columns, statistic, bounds)
 
     def of_table(
         self,
         table: VoxelTable,
         columns: Callable[[VoxelTable], Float64],
         statistic: Callable[[Float64], Float64],
-    ) -> Estimate:
-        """Of a statistic of the sums of the columns that are made of these voxels, in -1 to 1."""
-        return self.bootstrap.estimate_of(table, np.flatnonzero(self.again), columns, statistic, (-1.0, 1.0))
+    ) -> Interval:
+        """Of agreement beyond chance by the sums of the columns (m, C) that are made of these voxels.
+
+        The first column is agreement itself, the second its weight.
+        """
+        return self.places.estimate_of(table, np.flatnonzero(self.again), columns, statistic, (-1.0, 1.0), "agreement")
 
 
 def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> FrameAgreement:
@@ -259,9 +278,11 @@ def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, 
         trend_null=scene.trend_null,
         trend_excess=means.function(excess, ratio_of, (-1.0, 1.0)),
         trend_p=scene.trend_p,
+        stretches=scene.stretches,
+        voxels=scene.voxels,
         tested_voxels=int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
         unusual_sbd_voxels=_discoveries(maps["drift_q"]),
-        drifting_voxels=_discoveries(maps["trend_q"]),
+        trending_voxels=_discoveries(maps["trend_q"]),
     )
 
 
@@ -288,17 +309,17 @@ def _uncertainty(table: VoxelTable, means: _Means, maps: Maps) -> EntropyParts:
 
 
 def _correctness(
-    table: VoxelTable, truth: Truth, means: _Means, maps: Maps, edges: Sequence[int], seed: int
+    table: VoxelTable, truth: Truth, means: _Means, maps: Maps, edges: Sequence[int]
 ) -> CorrectnessStatistics:
     maps |= {"true_label": truth.label, "stable_wrong": stable_wrong(table, truth)}
     right = np.where(truth.known, dominant(table) == truth.label, np.nan)
     counted = truth.known & means.again
-    everywhere = spatial_blocks(table.index, table.voxel_size, size=means.bootstrap.blocks.size)
+    everywhere = Places(table.index, table.voxel_size, means.places.edge)
     return CorrectnessStatistics(
         accuracy=means.mean(right),
         strata=by_stratum(table, truth, edges),
         reliability=reliability(table.evidence.take(counted), truth.label[counted]),
-        quadrants=quadrants(table, truth, BlockBootstrap(everywhere, seed=seed)),
+        quadrants=quadrants(table, truth, everywhere),
     )
 
 
@@ -312,6 +333,21 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tup
         relabelled = fusion_rules.labels(fused.evidence) != usual
         rows.append(RuleOutcome(rule, rule_means(fused, again, truth), mean(relabelled[again])))
     return tuple(rows)
+
+
+def _beyond_coin(table: VoxelTable, means: _Means, maps: Maps) -> BeyondCoin:
+    """PSA does not depend on OP for a coin, nor does SBD on the order."""
+    op, agreement = table.op[means.again], maps["psa"][means.again]
+    excess = np.where(table.op > 2, maps["sbd_excess"], np.nan)
+    groups = [np.stack([agreement * where, where], axis=1) for where in (op == 2, op > 2)]
+    return BeyondCoin(
+        means.function(np.concatenate(groups, axis=1), _less, (-1.0, 1.0)), means.mean(-excess, (-1.0, 1.0))
+    )
+
+
+def _less(sums: Float64) -> Float64:
+    """A ratio less another, (...,) from sums (..., 4)."""
+    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
 
 
 def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> tuple[StratumStatistics, ...]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from semstab.model.statistics import UNDEFINED, ClassReach, Estimate, FrameAgreement, Reach, StabilityVerdict
+from semstab.model.statistics import NEXT_FLIGHT, ClassReach, Estimate, Interval, Judged, Reach, StabilityVerdict
+from semstab.statistics.sampling import LEAST_FRAMES
 
 RELIABLE = 0.8
 """Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""
@@ -39,33 +40,45 @@ ONE_CLASS = "hardly more than one class was predicted, so that agreement says no
 def verdict(
     backbone: str,
     *,
-    agreement: FrameAgreement,
+    judged: Judged,
     reach: Reach | None,
     voxels: int,
     share: float,
     blocks: int,
-    wrong_of_stable: Estimate = UNDEFINED,
 ) -> StabilityVerdict:
     """Judge by the intervals, never by values alone, from voxels with OP >= 2 only.
 
-    agreement        of these voxels
-    reach            the same beside its ceiling; where it is not known, alpha between frames is judged as it is
-    voxels, share    how many they are, and of all voxels
-    blocks           in how many blocks they lie
-    wrong_of_stable  share of the stable voxels that are wrong, where ground truth tells
+    judged         of these voxels
+    reach          the same beside its ceiling; where it is not known, alpha between frames is judged as it is
+    voxels, share  how many they are, and of all voxels
+    blocks         in how many cubes of space they lie
     """
     enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
-    level = _level(agreement, reach, wrong_of_stable) if enough else "no verdict"
+    level = _level(judged, reach) if enough else "no verdict"
     support = f"{voxels} places seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
         return StabilityVerdict(level, f"{backbone}: no verdict, {ONE_CLASS if enough else ADVICE[level]}; {support}")
-    psa = agreement.psa
+    psa, wrong = judged.psa, judged.wrong_of_stable
     found = [f"two frames agree on {psa.value:.0%} of the places ({psa.low:.0%} to {psa.high:.0%})"]
-    found += [_alpha(agreement.alpha_between)] if reach is None else _reached(reach)
-    if not math.isnan(wrong_of_stable.low):
-        wrong = wrong_of_stable
+    found += [_alpha(judged.alpha_between)] if reach is None else _reached(reach)
+    if not math.isnan(wrong.low):
         found.append(f"{wrong.value:.0%} of the stable places are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
-    return StabilityVerdict(level, f"{backbone}: {level}, {ADVICE[level]}: {', '.join(found)}; {support}")
+    basis = _basis(judged, reach)
+    reason = basis.undecided if level == "undecided" and basis.undecided else ADVICE[level]
+    return StabilityVerdict(level, f"{backbone}: {level}, {reason}: {', '.join(found)}; {support}; {_holds(basis)}")
+
+
+def _basis(judged: Judged, reach: Reach | None) -> Interval:
+    """The interval that decides."""
+    return judged.alpha_between if reach is None else reach.reached
+
+
+def _holds(basis: Interval) -> str:
+    """For what the intervals hold."""
+    if basis.question == NEXT_FLIGHT:
+        return f"intervals are for the next flight, from {basis.frames} frames"
+    frames = f"these {basis.frames} frames: fly {LEAST_FRAMES} or more" if basis.frames else "these frames: keep a log"
+    return f"intervals are for {frames} to tell of the next flight"
 
 
 def _alpha(alpha: Estimate) -> str:
@@ -89,17 +102,17 @@ def _class_share(row: ClassReach) -> str:
     return f"{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
 
 
-def _level(agreement: FrameAgreement, reach: Reach | None, wrong_of_stable: Estimate) -> str:
-    judged = agreement.alpha_between if reach is None else reach.reached
-    if math.isnan(judged.low):
+def _level(judged: Judged, reach: Reach | None) -> str:
+    basis = _basis(judged, reach)
+    if math.isnan(basis.low):
         return "no verdict"
-    if wrong_of_stable.low > DANGEROUS:
+    if judged.wrong_of_stable.low > DANGEROUS:
         return "misleading"
-    if judged.low < TENTATIVE:
-        return "unstable" if judged.high < TENTATIVE else "undecided"
+    if basis.low < TENTATIVE or not basis.decided:
+        return "unstable" if basis.decided and basis.high < TENTATIVE else "undecided"
     if reach is not None and not reach.ceiling.value >= LEAST_CEILING:
         return "too coarse"
-    if judged.low < RELIABLE:
+    if basis.low < RELIABLE:
         return "usable"
     return "stable" if reach is None or _every_class_holds(reach) else "partly stable"
 

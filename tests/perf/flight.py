@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -45,34 +46,28 @@ STREET, EAVES, TREES = 14.0, 12.0, 40
 """Half the width of the street, the height of its houses (metres), and how many trees stand in each of two rows."""
 
 
-def street(
-    index: int, width: int, height: int, K: int, *, noise: float = 0.0, salt: float = 0.0, clean: bool = False
-) -> semstab.Frame:
-    """Frame `index` of a flight along a street: facades with windows, trees, roofs, ground, and sky without depth.
-
-    noise  standard deviation of depth, as a share of it
-    salt   share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
-    """
-    rng = np.random.default_rng(index)
+@functools.lru_cache(maxsize=3)
+def _street(index: int, width: int, height: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8], Any]:
+    """Depth, 0 in the sky, labels 0 to 5, and the pose of a frame of `street`."""
     f = width / (2 * np.tan(np.radians(35)))
     v, u = np.mgrid[:height, :width].astype(np.float32)
     pitch = np.radians(12)
     R = np.array([[1, 0, 0], [0, -np.sin(pitch), np.cos(pitch)], [0, -np.cos(pitch), -np.sin(pitch)]])
-    dx, dy, dz = ((R[i, 0] * (u - width / 2) + R[i, 1] * (v - height / 2)) / f + R[i, 2] for i in range(3))
+    rays = np.stack([(R[i, 0] * (u - width / 2) + R[i, 1] * (v - height / 2)) / f + R[i, 2] for i in range(3)])
     start = np.array([0.5 * np.sin(index), 1.5 * index, 22.0])
     z = np.full((height, width), np.inf, dtype=np.float32)
-    label = np.zeros((height, width), dtype=np.int64)
+    label = np.zeros((height, width), dtype=np.uint8)
 
-    def hit(at: npt.NDArray[np.float32], where: npt.NDArray[np.bool_], name: int) -> None:
-        nearer = where & (at > 0.5) & (at < 150) & (at <= z)
-        z[nearer], label[nearer] = at[nearer], name % K
+    def hit(at: Any, where: Any, name: int, part: Any = np.s_[:]) -> None:
+        nearer = where & (at > 0.5) & (at < 150) & (at <= z[part])
+        z[part][nearer], label[part][nearer] = at[nearer], name
 
     with np.errstate(divide="ignore", invalid="ignore"):
+        dx, dy, dz = rays.astype(np.float32)
         at = (-start[2] / dz).astype(np.float32)
-        x = start[0] + dx * at
-        hit(at, np.abs(x) <= STREET, 0)
-        hit(at, np.abs(x) <= STREET / 3, 1)
-        at = (EAVES - start[2]) / dz
+        hit(at, np.abs(start[0] + dx * at) <= STREET, 0)
+        hit(at, np.abs(start[0] + dx * at) <= STREET / 3, 1)
+        at = ((EAVES - start[2]) / dz).astype(np.float32)
         hit(at, np.abs(start[0] + dx * at) > STREET, 2)
         for side in (-STREET, STREET):
             at = (side - start[0]) / dx
@@ -83,28 +78,44 @@ def street(
             hit(at, (up > 0) & (up < EAVES) & window, 4)
         for k in range(2 * TREES):
             center = np.array([(-9.0, 9.0)[k % 2], 8.0 + (k // 2) * 7.0, 5.0]) - start
-            along = (dx * center[0] + dy * center[1] + dz * center[2]) / (dx * dx + dy * dy + dz * dz)
-            miss = (dx * along - center[0]) ** 2 + (dy * along - center[1]) ** 2 + (dz * along - center[2]) ** 2
-            if center[1] > 0:
-                leaf = (np.floor(u / 7) * 31 + np.floor(v / 5) * 17 + k) % 11 / 11  # leaves before and behind others
-                hit(along - np.sqrt(np.maximum(6.0 - miss, 0)) + 0.8 * leaf, miss < 6.0 - 2 * leaf, 5)
-    if noise:
-        z *= 1 + noise * rng.standard_normal(z.shape, dtype=np.float32)
+            x, y, ahead = center @ R
+            if ahead > 4:
+                reach = 3 * f / (ahead - 3)
+                column, row = width / 2 + f * x / ahead, height / 2 + f * y / ahead
+                part = tuple(slice(max(0, int(c - reach)), max(0, int(c + reach))) for c in (row, column))
+                px, py, pz, v_, u_ = dx[part], dy[part], dz[part], v[part], u[part]
+                along = (px * center[0] + py * center[1] + pz * center[2]) / (px * px + py * py + pz * pz)
+                miss = (px * along - center[0]) ** 2 + (py * along - center[1]) ** 2 + (pz * along - center[2]) ** 2
+                leaf = (np.floor(u_ / 7) * 31 + np.floor(v_ / 5) * 17 + k) % 11 / 11  # leaves before and behind others
+                surface = (along - np.sqrt(np.maximum(6.0 - miss, 0)) + 0.8 * leaf).astype(np.float32)
+                hit(surface, miss < 6.0 - 2 * leaf, 5, part)
     z[~np.isfinite(z)] = 0
+    T_wc = np.eye(4)
+    T_wc[:3, :3], T_wc[:3, 3] = R, start
+    return z, label, T_wc
+
+
+def street(
+    index: int, width: int, height: int, K: int, *, noise: float = 0.0, salt: float = 0.0, clean: bool = False
+) -> semstab.Frame:
+    """Frame `index` of a flight along a street: facades with windows, trees, roofs, ground, and sky without depth.
+
+    noise  standard deviation of depth, as a share of it
+    salt   share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
+    """
+    rng = np.random.default_rng(index)
+    depth, label, T_wc = _street(index, width, height)
+    if noise:
+        depth = depth * (1 + noise * rng.standard_normal(depth.shape, dtype=np.float32))
+    label = label % K
     if not clean:
         wrong = rng.random((-(-height // 24), -(-width // 24))) < 0.12
         label = np.where(np.kron(wrong, np.ones((24, 24), dtype=bool))[:height, :width], (label + 1) % K, label)
     if salt:
-        label = np.where(rng.random(z.shape) < salt, rng.integers(0, K, z.shape), label)
-    T_wc = np.eye(4)
-    T_wc[:3, :3], T_wc[:3, 3] = R, start
-    return semstab.Frame(
-        index=index,
-        depth=z,
-        labels=label.astype(np.uint8),
-        intrinsics=semstab.Intrinsics(f, f, width / 2, height / 2),
-        T_wc=T_wc,
-    )
+        label = np.where(rng.random(depth.shape) < salt, rng.integers(0, K, depth.shape), label)
+    f = width / (2 * np.tan(np.radians(35)))
+    camera = semstab.Intrinsics(f, f, width / 2, height / 2)
+    return semstab.Frame(index=index, depth=depth, labels=label.astype(np.uint8), intrinsics=camera, T_wc=T_wc)
 
 
 def milliseconds(work: Callable[..., Any], *arguments: Any) -> float:
@@ -112,13 +123,3 @@ def milliseconds(work: Callable[..., Any], *arguments: Any) -> float:
     started = time.perf_counter()
     work(*arguments)
     return 1e3 * (time.perf_counter() - started)
-
-
-def read_bandwidth(threads: int = 2, megabytes: int = 400) -> float:
-    """Bytes a second that `threads` threads read from memory together: the best of several sums of large arrays."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    parts = [np.ones(megabytes * 2**20 // 8 // threads) for _ in range(threads)]
-    with ThreadPoolExecutor(threads) as pool:
-        best = min(milliseconds(lambda: list(pool.map(np.sum, parts))) for _ in range(7))
-    return sum(part.nbytes for part in parts) / (best / 1e3)

@@ -13,25 +13,30 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import FusionBackend
+from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
 from semstab.config import Config
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
-from semstab.engine.series import to_csv
+from semstab.engine.series import FrameRow, to_csv
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
-from semstab.metrics import macro_mean, summarise
-from semstab.model.measures import dominant, measures
-from semstab.model.records import EVENTS, FRAMES, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
-from semstab.model.results import STAGES, UnitSummary, slug
+from semstab.metrics import compare, macro_mean, summarise
+from semstab.metrics.matching import rows_of
+from semstab.model.measures import dominant, mean, measures, vss
+from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
+from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
-from semstab.statistics import Analysis, Sample
+from semstab.statistics import Analysis, Sample, krippendorff_alpha
 from semstab.task import Task, read
+
+WORST = 3
+"""So many frames are named that moved the map most."""
 
 Savers = dict[str, Callable[[Path], None]]
 """What writes each file of a unit, by its path in the folder."""
@@ -55,7 +60,9 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         summary = _summary(one, table, found)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
-    content = UnitContent(task.digest, summary, files=saved)
+    with watch("reference"):
+        checked = None if one.reference is None else _checked(one, table, one.reference)
+    content = UnitContent(task.digest, summary, files=saved, checked=checked)
     if one.request.image_space and stream.image_space is not None:
         image_space = stream.image_space.result(summary.flicker_percent)
         content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
@@ -90,6 +97,14 @@ def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
     )
 
 
+def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
+    """How far the map agrees with the reference on the voxels of the sample."""
+    unit, found = one.task.units[0], _table(sample, one.task)
+    drawn = rows_of(table, in_sample(table.index.T.astype(np.int64)))
+    units = (unit, dataclasses.replace(unit, backend="numpy"))
+    return dataclasses.replace(compare(drawn, found, units, tolerance=one.request.config.tolerance), one_in=ONE_IN)
+
+
 def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
     task, config, rows = one.task, one.request.config, one.rows
@@ -106,7 +121,23 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSum
         frames_left_out=task.left_out,
         frames_empty=sum(row.report.points == 0 for row in rows),
         statistics=None if found is None else found.summary,
+        reduced=None if one.hard is None else _reduced(one.hard.table()),
+        worst_frames=tuple(_worst(rows)),
+        sizes=() if one.sizes is None else one.sizes.alphas(),
     )
+
+
+def _reduced(table: VoxelTable) -> ReducedScores:
+    values = vss(table)
+    return ReducedScores(mean(values), mean(values[table.op >= RECURRENT]), krippendorff_alpha(table))
+
+
+def _worst(rows: Sequence[FrameRow]) -> list[FrameDrift]:
+    """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
+    found = [FrameDrift(r.frame, r.drift, r.voxels - r.new_voxels) for r in (row.report for row in rows)]
+    usual = np.median([frame.voxels for frame in found]) if found else 0
+    met = [frame for frame in found if frame.voxels >= max(1, usual)]
+    return sorted(met, key=lambda frame: -frame.drift)[:WORST]
 
 
 def _savers(
@@ -122,6 +153,8 @@ def _savers(
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
         save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
     )
+    if found is not None:
+        savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found.sums.save
     savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
     if one.sampler is not None:
         savers[f"{LOOKS}/{unit.slug}.parquet"] = one.sampler.looks(table.classes).save

@@ -29,6 +29,7 @@ class Request:
     image_space: bool = False
     kept: bool = False
     judged: bool = True
+    sampled: bool = False
     left_out: int = 0
     regions: bool = False
 
@@ -39,7 +40,7 @@ class Request:
             return cls(planned.identity, planned.config, regions=True)
         frames = FrameSelection(list=tuple(planned.task.indices))
         config = planned.config.model_copy(update={"frames": frames})
-        wanted = (planned.image_space, planned.kept, planned.judged)
+        wanted = (planned.image_space, planned.kept, planned.judged, planned.sampled)
         return cls(planned.identity, config, *wanted, planned.task.left_out)
 
 

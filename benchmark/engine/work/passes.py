@@ -10,6 +10,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.backends import FusionBackend, create, takes_option
+from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.evaluation import truth_task
@@ -20,6 +21,7 @@ from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
 from semstab.engine.work.memory import require_memory
 from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
+from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, Prepared, Stream, UnitMap, streams_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
@@ -137,7 +139,12 @@ class Pass:
             task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
             sampler, of_truth = (_sampler(request, task) if wanted else None for wanted in (request.judged, truth))
-            return [UnitMap(request, task, _new_map(request.config, task), truth, sampler, of_truth)]
+            made = UnitMap(request, task, _new_map(request.config, task), truth, sampler, of_truth)
+            if request.sampled:
+                made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target))
+            if request.image_space and request.judged:
+                made.sizes = SizeMaps(task, request.config)
+            return [made]
         return []
 
     def _decode(self, index: int) -> Decoded:
@@ -178,6 +185,16 @@ class Pass:
         with self._watch("sample"):
             if one.sampler is not None:
                 one.sampler.add(frame)
+        if one.reference is not None:
+            with self._watch("reference"):
+                one.reference.integrate(frame)
+        if one.sizes is not None:
+            with self._watch("voxel sizes"):
+                one.sizes.add(fetched.item.index, frame)
+        if frame.scores is not None and one.request.image_space:
+            with self._watch("reduced scores"):
+                one.hard = one.hard or _map_without_log(one.request.config, one.task)
+                one.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if one.truth is not None and now.truth is not None:
             one.truth.integrate(now.truth)
             if one.truth_sampler is not None:
@@ -250,8 +267,11 @@ def _new_map(config: Config, task: Task) -> FusionBackend:
 
 def _truth_map(config: Config, task: Task) -> FusionBackend | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
-    without_log = config.model_copy(update={"statistics": False, "events": False})
-    return _new_map(without_log, task) if truth_task(task) else None
+    return _map_without_log(config, task) if truth_task(task) else None
+
+
+def _map_without_log(config: Config, task: Task) -> FusionBackend:
+    return _new_map(config.model_copy(update={"statistics": False, "events": False}), task)
 
 
 def _sampler(request: Request, task: Task) -> Sampler:

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from semstab.backends import FusionBackend
+from semstab.backends.numpy_reference import NumpySample
 from semstab.engine.evaluation import truth_task
 from semstab.engine.series import FrameRow
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
+from semstab.engine.work.sizes import SizeMaps
 from semstab.metrics import flicker_percent
 from semstab.model.frames import Frame
 from semstab.runtime.stopwatch import Stopwatch
@@ -27,7 +29,12 @@ SHOWN_WIDTH = 1280
 
 @dataclass(eq=False)
 class UnitMap:
-    """A unit that is being fused; `truth` takes the ground truth of the same frames, samplers what statistics need."""
+    """A unit that is being fused; `truth` takes the ground truth of the same frames, samplers what statistics need.
+
+    reference  follows a sample of its voxels, where it is checked so
+    sizes      maps of some frames at other voxel sizes
+    hard       of soft scores, a map of each pixel's likeliest class
+    """
 
     request: Request
     task: Task
@@ -35,6 +42,9 @@ class UnitMap:
     truth: FusionBackend | None = None
     sampler: Sampler | None = None
     truth_sampler: Sampler | None = None
+    reference: NumpySample | None = None
+    sizes: SizeMaps | None = None
+    hard: FusionBackend | None = None
     rows: list[FrameRow] = field(default_factory=list)
     observations: int = 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, SemstabError, one_line
 from semstab.outputs.export import las, ply
 from semstab.outputs.export.lookup import NONE, VoxelLookup, for_points
 from semstab.outputs.export.voxels import Voxels
@@ -74,7 +74,7 @@ def classify(voxels: Voxels, cloud: Path, out: Path, radius: float, asprs: Path 
     with atomic_path(out) as temporary:
         write(voxels, cloud, temporary, _finder(lookup, tally))
         if not tally.classified:
-            raise _beside(cloud, tally.low, tally.high, lookup)
+            raise _beside(cloud, tally, lookup, georeferenced=voxels.georeference is not None)
     return tally
 
 
@@ -87,12 +87,14 @@ def _finder(lookup: VoxelLookup, tally: Tally) -> Finder:
     return find
 
 
-def _beside(cloud: Path, low: Any, high: Any, lookup: VoxelLookup) -> DataError:
+def _beside(cloud: Path, tally: Tally, lookup: VoxelLookup, *, georeferenced: bool) -> DataError:
+    """What to raise where no point of a cloud has a voxel."""
     there, here = (
         " to ".join("(" + ", ".join(f"{value:.1f}" for value in corner) + ")" for corner in box)
-        for box in ((low, high), lookup.bounds)
+        for box in ((tally.low, tally.high), lookup.bounds)
     )
-    return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; mend its coordinates")
+    mend = "mend the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
+    return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; {mend}")
 
 
 # --- LAS --------------------------------------------------------------------------------------------------------------
@@ -108,22 +110,31 @@ def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: P
             with library.open(out, mode="w", header=header, do_compress=compress) as writer:
                 for points in reader.chunk_iterator(CHUNK):
                     writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
-    except (OSError, ValueError, library.errors.LaspyException) as error:
+                if (read := writer.header.point_count) < reader.header.point_count:
+                    raise DataError(f"{cloud}: ends after {read:,} of {reader.header.point_count:,} points")
+                if extended := _without_copc(reader.evlrs or ()):
+                    writer.write_evlrs(type(reader.header.vlrs)(extended))
+    except SemstabError:
+        raise
+    except (OSError, ValueError, library.errors.LaspyException, RuntimeError) as error:
         raise DataError(f"{cloud}: cannot be read ({one_line(error)})") from error
 
 
 def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:
     """The cloud's header with the dimensions that its points take."""
     extended = copy.deepcopy(header)
-    extended.vlrs = type(header.vlrs)(
-        vlr for vlr in header.vlrs if vlr.user_id != "copc"
-    )  # the order of points is none
+    extended.vlrs = type(header.vlrs)(_without_copc(header.vlrs))
     las.declare(extended, BEFORE, np.uint8, "what was there before")
     las.declare(extended, "class", voxels.classified.dtype, "1 to K; 0 unclassified")
     for name, column in voxels.columns.items():
         las.declare_column(extended, name, column)
     las.describe(extended, voxels)
     return extended
+
+
+def _without_copc(records: Iterable[laspy.VLR]) -> list[laspy.VLR]:
+    """The records but those that say in which order a COPC file has its points: it is written as plain LAZ."""
+    return [record for record in records if record.user_id != "copc"]
 
 
 def _classified_points(

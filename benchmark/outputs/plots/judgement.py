@@ -178,7 +178,7 @@ def _sweeps(result: Result) -> Iterator[Figure]:
             yield Figure(
                 f"sensitivity_agreement_{sweep.name}",
                 f"Agreement against {sweep.title}",
-                "VSS over all voxels, beside what does not depend on how often a voxel was seen: pairwise agreement"
+                "VSS over all voxels, beside what random thinning of the frames does not change: pairwise agreement"
                 " (PSA) and Krippendorff's alpha of the voxels seen twice or more, macro means of the scenes; and"
                 " their SBD as seen and in random order. Bars are the standard deviation over repeats.",
                 f"Four panels against {sweep.title}: VSS, pairwise agreement, alpha, and SBD with its null.",

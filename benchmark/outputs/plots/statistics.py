@@ -36,7 +36,7 @@ _PANELS: tuple[tuple[str, Callable[[Pooled], float]], ...] = (
 
 
 def draw_agreement(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
-    """VSS beside what does not depend on OP, and SBD beside its null, along a sweep."""
+    """VSS beside what random thinning does not change, and SBD beside its null, along a sweep."""
     from matplotlib.lines import Line2D
 
     figure = canvas(PAGE, 2.5)

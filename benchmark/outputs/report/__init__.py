@@ -234,7 +234,7 @@ TOPICS = (
         "What the association does to the numbers",
         "Voxel size, noise and sampling change which observations meet in a voxel, and so how many voxels could be"
         " contradicted at all. Compare the values over all voxels with those of the recurrent ones and their share, and"
-        " with the agreement of frames, which does not depend on it.",
+        " with the share that agreement reaches of its ceiling, which hardly moves.",
         ("sensitivity",),
     ),
     Topic(

@@ -11,6 +11,7 @@ from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.outputs.averages import ENOUGH, Pooled, by_backbone, pooled
 from semstab.outputs.findings import Finding
+from semstab.outputs.remarks import mixed, remarks
 from semstab.outputs.tables.stability import comparable
 
 
@@ -21,9 +22,10 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
         return ["No unit at the study's own settings was finished: there is nothing to say yet."]
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
     return [
+        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
+        *(f"{remark[0].upper()}{remark[1:]}." for remark in remarks(result)),
         *_once(pooled(records)),
         *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
-        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
         *_ranking(result),
         *_flicker(records),
         *_least_seen(records),
@@ -66,6 +68,8 @@ def _ranking(result: Result) -> Iterator[str]:
     """Does the order of the backbones change where only recurrent voxels count?"""
     records = comparable(result)
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
+    if mixed([record.summary for record in result.select()]):
+        return
     if not means or any(voxels.recurrent.voxels < ENOUGH for voxels in means.values()):
         return
     every = _order({name: voxels.every[VSS] for name, voxels in means.items()})
@@ -126,3 +130,11 @@ def _implementations(result: Result) -> Iterator[str]:
     for name, agrees in rows.items():
         if not all(agrees):
             yield f"{name} and {result.backend} disagree in {agrees.count(False)} of {len(agrees)} comparisons."
+    for name in dict.fromkeys(row.backends[1] for row in result.compared):
+        pairs = [row for row in result.compared if row.backends[1] == name]
+        missing = macro_mean([row.only_in[0] / max(1, row.voxels[0]) for row in pairs])
+        other = macro_mean([row.differences["label"].mean for row in pairs])
+        yield (
+            f"{name}, which associates otherwise than {pairs[0].backends[0]}, lacks {missing:.0%} of its voxels, and"
+            f" gives another label to {other:.1%} of those that both have."
+        )

@@ -7,7 +7,7 @@ from pathlib import Path
 from semstab.model.records import Result
 from semstab.outputs.tables.comparison import comparison
 from semstab.outputs.tables.correctness import ceiling, correctness, rules
-from semstab.outputs.tables.fusion import agreement, fusion
+from semstab.outputs.tables.fusion import agreement, compared, fusion
 from semstab.outputs.tables.glance import glance
 from semstab.outputs.tables.image_space import flicker
 from semstab.outputs.tables.looks import correlogram
@@ -33,7 +33,7 @@ __all__ = [
 
 BUILDERS = (
     glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
-    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, agreement,
+    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, compared, agreement,
 )  # fmt: skip
 """In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
 

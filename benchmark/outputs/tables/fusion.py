@@ -39,6 +39,37 @@ def fusion(result: Result) -> list[Table]:
     return [Table("fusion", "Fusion implementations", caption, columns, groups)]
 
 
+def compared(result: Result) -> list[Table]:
+    """Where a backend that associates pixels and voxels in another way leaves the base one's map."""
+    if not result.compared:
+        return []
+    titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
+    columns = (
+        Column("scene", "Scene"),
+        Column("backbone", "Backbone"),
+        Column("first_only_percent", "in the first only (%)", 1, over="Voxels"),
+        Column("other_only_percent", "in the other only (%)", 1, over="Voxels"),
+        Column("relabelled_percent", "Other label (%)", 2),
+        *(Column(f"mean_{name}", header, 4, over="Mean difference") for name, header in titles.items()),
+    )
+    pairs = dict.fromkeys(row.backends for row in result.compared)
+    groups = tuple(
+        Group(" and ".join(pair), tuple(_compared_row(row, titles) for row in result.compared if row.backends == pair))
+        for pair in pairs
+    )
+    caption = (
+        "The same frames through code that associates pixels and voxels in another way, and need not agree. Labels and"
+        " differences, which have no sign, are of the voxels that both maps have."
+    )
+    return [Table("fusion_compared", "Where fusion implementations differ", caption, columns, groups, "backends")]
+
+
+def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
+    shares = (100 * only / max(1, n) for only, n in zip(row.only_in, row.voxels, strict=True))
+    means = (row.differences[name].mean for name in names)
+    return row.scene, row.backbone, *shares, 100 * row.differences["label"].mean, *means
+
+
 def agreement(result: Result) -> list[Table]:
     """How far each backend's map agrees with the base one's, voxel by voxel."""
     if not result.agreement:
@@ -55,6 +86,8 @@ def agreement(result: Result) -> list[Table]:
     rows = [(row.backends, _agreement_row(row, titles)) for row in result.agreement]
     groups = tuple(Group(" and ".join(pair), tuple(row for of, row in rows if of == pair)) for pair in pairs)
     caption = "The same frames through two backends: the largest difference of any voxel that both maps have."
+    if one_in := {row.one_in for row in result.agreement} - {1}:
+        caption += f" Against the numpy reference one voxel in {max(one_in)} was compared, drawn at random."
     return [Table("agreement", "Agreement of the fusion implementations", caption, columns, groups, "backends")]
 
 

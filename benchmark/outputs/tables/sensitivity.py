@@ -11,7 +11,7 @@ from semstab.statistics.agreement import ALPHA, PSA
 
 
 def sensitivity(result: Result) -> list[Table]:
-    """One table a sweep (paper, Sensitivity to World-Space Association), and one with what does not depend on OP."""
+    """One table a sweep (paper, Sensitivity to World-Space Association), and one with what thinning does not change."""
     found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
     return [table for pair in found for table in pair if table is not None]
 

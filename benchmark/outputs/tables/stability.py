@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from semstab.config import SHARED
-from semstab.metrics import macro_mean
+from semstab.metrics import macro_mean, split_last
 from semstab.model.measures import measures
 from semstab.model.records import Record, Result
 from semstab.model.results import Means, TableSummary
@@ -52,13 +52,16 @@ def persistence(result: Result) -> list[Table]:
         return []
     columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
     groups = []
-    for name, rows in by_backbone(records).items():
-        together = pooled(rows)
-        groups.append(Group(name, tuple(_means_row(row) for row in together.strata), _means_row(together.recurrent)))
+    for name, own in by_backbone(records).items():
+        together = pooled(own)
+        rows = (*together.strata, *together.well_seen)
+        groups.append(Group(name, tuple(_means_row(row) for row in rows), _means_row(together.recurrent)))
     caption = (
         f"{settings(records)} Pooled: the means run over the voxels of all scenes together. The last row is the"
         " recurrent voxels. A voxel seen once has no SBD, and where its pixels agree VSS = 1 and no entropy."
     )
+    if any(split_last([record.summary.table for record in own]) for own in by_backbone(records).values()):
+        caption += " Where most voxels are in the last stratum, it follows in parts."
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 
 

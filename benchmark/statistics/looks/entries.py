@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.metrics.matching import voxel_keys
+from semstab.metrics.matching import shared_observations, voxel_keys
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
 from semstab.runtime.files import atomic_path
@@ -58,6 +58,11 @@ class Sample:
     views: tuple[View, ...]
     soft: bool
     by: str = OWN
+
+    def shared(self) -> tuple[Events, Events]:
+        """The observations that both logs have."""
+        seen, limit = shared_observations(self.seen, self.limit)
+        return seen, limit
 
     def against(self, truth: Sample) -> Sample:
         """The same with the ground truth's labels as the limit, of a sample of the same frames."""

@@ -19,6 +19,9 @@ from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
 
+SIDE = 640
+"""Of frames with more pixels on a side every n-th of each axis is looked at."""
+
 REACH = 1 << 18
 """Voxels from the first camera within which there is a sample."""
 
@@ -27,7 +30,7 @@ Int64 = npt.NDArray[np.int64]
 
 
 class Sampler:
-    """Takes frames one by one, as they are fused; `sample` says what is there. About a tenth of the cost of fusion."""
+    """Takes frames one by one, as they are fused; `sample` says what is there."""
 
     def __init__(self, voxel_size: float, num_classes: int, budget: int = BUDGET) -> None:
         self.voxel_size, self.K, self.budget = voxel_size, num_classes, budget
@@ -42,6 +45,7 @@ class Sampler:
         """What the frame's valid pixels show of the sampled voxels."""
         from semstab.statistics.looks.loops import draw
 
+        frame = frame.every(math.ceil(max(frame.shape) / SIDE))
         centre = frame.T_wc[:3, 3]
         if self._origin is None:
             self._origin = np.floor(centre / self.voxel_size).astype(np.int64)

@@ -2,6 +2,19 @@
 
 from semstab.statistics.sampling.collect import influence_sums
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
-from semstab.statistics.sampling.intervals import difference, estimate
+from semstab.statistics.sampling.intervals import LEAST_FRAMES, difference, estimate, judged_of, question_of
+from semstab.statistics.sampling.places import Places
 
-__all__ = ["InfluenceSums", "aligned", "difference", "estimate", "influence_sums", "merged", "value"]
+__all__ = [
+    "LEAST_FRAMES",
+    "InfluenceSums",
+    "Places",
+    "aligned",
+    "difference",
+    "estimate",
+    "influence_sums",
+    "judged_of",
+    "merged",
+    "question_of",
+    "value",
+]

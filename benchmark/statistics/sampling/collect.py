@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -13,55 +14,116 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
-from semstab.statistics.correctness import STABLE
 from semstab.statistics.sampling.influence import MOST_CELLS, MOST_CLASSES, MOST_GROUPS, InfluenceSums, layout
+from semstab.statistics.steady import steady
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-NEARLY = STABLE - 1e-9
-"""A place is stable from this PSA on."""
-
 
 def influence_sums(
-    table: VoxelTable, events: Events | None = None, true_label: Int64 | None = None, *, edge: float | None = None
+    table: VoxelTable,
+    events: Events | None = None,
+    true_label: Int64 | None = None,
+    *,
+    sample: tuple[Events, Events] | None = None,
+    edge: float | None = None,
 ) -> InfluenceSums:
-    """The sums of a map; without its log each place counts as a whole, and the frames are not known.
+    """The sums of a map.
 
-    true_label (n,) is the true class of each voxel, -1 where it is not known; `edge` the cubes' edge in metres, a power
-    of 2, where several maps are to have the same: else the smallest that leaves at most MOST_CELLS.
+    events      its log; without it, but with a sample, what frames have to do with it is known of the sampled voxels
+                only; without either a place counts as a whole, and the frames are not known
+    true_label  (n,) the true class of each voxel, -1 where it is not known
+    sample      the same observations of sampled voxels, as they were and as they would be with labels that do not
+                depend on the view
+    edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
+                leaves at most MOST_CELLS
     """
+    index = table.index[table.op >= 2]
+    edge = cell_edge(index, table.voxel_size) if edge is None else edge
+    likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
+    whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
+    whole = dataclasses.replace(whole, classes=table.classes)
+    if sample is None:
+        return whole
+    seen, limit = (
+        dataclasses.replace(_of_log(log, None, edge, np.zeros(len(log.ix))), classes=table.classes) for log in sample
+    )
+    whole = _with_frames(whole, seen) if events is None else whole
+    return dataclasses.replace(whole, seen=seen, limit=limit)
+
+
+def _of_table(table: VoxelTable, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
     again = np.flatnonzero(table.op >= 2)
-    edge = cell_edge(table) if edge is None else edge
-    at = np.floor((table.index[again] + 0.5) * (table.voxel_size / edge)).astype(np.int64)
-    (key,) = voxel_keys(at)
-    _, first, of = np.unique(key, return_index=True, return_inverse=True)
-    if events is None:
-        step, frames = 0, np.array([-1])
-        sums = _sums_of_table(table, again, of, len(first), true_label)[:, None]
-    else:
-        step = _step(events.frame)
-        frames, group = np.unique(events.frame // step, return_inverse=True)
-        sums = _sums_of_log(table, events, again, of, len(first), group, len(frames), true_label)
-    cell, frame = np.nonzero(sums[:, :, layout(table.K, truth=False)["observations"].start])
+    at, of = cells_of(table.index[again], table.voxel_size, edge)
+    columns = _sums_of_table(table, again, of, len(at), true_label, likely)
+    unknown = np.full(len(at), -1, dtype=np.int32)
     return InfluenceSums(
-        cell=at[first[cell]].astype(np.int32),
-        frame=frames[frame].astype(np.int32),
-        columns=sums[cell, frame],
-        edge=edge,
-        step=step,
-        voxel_size=table.voxel_size,
-        K=table.K,
-        classes=table.classes,
-        truth=true_label is not None,
+        at, unknown, columns, edge, 0, table.voxel_size, table.K, table.classes, true_label is not None
     )
 
 
-def cell_edge(table: VoxelTable) -> float:
+def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
+    starts = events.starts
+    op = np.diff(np.append(starts, len(events)))
+    again = np.flatnonzero(op >= 2)
+    index = np.stack([events.ix, events.iy, events.iz], axis=1)
+    at, of = cells_of(index[again], events.voxel_size, edge)
+    step, K = _step(events.frame), int(events.evidence.shape[1])
+    frames, group = np.unique(events.frame // step, return_inverse=True)
+    sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
+    cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
+    return InfluenceSums(
+        at[cell],
+        frames[frame].astype(np.int32),
+        sums[cell, frame],
+        edge,
+        step,
+        events.voxel_size,
+        K,
+        events.classes,
+        true_label is not None,
+    )
+
+
+def _with_frames(whole: InfluenceSums, seen: InfluenceSums) -> InfluenceSums:
+    """The sums of a whole map, with the share that each frame has in a cube as in a sample of its voxels.
+
+    What the sample does not account for stands in rows of its own, whose frame is -1.
+    """
+    cells, row = np.unique(np.concatenate([whole.cell, seen.cell]), axis=0, return_inverse=True)
+    mine, theirs = np.split(row.ravel(), [len(whole.cell)])
+    count = [np.bincount(of, weights=part["observations"][:, 0], minlength=len(cells))
+             for of, part in ((mine, whole), (theirs, seen))]  # fmt: skip
+    scale = count[0][theirs] / np.maximum(count[1][theirs], 1.0)
+    by_frame = np.zeros((len(seen.cell), whole.columns.shape[1]))
+    by_frame[:, : seen.columns.shape[1]] = seen.columns * scale[:, None]
+    left = np.zeros((len(cells), whole.columns.shape[1]))
+    np.add.at(left, mine, whole.columns)
+    np.subtract.at(left, theirs, by_frame)
+    return dataclasses.replace(
+        whole,
+        cell=np.concatenate([seen.cell, cells]).astype(np.int32),
+        frame=np.concatenate([seen.frame, np.full(len(cells), -1)]).astype(np.int32),
+        columns=np.concatenate([by_frame, left]),
+        step=seen.step,
+    )
+
+
+def cells_of(
+    index: npt.NDArray[np.int32], voxel_size: float, edge: float
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+    """The cubes (G, 3) that hold voxels (n, 3), and which of them each is in."""
+    at = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
+    (key,) = voxel_keys(at)
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    return at[first].astype(np.int32), of.astype(np.int64)
+
+
+def cell_edge(index: npt.NDArray[np.int32], voxel_size: float) -> float:
     """The smallest power of 2, in metres and no smaller than a voxel, that leaves at most MOST_CELLS cubes."""
-    index = table.index[table.op >= 2].astype(np.float64) + 0.5
-    edge = 2.0 ** math.ceil(math.log2(table.voxel_size) - 1e-9)
-    cells = np.floor(index * (table.voxel_size / edge)).astype(np.int64)
+    edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
+    cells = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
     while len(cells := cells[np.unique(voxel_keys(cells)[0], return_index=True)[1]]) > MOST_CELLS:
         cells, edge = cells // 2, 2 * edge
     return edge
@@ -75,43 +137,48 @@ def _step(frame: npt.NDArray[np.int32]) -> int:
 
 
 def _sums_of_log(
-    table: VoxelTable,
     events: Events,
+    starts: Int64,
+    op: Int64,
     again: Int64,
     of: Int64,
     cells: int,
     group: Int64,
     groups: int,
     true_label: Int64 | None,
+    likely: Float64,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
     from semstab.statistics.kernels import in_chunks
     from semstab.statistics.sampling import loops
 
-    columns = layout(table.K, truth=true_label is not None)
+    K = int(events.evidence.shape[1])
+    columns = layout(K, truth=true_label is not None)
     sums = np.zeros((cells, groups, max(part.stop for part in columns.values())))
     order = again[np.argsort(of, kind="stable")]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
-    truth = np.full(len(table), -1) if true_label is None else true_label
-    options = (table.K <= MOST_CLASSES, true_label is not None)
+    truth = np.full(len(op), -1) if true_label is None else true_label
+    options = (K <= MOST_CLASSES, true_label is not None)
     in_chunks(
         loops.add_influences,
         order,
         bounds,
-        events.starts,
-        table.op,
+        starts,
+        op,
         events.evidence.entries,
-        table.K,
+        K,
         group,
         truth,
-        STABLE,
+        likely,
         *options,
         sums,
     )
     return sums
 
 
-def _sums_of_table(table: VoxelTable, again: Int64, of: Int64, cells: int, true_label: Int64 | None) -> Float64:
+def _sums_of_table(
+    table: VoxelTable, again: Int64, of: Int64, cells: int, true_label: Int64 | None, likely: Float64
+) -> Float64:
     """(cells, C) from the voxels' rows alone; sums by class are NaN for evidence that is not one-hot."""
     T, e = table.op[again].astype(np.float64), table.evidence[again]
     agreement, recurrent = psa(table)[again], (table.op[again] >= RECURRENT).astype(np.float64)
@@ -129,15 +196,15 @@ def _sums_of_table(table: VoxelTable, again: Int64, of: Int64, cells: int, true_
     if true_label is not None:
         label = true_label[again]
         known, right = label >= 0, label == dominant(table)[again]
-        steady = known & (agreement >= NEARLY) & (recurrent > 0)
+        stable = known * likely[again] * recurrent
         looks = np.take_along_axis(e, np.maximum(label, 0)[:, None], axis=1)[:, 0]
         values |= {
             "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
-            "stable": steady, "stable_wrong": steady & ~right,
+            "stable": stable, "stable_wrong": stable * ~right,
         }  # fmt: skip
         if table.K <= MOST_CLASSES:
             true = (label[:, None] == np.arange(table.K)).astype(np.float64)
             values |= {"class_known": true, "class_right": true * right[:, None]}
     names = layout(table.K, truth=true_label is not None)
-    columns = np.concatenate([np.asarray(values[name], float).reshape(len(T), -1) for name in names], axis=1)
+    columns = np.column_stack([np.asarray(values[name], float) for name in names])
     return np.stack([np.bincount(of, weights=column, minlength=cells) for column in columns.T], axis=1)

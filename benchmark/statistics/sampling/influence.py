@@ -8,20 +8,22 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
 from semstab.runtime.files import atomic_path
-from semstab.statistics.agreement import alpha_of, between_of, ratio_of
+from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
 Statistic = Callable[[Float64], Float64]
+Scale = Literal["share", "agreement", "plain"]
 
 SCHEMA = 1
 MOST_CELLS, MOST_GROUPS = 256, 64
@@ -57,6 +59,8 @@ class InfluenceSums:
     edge     metres, a power of 2
     step     frames of a group, a power of 2; 0 where they are not known
     truth    whether ground truth is in it
+    seen     the same of the sampled voxels alone, where a `Sample` was taken; limit of what they would be had their
+             labels not depended on the view, in the same rows
     """
 
     cell: Int32
@@ -68,6 +72,8 @@ class InfluenceSums:
     K: int
     classes: tuple[str, ...] = ()
     truth: bool = False
+    seen: InfluenceSums | None = None
+    limit: InfluenceSums | None = None
 
     def __getitem__(self, name: str) -> Float64:
         """Sums (m, 1), or (m, K) by class, of that name."""
@@ -80,7 +86,7 @@ class InfluenceSums:
     @property
     def frames(self) -> int:
         """How many groups of frames there are; 0 where they are not known."""
-        return len(np.unique(self.frame)) if self.step else 0
+        return len(np.unique(self.frame[self.frame >= 0])) if self.step else 0
 
     @property
     def cells(self) -> int:
@@ -91,7 +97,7 @@ class InfluenceSums:
         """With larger cubes, or groups of frames; step 0 forgets the frames."""
         cell = np.floor_divide(self.cell, round(edge / self.edge)).astype(np.int32)
         known = step and self.step
-        frame = self.frame // (step // self.step) if known else np.full(len(self.frame), -1)
+        frame = np.where(self.frame >= 0, self.frame // (step // self.step), -1) if known else np.full(len(cell), -1)
         key = np.concatenate([cell, frame[:, None]], axis=1)
         rows, of = np.unique(key, axis=0, return_inverse=True)
         columns = np.zeros((len(rows), self.columns.shape[1]))
@@ -103,6 +109,8 @@ class InfluenceSums:
             columns=columns,
             edge=edge,
             step=step if known else 0,
+            seen=None if self.seen is None else self.seen.coarsened(edge, step),
+            limit=None if self.limit is None else self.limit.coarsened(edge, step),
         )
 
     def bounded(self) -> InfluenceSums:
@@ -119,14 +127,22 @@ class InfluenceSums:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
+        parts = [part for part in (self, self.seen, self.limit) if part is not None]
         about = {name: getattr(self, name) for name in ("edge", "step", "voxel_size", "K", "classes", "truth")}
-        keys = dict(zip(("ix", "iy", "iz"), self.cell.T, strict=True)) | {"frame": self.frame}
-        sums = {
-            f"{name}_{k}" if columns.stop - columns.start > 1 else name: self.columns[:, columns.start + k]
-            for name, columns in layout(self.K, truth=self.truth).items()
-            for k in range(columns.stop - columns.start)
-        }
-        content = pa.table({name: pa.array(np.ascontiguousarray(column)) for name, column in (keys | sums).items()})
+        lengths = [len(part.frame) for part in parts]
+        cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
+        columns = np.zeros((sum(lengths), self.columns.shape[1]))
+        for part, rows in zip(parts, np.split(np.arange(len(columns)), np.cumsum(lengths)[:-1]), strict=True):
+            columns[rows, : part.columns.shape[1]] = part.columns
+        names = [
+            f"{name}_{k}" if own.stop - own.start > 1 else name
+            for name, own in layout(self.K, truth=self.truth).items()
+            for k in range(own.stop - own.start)
+        ]
+        arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *columns.T]
+        content = pa.table(
+            {name: pa.array(np.ascontiguousarray(array)) for name, array in zip([*KEYS, *names], arrays, strict=True)}
+        )
         text = json.dumps({"schema": SCHEMA, "kind": "InfluenceSums", **about})
         with atomic_path(path) as temporary:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
@@ -143,14 +159,31 @@ class InfluenceSums:
             if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
                 raise DataError("of another kind or version")
             about["classes"] = tuple(about["classes"])
-            columns = [column.to_numpy() for column in content.columns]
-            cell, frame = np.stack(columns[:3], axis=1).astype(np.int32), columns[3].astype(np.int32)
-            sums = cls(cell, frame, np.stack(columns[4:], axis=1).astype(np.float64), **about)
-            if sums.columns.shape[1] != max(part.stop for part in layout(sums.K, truth=sums.truth).values()):
-                raise DataError(f"{sums.columns.shape[1]} columns of sums for {sums.K} classes")
+            part, *keys = (content.column(name).to_numpy() for name in KEYS)
+            columns = np.stack([column.to_numpy() for column in content.columns[len(KEYS) :]], axis=1)
+            if columns.shape[1] != _width(about["K"], truth=about["truth"]):
+                raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
+            found: list[InfluenceSums | None] = []
+            for number in range(3):
+                own = part == number
+                cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
+                some = about | ({"truth": False} if number else {})
+                sums = columns[own, : _width(about["K"], truth=some["truth"])].astype(np.float64)
+                made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
+                found.append(made if own.any() or not number else None)
+            whole, seen, limit = found
         except (OSError, LookupError, TypeError, ValueError, pa.ArrowException, DataError) as error:
             raise DataError(f"{path}: not a file of influence sums ({one_line(error)})") from error
-        return sums
+        assert whole is not None
+        return dataclasses.replace(whole, seen=seen, limit=limit)
+
+
+KEYS = ("part", "ix", "iy", "iz", "frame")
+"""The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 its limit."""
+
+
+def _width(K: int, *, truth: bool) -> int:
+    return max(int(part.stop) for part in layout(K, truth=truth).values())
 
 
 def merged(*parts: InfluenceSums) -> InfluenceSums:
@@ -161,8 +194,15 @@ def merged(*parts: InfluenceSums) -> InfluenceSums:
         cell=np.concatenate([part.cell for part in parts]),
         frame=np.concatenate([part.frame for part in parts]),
         columns=np.concatenate([part.columns for part in parts]),
+        seen=_merged([part.seen for part in parts]),
+        limit=_merged([part.limit for part in parts]),
     )
     return together.coarsened(together.edge, together.step).bounded()
+
+
+def _merged(parts: Sequence[InfluenceSums | None]) -> InfluenceSums | None:
+    there = [part for part in parts if part is not None]
+    return merged(*there) if len(there) == len(parts) else None
 
 
 def aligned(*parts: InfluenceSums) -> tuple[InfluenceSums, ...]:
@@ -186,18 +226,20 @@ class Functional:
     names      of the sums
     of         the number (...,) from these sums (..., C)
     low, high  its range
-    agreement  the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
+    scale      of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'
+    sampled    it is of the sample's sums beside those of its limit
+    pairs      the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
+
+    The second sum counts what the first is a sum of.
     """
 
     names: tuple[str, ...]
     of: Statistic
     low: float = 0.0
     high: float = 1.0
-    agreement: bool = False
-
-    def value(self, sums: InfluenceSums) -> float:
-        """The number; NaN where undefined."""
-        return float(self.of(sums.of(self.names).sum(axis=0)))
+    scale: Scale = "share"
+    pairs: bool = False
+    sampled: bool = False
 
 
 def class_alpha_of(sums: Float64) -> Float64:
@@ -205,53 +247,80 @@ def class_alpha_of(sums: Float64) -> Float64:
     apart, n, total, squares = np.moveaxis(sums, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
-        value: Float64 = 1 - (apart / n) / np.where(expected > 1e-9, expected, np.nan)
+        value: Float64 = 1 - (apart / n) / np.where(expected > ONE_HOT, expected, np.nan)
     return value
 
 
+def class_between_of(sums: Float64) -> Float64:
+    """The same of alpha between frames, which forgives what is within one."""
+    apart, n, total, squares = np.moveaxis(sums, -1, 0)
+    return class_of(np.stack([apart - 2 * (total - squares), n, squares, total], axis=-1))
+
+
+def reached_of(of: Statistic) -> Statistic:
+    """The share of its ceiling that a number reaches; NaN where that is no better than chance."""
+
+    def ratio(sums: Float64) -> Float64:
+        seen, limit = np.split(sums, 2, axis=-1)
+        ceiling = of(limit)
+        share: Float64 = of(seen) / np.where(ceiling > 0, ceiling, np.nan)
+        return share
+
+    return ratio
+
+
+ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")
+CLASS_SUMS = ("class_apart", "observations", "evidence", "class_own")
+
 FUNCTIONALS: Mapping[str, Functional] = {
-    "psa": Functional(("psa", "voxels"), ratio_of, agreement=True),
-    "alpha": Functional(("agreeing", "observations", "own", "evidence"), alpha_of, low=-1.0, agreement=True),
-    "alpha_between": Functional(("agreeing", "observations", "own", "evidence"), between_of, low=-1.0, agreement=True),
+    "psa": Functional(("psa", "voxels"), ratio_of, pairs=True),
+    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
+    "alpha_between": Functional(ALPHA_SUMS, between_of, -1.0, 1.0, "agreement", pairs=True),
+    "reached": Functional(ALPHA_SUMS, reached_of(between_of), -math.inf, math.inf, "plain", sampled=True),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
     "look_accuracy": Functional(("looks_right", "looks"), ratio_of),
     "wrong_of_stable": Functional(("stable_wrong", "stable"), ratio_of),
 }
-"""By key: PSA, alpha, and entropy at OP >= 2, VSS at OP >= 3; with ground truth the accuracy of the fused labels at
-OP >= 2 and of single looks, and the wrong among the stable places at OP >= 3."""
+"""By key: PSA, both alphas, the share of its ceiling that alpha between frames reaches, and entropy at OP >= 2, VSS at
+OP >= 3; with ground truth the accuracy of the fused labels at OP >= 2 and of single looks, and the wrong among the
+stable places at OP >= 3."""
 
-BY_CLASS: Mapping[str, tuple[str, ...]] = {
-    "alpha": ("class_apart", "observations", "evidence", "class_own"),
-    "accuracy": ("class_right", "class_known"),
+BY_CLASS: Mapping[str, Functional] = {
+    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
+    "alpha_between": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement"),
+    "reached": Functional(CLASS_SUMS, reached_of(class_between_of), -math.inf, math.inf, "plain", sampled=True),
+    "accuracy": Functional(("class_right", "class_known"), ratio_of),
 }
+"""Of one class: alphas against all others, accuracy where it is the true one."""
 
 
 def functional(key: str, k: int | None = None) -> Functional:
-    """What a key stands for: of all classes, or of class k ('alpha': against all others; 'accuracy': where it is true).
+    """What a key stands for: of all classes, or of class k."""
+    return FUNCTIONALS[key] if k is None else BY_CLASS[key]
 
-    Of class k, the sums are those that `columns_of` gives for it.
-    """
-    if k is None:
-        return FUNCTIONALS[key]
-    return Functional(BY_CLASS[key], class_alpha_of if key == "alpha" else ratio_of, -1.0 if key == "alpha" else 0.0)
+
+def parts_of(sums: InfluenceSums, number: Functional) -> tuple[InfluenceSums, ...]:
+    """The sums that a number is of: the map's, or those of the sample and its limit; none where they are not there."""
+    parts = (sums.seen, sums.limit) if number.sampled else (sums,)
+    there = tuple(part for part in parts if part is not None)
+    known = all(set(number.names) <= set(layout(part.K, truth=part.truth)) for part in there)
+    return there if known and len(there) == len(parts) else ()
 
 
 def columns_of(sums: InfluenceSums, key: str, k: int | None = None) -> Float64:
-    """The sums (m, C) that a functional is of."""
-    if k is None:
-        return sums.of(FUNCTIONALS[key].names)
-    own = [sums[name][:, k if name.startswith(("class", "evidence")) else 0] for name in BY_CLASS[key]]
-    return np.stack(own, axis=1)
-
-
-def defined(sums: InfluenceSums, key: str, k: int | None = None) -> bool:
-    """Whether the sums hold what a key is of."""
-    names = FUNCTIONALS[key].names if k is None else BY_CLASS[key]
-    return set(names) <= set(layout(sums.K, truth=sums.truth))
+    """The sums (m, C) that a number is of; (0, 0) where they are not there."""
+    number = functional(key, k)
+    own = [part[name] for part in parts_of(sums, number) for name in number.names]
+    if not own:
+        return np.zeros((0, 0))
+    if k is not None:
+        own = [columns[:, min(k, columns.shape[1] - 1)][:, None] for columns in own]
+    return np.concatenate(own, axis=1)
 
 
 def value(sums: InfluenceSums, key: str, k: int | None = None) -> float:
     """The number; NaN where undefined."""
-    return float(functional(key, k).of(columns_of(sums, key, k).sum(axis=0))) if defined(sums, key, k) else math.nan
+    columns = columns_of(sums, key, k)
+    return float(functional(key, k).of(columns.sum(axis=0))) if columns.size else math.nan

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +17,14 @@ from threadpoolctl import ThreadpoolController
 
 Float64 = npt.NDArray[np.float64]
 
-REACHES = (0.5, 0.8, 1.3, 2.0, 3.2, 5.0, 8.0)
+REACHES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """How far errors may reach, in cells, besides not at all."""
 
 ALONE = (0.0, 0.5)
 """Shares of a cell's variance that it may have for itself."""
+
+ROUNDING = 1e-13
+"""Influences below are rounding's."""
 
 BLOCK = 4.0
 """The edge of a block, in reaches."""
@@ -78,9 +82,9 @@ class Arrangement:
         """Of the sum over cells of influences (G,), which are centred; size (G,) is how much is in each cell."""
         if self.count < 2:
             return Spread(math.nan, 0.0, 1.0)
-        if not influence.any():
+        if np.abs(influence).max() < ROUNDING:
             return Spread(0.0, self.count - 1.0, 1.0)
-        with _blas().limit(limits=1, user_api="blas"):
+        with one_thread():
             return self._spread(influence, size)
 
     def _spread(self, influence: Float64, size: Float64) -> Spread:
@@ -129,8 +133,13 @@ def arrangement(at: npt.NDArray[np.integer]) -> Arrangement:
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    """Matrices are so small that a second thread only waits, the longer the busier the machine is."""
     return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Matrices are so small that a second thread only waits, the longer the busier the machine is."""
+    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
+    return limited
 
 
 def carriers(influence: Float64) -> float:

@@ -1,0 +1,184 @@
+"""The influences of places and frames on a number, and the variance that they make together."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.statistics import THIS_MAP, Question
+from semstab.statistics.sampling.influence import Statistic
+from semstab.statistics.sampling.reach import Arrangement, Spread, arrangement, one_thread
+
+Float64 = npt.NDArray[np.float64]
+
+TINY = 1e-12
+"""A variance below is none."""
+
+# --- Influences -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Influences of places and frames on a number.
+
+    places   (G, 3) cubes in which something counts, frames (F,) groups
+    block    (G,) influence of each cube; they sum to 0
+    cell     (G, F) of each group of frames in each cube
+    size     (G, F) how much is in it, all (G,) in each cube
+    one_off  what the number falls by where all that counts was not as the first sum has it, but the opposite
+    """
+
+    places: npt.NDArray[np.int64]
+    frames: npt.NDArray[np.int64]
+    block: Float64
+    cell: Float64
+    size: Float64
+    all: Float64
+    edge: float
+    step: int
+    one_off: float
+
+    def units(self, question: Question) -> int:
+        """How many independent looks there can be."""
+        return len(self.places) if question == THIS_MAP else min(len(self.places), len(self.frames) * self.step)
+
+    def unseen(self, question: Question, level: float) -> float:
+        """What so many looks without a single error may have missed."""
+        return self.one_off * float(1 - ((1 - level) / 2) ** (1 / self.units(question)))
+
+    def minus(self, other: Grid) -> Grid:
+        """The influences on the difference of two numbers."""
+        places, rows = np.unique(np.concatenate([self.places, other.places]), axis=0, return_inverse=True)
+        frames, columns = np.unique(np.concatenate([self.frames, other.frames]), return_inverse=True)
+        block, everything = np.zeros(len(places)), np.zeros(len(places))
+        cell, size = np.zeros((len(places), len(frames))), np.zeros((len(places), len(frames)))
+        row, column = np.split(rows.ravel(), [len(self.places)]), np.split(columns, [len(self.frames)])
+        for grid, sign, at, to in zip((self, other), (1.0, -1.0), row, column, strict=True):
+            block[at] += sign * grid.block
+            everything[at] += grid.all
+            cell[np.ix_(at, to)] += sign * grid.cell
+            size[np.ix_(at, to)] += grid.size
+        return Grid(
+            places, frames, block, cell, size, everything, self.edge, self.step, max(self.one_off, other.one_off)
+        )
+
+
+def influences(
+    cell: npt.NDArray[np.integer],
+    frame: npt.NDArray[np.integer],
+    columns: Float64,
+    of: Statistic,
+    edge: float,
+    step: int,
+    halves: Float64 | None = None,
+) -> Grid | None:
+    """The influences of sums (m, C) by cube (m, 3) and group of frames (m,), -1 where that is not known.
+
+    halves (m, 2): of places that two frames saw, what of the first two sums both are held for, instead of half each.
+    """
+    total = columns.sum(axis=0)
+    gradient = _gradient(of, total)
+    places, row = np.unique(cell.astype(np.int64), axis=0, return_inverse=True)
+    row = row.ravel()
+    everything = np.abs(_sums(row, columns[:, 1], len(places)))
+    some = everything > TINY * everything.sum()
+    if some.sum() < 2 or not np.isfinite(gradient).all():
+        return None
+    own: Float64 = columns @ gradient
+    block = _sums(row, own, len(places))
+    shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
+    known = (frame >= 0) | (step == 0)
+    frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
+    by_frame, size = np.zeros((len(places), len(frames))), np.zeros((len(places), len(frames)))
+    np.add.at(by_frame, (row[known], column), shared[known])
+    np.add.at(size, (row[known], column), np.abs(columns[known, 1]))
+    seen = size.sum(axis=0) > 0
+    at = np.ix_(some, seen)
+    one_off = abs(float(gradient[0] * total[1]))
+    return Grid(places[some], frames[seen], block[some], by_frame[at], size[at], everything[some], edge, step, one_off)
+
+
+def _sums(row: npt.NDArray[np.int64], values: Float64, rows: int) -> Float64:
+    sums: Float64 = np.bincount(row, weights=values, minlength=rows).astype(np.float64)
+    return sums
+
+
+def _gradient(of: Statistic, total: Float64) -> Float64:
+    """Central differences (C,) of a statistic at sums (C,)."""
+    steps = np.diag(1e-5 * np.maximum(np.abs(total), TINY))
+    gradient: Float64 = (of(total + steps) - of(total - steps)) / (2 * np.diagonal(steps))
+    return np.where(total == 0, 0.0, gradient)
+
+
+# --- Variance ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TwoWay:
+    """The variance that comes from places, and what frames add to it."""
+
+    places: Spread
+    frames: Spread
+
+    @property
+    def total(self) -> float:
+        """Of both."""
+        return self.places.variance + self.frames.variance
+
+    @property
+    def degrees(self) -> float:
+        """Of the sum (Satterthwaite 1946)."""
+        parts = (self.places, self.frames)
+        spread = sum(part.variance**2 / part.degrees for part in parts if part.variance > 0)
+        return max(self.total**2 / spread, 1.0) if spread else self.places.degrees
+
+    def half(self, level: float) -> float:
+        """Half the width of the interval."""
+        from scipy import stats
+
+        if not self.degrees > 0:
+            return math.nan
+        return float(stats.t.ppf((1 + level) / 2, self.degrees)) * math.sqrt(self.total)
+
+
+NO_FRAMES = Spread(0.0, math.inf, 1.0)
+
+
+def two_way(grid: Grid, question: Question) -> TwoWay:
+    """V_frame + V_block - V_cell (Cameron, Gelbach, Miller 2011): pairs that share a frame or a block count once."""
+    places = arrangement(grid.places)
+    by_place = places.spread(grid.block, grid.all)
+    if question == THIS_MAP or len(grid.frames) < 2:
+        return TwoWay(by_place, NO_FRAMES)
+    return TwoWay(by_place, _beyond_places(grid, places, by_place))
+
+
+def _beyond_places(grid: Grid, places: Arrangement, by_place: Spread) -> Spread:
+    """What frames add: the influences that one frame, and those near it, have in places far from each other."""
+    frames = arrangement(grid.frames[:, None])
+    influence, size = grid.cell.sum(axis=0), grid.size.sum(axis=0)
+    influence = influence - size / size.sum() * influence.sum()  # of a sample they do not sum to 0
+    by_frame = frames.spread(influence, size)
+    if not by_frame.variance > 0:
+        return NO_FRAMES
+    kernel = frames.kernel(by_frame.block)
+    with one_thread():
+        plain = float(influence @ kernel @ influence)
+        inside = float((kernel * (grid.cell.T @ places.kernel(by_place.block) @ grid.cell)).sum())
+    if not plain > 0:
+        return NO_FRAMES
+    return dataclasses.replace(by_frame, variance=by_frame.variance * max(1 - inside / plain, 0.0))
+
+
+def apart(one: Grid, other: Grid, question: Question) -> TwoWay:
+    """Of two flights over the same places: each adds the variance of its own frames."""
+    both = two_way(one.minus(other), THIS_MAP)
+    if question == THIS_MAP:
+        return both
+    added = [two_way(grid, question).frames for grid in (one, other)]
+    joined = TwoWay(*added)
+    return TwoWay(both.places, Spread(joined.total, joined.degrees, added[0].block))
