@@ -204,7 +204,7 @@ def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames
 def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
     found = judged(0.82, 0.9, ceiling=0.7)
     assert found.level == "stable"
-    assert "alpha between frames 0.86 is 86% (82% to 90%) of the 0.70 that the ground truth allow" in found.line
+    assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70 by the ground truth" in found.line
     assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
     assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
 
