@@ -89,7 +89,7 @@ def drift(result: Result) -> list[Table]:
         Column("trend", "one way", 3, over="Trend"),
         Column("trend_null", "random order", 3, over="Trend"),
         Column("trend_p", "p", 3, over="Trend"),
-        Column("drifting_voxels", "drifting", 0, over="Voxels"),
+        Column("trending_voxels", "trending", 0, over="Voxels"),
         Column("tested_voxels", "tested", 0, over="Voxels"),
     )
     numbers: tuple[Number, ...] = (
@@ -101,7 +101,7 @@ def drift(result: Result) -> list[Table]:
         tested(lambda tests: tests.trend),
         tested(lambda tests: tests.trend_null),
         tested(lambda tests: tests.trend_p),
-        tested(lambda tests: tests.drifting_voxels),
+        tested(lambda tests: tests.trending_voxels),
         tested(lambda tests: tests.tested_voxels),
     )
     logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())
