@@ -64,7 +64,6 @@ def difference(
                  paired if both maps have the same
     Each map counts with all its voxels: those of the cubes that only one holds add to the variance.
     """
-    from scipy import stats
 
     a, b = aligned(a, b)
     found = value(a, key, k) - value(b, key, k)
