@@ -63,7 +63,7 @@ def test_from_images_to_numbers_by_the_documented_commands(data, models, tmp_pat
     for words in predictions:
         more = {"segearth-ov": ["--set", f"prompts={models / 'prompts.yaml'}"], "segformer": []}
         called([*words, *more.get(words[words.index("--backbone") + 1], TINY_SAM), "-q"])
-    small = ["scenes=[scene0]", "scene_frames={}", "frames={stop: 3}", "pixel_stride=2", "backends=[numba]"]
+    small = ["scenes=[scene0]", "scene_frames={}", "frames={stop: 3}", "pixel_stride=2", "backends=[numpy]"]
     settings = [part for setting in small for part in ("--set", setting)]
     parts = ["--only", "shared_taxonomy", "--report", "off"]
     called([*study, *settings, *parts, "--out", str(tmp_path / "study"), "-q"])
