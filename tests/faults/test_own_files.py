@@ -28,7 +28,7 @@ from semstab.runtime.json_form import from_json
 
 VALUES = (None, True, -1, 1e308, float("nan"), "x", "\ud800", [], {}, "../../x", 10**400, "a" * 5000, 0)
 WHOLES = (b"", b"[]", b"null", b"{}", b"[" * 100_000, b'{"a":' * 50_000, b"\xff\xfe", b"1" * 6000, b'"x"')
-DAMAGES = 50
+DAMAGES = 30
 """Of each file."""
 
 
