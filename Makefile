@@ -1,11 +1,12 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
 
-.PHONY: help setup setup-dev bench test lint format clean
+.PHONY: help setup setup-dev bench test faults lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types, import contract and the whole test suite'
+	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, and see that none of it is lost'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
 	@echo 'make clean   remove .venv and what tools left behind'
@@ -21,6 +22,9 @@ bench: setup
 
 test: setup-dev lint
 	$(BIN)/pytest -n auto --maxprocesses 4
+
+faults: setup-dev
+	$(BIN)/python tests/faults/kills.py 100
 
 lint: setup-dev
 	$(BIN)/ruff check .

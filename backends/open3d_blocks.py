@@ -18,6 +18,7 @@ from open3d.t.geometry import VoxelBlockGrid
 from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import Int64, check_depth, check_frame, check_settings
+from semstab.backends.shared.blocks import blocks_of
 from semstab.backends.shared.columns import update_rows
 from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
@@ -122,20 +123,15 @@ class Open3DBlocks(FusionBackend):
         self.grid = grid
 
     def _activate(self, index: Int64) -> Int64:
-        """Rows of voxels (n, 3) in the flattened attributes, their blocks activated; new ones start at 0."""
-        r = self.block_resolution
-        if not len(index):  # the hash map takes no empty list of keys
-            return np.zeros(0, dtype=np.int64)
-        block, local = index // r, index % r
-        blocks, inverse = _unique_rows(block)
-        keys = self._tensor(blocks.astype(np.int32))
+        """Rows of voxels (n, 3), at least one, in the attributes, their blocks activated; new ones start at 0."""
+        blocks, block, place = blocks_of(index, self.block_resolution)
+        keys = self._tensor(blocks)
         self._make_room(keys)
         hashmap = self.grid.hashmap()
         hashmap.activate(keys)  # gives indices of new blocks only
         buffer, _ = hashmap.find(keys)
-        offset = (local[:, 2] * r + local[:, 1]) * r + local[:, 0]  # Open3D's order: x runs fastest
         buffers: Int64 = buffer.cpu().numpy().astype(np.int64)
-        return buffers[inverse] * r**3 + offset
+        return buffers[block] * self.block_resolution**3 + place
 
     def _index_of(self, rows: Int64) -> Int64:
         """Voxel indices (n, 3) of rows: the inverse of `_activate`."""
@@ -186,15 +182,6 @@ def _copy_blocks(old: VoxelBlockGrid, new: VoxelBlockGrid, attributes: tuple[str
         for start in range(0, source.shape[0], COPIED_BLOCKS):
             part = slice(start, start + COPIED_BLOCKS)
             room[target[part]] = values[source[part]]
-
-
-def _unique_rows(index: Int64) -> tuple[Int64, Int64]:
-    """Distinct rows of (n, 3) and where each row went."""
-    low = index.min(axis=0)
-    size = index.max(axis=0) - low + 1
-    x, y, z = (index - low).T
-    _, first, inverse = np.unique((x * size[1] + y) * size[2] + z, return_index=True, return_inverse=True)
-    return index[first], inverse
 
 
 def _device(name: str) -> Any:

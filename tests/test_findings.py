@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
-from records import record, study, voxels
+import records
+from records import study, voxels
+from simulated_events import log_of
 from wall_study import BACKBONES, wall_study
 
 from semstab.metrics import op, vss
+from semstab.model.statistics import BeyondCoin, Interval
 from semstab.outputs.averages import ENOUGH, Level, describe, pooled
 from semstab.outputs.findings import (
     HARDLY,
@@ -19,9 +24,23 @@ from semstab.outputs.findings import (
     less_association,
     more_disagreement,
 )
+from semstab.statistics import describe as describe_map
 
-SURE, SPLIT = [1, 0, 0], [3, 1, 0]
+SURE, SPLIT, CALM = [1, 0, 0], [3, 1, 0], [3.6, 0.4, 0]
 N = ENOUGH
+
+UNKNOWN = Interval(np.nan, np.nan, np.nan)
+FALLS = BeyondCoin(Interval(0.1, 0.05, 0.15), Interval(0.01, 0.005, 0.015))
+COIN = BeyondCoin(Interval(0.0, -0.05, 0.05), Interval(0.0, -0.005, 0.005))
+STATISTICS = describe_map(log_of([[0, 1], [0, 0]]).table())
+
+
+def record(table, *what, beyond=FALLS, **more):
+    """A record whose statistics say so much of a coin."""
+    made = records.record(table, *what, **more)
+    agreement = dataclasses.replace(STATISTICS.agreement, vss=UNKNOWN)
+    said = dataclasses.replace(STATISTICS, beyond_coin=beyond, agreement=agreement)
+    return dataclasses.replace(made, summary=dataclasses.replace(made.summary, statistics=said))
 
 
 def level(value, *groups):
@@ -46,9 +65,32 @@ def test_recurrent_voxels_that_disagree_more():
     assert outcome.verdict is Answer.SHOWN
     assert (
         outcome.numbers
-        == "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%."
+        == "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%. From OP=2"
+        " to OP>=3 PSA falls by 0.1000 (0.0500 to 0.1500)."
     )
     assert outcome.why == ""
+
+
+def test_a_coin_shows_no_disagreement_nor_drift():
+    """VSS and SBD of a coin move with OP as if something were found."""
+    groups = (3 * N, 1, SURE, 0.0), (N, 2, SURE, 0.08), (N, 4, SPLIT, 0.05)
+    for test in (more_disagreement, falling_drift):
+        assert test(pooled([record(voxels(*groups))])).verdict is Answer.SHOWN
+        outcome = test(pooled([record(voxels(*groups), beyond=COIN)]))
+        assert outcome.verdict is Answer.NOT_SHOWN
+        assert "coin" in outcome.why
+        assert test(pooled([records.record(voxels(*groups))])).verdict is Answer.UNTESTED
+
+
+def test_a_tossed_coin_is_told_from_findings():
+    """0.9 against 0.1, tossed once, twice and up to ten times a place."""
+    rng = np.random.default_rng(0)
+    seen_by = rng.integers(1, 11, 4000)
+    labels = np.where(np.arange(10) < seen_by[:, None], rng.random((4000, 10)) < 0.1, -1)
+    events = log_of(labels, K=2)
+    found = describe_map(events.table(), events).beyond_coin
+    assert found.disagreement.low <= 0 <= found.disagreement.high
+    assert found.settling.low <= 0 <= found.settling.high
 
 
 def test_recurrent_voxels_that_agree_as_well_as_all():
@@ -79,7 +121,7 @@ def test_the_first_finding_against_the_voxels_themselves(walls):
         tables = [r.table() for r in walls.select(backbone=row.backbone)]
         values, seen_by = (np.concatenate([measure(table) for table in tables]) for measure in (vss, op))
         every, recurrent = values.mean(), values[seen_by >= 3].mean()
-        assert row.verdict is (Answer.SHOWN if every - recurrent >= VISIBLE_VSS else Answer.NOT_SHOWN)
+        assert ("as well as all" in row.outcome.why) == (every - recurrent < VISIBLE_VSS)
         assert f"VSS {recurrent:.4f} for OP>=3 against {every:.4f}" in row.outcome.numbers
     assert [row.backbone for row in finding.evidence] == list(BACKBONES)
 
@@ -94,7 +136,10 @@ def drifting(*sbd_by_op):
 def test_sbd_that_falls_from_stratum_to_stratum():
     outcome = falling_drift(drifting((N, 1, 0.0), (N, 2, 0.08), (N, 4, 0.05), (N, 9, 0.02)))
     assert outcome.verdict is Answer.SHOWN
-    assert outcome.numbers == "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5."
+    assert outcome.numbers == (
+        "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5; lower by 0.0100 (0.0050 to 0.0150) than in random"
+        " order for OP>=3."
+    )
 
 
 def test_sbd_that_rises_once_does_not_fall():
@@ -115,17 +160,25 @@ def test_one_stratum_has_no_trend():
 
 
 def test_noise_that_lowers_recurrence_and_raises_vss():
-    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
+    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, CALM))]
     outcome = less_association(describe("depth_noise"), found)
     assert outcome.verdict is Answer.SHOWN
-    assert outcome.numbers == "0 → 1 % of depth: VSS 0.8750 → 0.9375; OP>=3 50.00 → 25.00%."
+    assert outcome.numbers == "0 → 1 % of depth: VSS 0.8750 → 0.9750; OP>=3 50.00 → 25.00%."
+
+
+def test_what_fewer_looks_alone_make_of_vss_is_not_shown():
+    """The same places agree as before at each OP: of a coin as well there would be fewer that were seen often."""
+    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
+    outcome = less_association(describe("depth_noise"), found)
+    assert outcome.verdict is Answer.NOT_SHOWN
+    assert outcome.why == "At 1 % of depth a coin would show it: VSS rises no more than fewer observations make it."
 
 
 def test_finer_voxels_are_compared_with_the_coarsest():
-    found = [level(0.1, *seen(3 * N, N, SPLIT)), level(0.4, *seen(N, N, SPLIT))]
+    found = [level(0.1, *seen(3 * N, N, CALM)), level(0.4, *seen(N, N, SPLIT))]
     outcome = less_association(describe("voxel_size"), found)
     assert outcome.verdict is Answer.SHOWN
-    assert outcome.numbers.startswith("0.4 → 0.1 m: VSS 0.8750 → 0.9375")
+    assert outcome.numbers.startswith("0.4 → 0.1 m: VSS 0.8750 → 0.9750")
 
 
 def test_every_level_has_to_follow():
@@ -156,11 +209,17 @@ def sampled(fewer, more):
 
 
 def test_denser_sampling_that_uncovers_what_was_there():
-    outcome = sampled(seen(9 * N, N, SPLIT), seen(N, N, SPLIT))
+    outcome = sampled(seen(90 * N, 10 * N, SPLIT), seen(10 * N, 10 * N, [2.9, 1.1, 0]))
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == (
-        "20 → 80 frames: VSS over all voxels 0.9750 → 0.8750, for OP>=3 0.7500 → 0.7500; OP>=3 10.00 → 50.00%."
+        "20 → 80 frames: VSS over all voxels 0.9750 → 0.8625, for OP>=3 0.7500 → 0.7250; OP>=3 10.00 → 50.00%."
     )
+
+
+def test_what_more_looks_alone_make_of_vss_is_not_shown():
+    outcome = sampled(seen(9 * N, N, SPLIT), seen(N, N, SPLIT))
+    assert outcome.verdict is Answer.NOT_SHOWN
+    assert outcome.why == "A coin would show it: VSS falls no more than more observations make it."
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.9, Answer.SHOWN), (1.1, Answer.NOT_SHOWN)])
@@ -221,11 +280,10 @@ def test_repeats_are_averaged():
     assert "VSS 0.8750 → 0.9062; OP>=3 50.00 → 37.50%" in row.outcome.numbers
 
 
-def test_the_walls_show_what_they_were_made_for(walls):
-    """Errors drawn anew in every frame: more looks, more disagreement; and noise tears apart what meets."""
+def test_the_walls_show_no_more_than_a_coin(walls):
+    """Errors anew in every frame: more looks, more disagreement; noise tears apart what meets. It is no finding."""
     by_name = {finding.name: finding for finding in findings(walls)}
-    assert by_name["disagreement"].verdict is Answer.SHOWN
-    assert by_name["drift"].verdict is Answer.SHOWN
-    assert by_name["association"].verdict is Answer.SHOWN
+    assert by_name["drift"].verdict is not Answer.SHOWN
+    assert any("coin" in row.outcome.why for row in by_name["disagreement"].evidence)
     assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
     assert all(row.outcome.numbers for row in by_name["sampling"].evidence)

@@ -20,6 +20,7 @@ from semstab.statistics import (
 )
 from semstab.statistics.correctness import by_stratum
 from semstab.statistics.sampling import Places
+from semstab.statistics.steady import steady
 
 
 def random_beliefs(n=400, K=4, seed=0):
@@ -109,22 +110,44 @@ def test_strata_hold_the_voxels_of_their_op():
 
 
 def test_quadrants_by_hand():
-    """Of five voxels one is seen twice only, and one has no truth."""
-    labels = [[0, 0, 0], [1, 1, 1], [0, 0, 1], [0, 1, 1], [2, 2, -1], [2, 2, 2]]
+    """Of five voxels one is seen twice only, and one has no truth; seen so often, places are what they look like."""
+    labels = np.full((6, 40), -1)
+    labels[:4] = np.arange(40) >= np.array([40, 0, 26, 26])[:, None]
+    labels[4, :2], labels[5] = 2, 2
     table = log_of(labels).table()
-    truth = join_truth(table, log_of([[0], [0], [0], [0], [0]]).table())
+    truth = join_truth(table, log_of([[0], [0], [0], [1], [0]]).table())
     found = quadrants(table, truth, Places(table.index, 0.2))
     assert found.voxels == 4
     shares = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
-    assert [share.value for share in shares] == [0.25, 0.25, 0.25, 0.25]
-    assert found.wrong_of_stable.value == 0.5
+    assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
+    assert found.wrong_of_stable.value == pytest.approx(0.5, abs=0.01)
     assert stable_wrong(table, truth).tolist() == [False, True, False, False, False, False]
 
 
 def test_one_of_ten_frames_may_disagree_at_a_stable_voxel():
-    table = log_of([[0] * 9 + [1], [0] * 8 + [1, 1]]).table()
+    table = log_of([[0] * 90 + [1] * 10, [0] * 80 + [1] * 20]).table()
     truth = join_truth(table, log_of([[1], [1]]).table())
     assert stable_wrong(table, truth).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("q", [0.8, 0.95])
+def test_the_share_of_stable_places_does_not_depend_on_how_often_they_were_seen(q):
+    """One error rate, at OP 3 to 30; with q = 0.8 the PSA alone called .51, .32, .38 and .12 of them stable."""
+    rng = np.random.default_rng(7)
+    T = np.repeat([3, 5, 10, 30], 400)
+    wrong = (rng.random((len(T), 30)) > q).astype(int)
+    likely = steady(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
+    shares = [likely[t == T].mean() for t in (3, 5, 10, 30)]
+    assert max(abs(share - (q > 0.9)) for share in shares) < 0.05
+
+
+def test_half_of_the_places_are_stable_at_any_op():
+    rng = np.random.default_rng(8)
+    T = np.repeat([3, 5, 10, 30], 600)
+    right = np.where(rng.random(len(T)) < 0.5, 0.98, 0.75)[:, None]
+    wrong = (rng.random((len(T), 30)) > right).astype(int)
+    likely = steady(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
+    assert [likely[t == T].mean() for t in (3, 5, 10, 30)] == pytest.approx([0.5] * 4, abs=0.06)
 
 
 def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():

@@ -8,6 +8,7 @@ import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import looking_down as down
 import numpy as np
 import pytest
@@ -132,6 +133,14 @@ def test_a_posed_folder_gives_the_voxels_of_its_depth_files(flight, mesh, tmp_pa
     assert (len(ours), ours.pixels.sum()) == (len(theirs), theirs.pixels.sum())
     assert result.manifest["depth_from"] == {"field": f"rays cast at {mesh}"}
     assert stored.manifest["depth_from"] == {}
+
+
+def test_intrinsics_are_those_of_the_depth_files_that_a_surface_stands_for(flight, mesh, tmp_path) -> None:
+    other = shutil.copytree(flight, tmp_path / "field")
+    for path in (other / "color").iterdir():
+        cv2.imwrite(str(path), np.zeros((7, 9, 3), np.uint8))
+    scene = open_dataset("posed_folder", {"root": other, "surface": mesh, "casts": False}).scene("field")
+    np.testing.assert_allclose(scene.depth(1), down.plane_depth(down.pose(1)), atol=2e-5)
 
 
 def test_a_run_is_kept_while_its_surface_is_the_same(flight, mesh, tmp_path) -> None:
@@ -282,6 +291,12 @@ def test_a_raster_of_another_projection_or_turned_is_told_what_to_do(tmp_path) -
     fails(DataError, "t.tif: the raster is rotated", Surface(path, georeference=placed()).depth, view())
 
 
+def test_heights_need_z_to_be_up(flight, tmp_path) -> None:
+    path = down.write_raster(tmp_path / "dsm.tif")
+    dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "up_axis": "-y"})
+    fails(ConfigError, "dsm.tif: is a surface over x and y, but up_axis is -y; turn it", dataset.scene, "field")
+
+
 def test_a_grid_that_is_too_fine_is_refused(tmp_path) -> None:
     path = down.write_points(tmp_path / "c.ply")
     fails(DataError, "too many .* set a larger surface_cell", Surface(path, cell=0.001).depth, view())
@@ -297,7 +312,8 @@ def test_without_the_extra_it_is_said_what_to_install(tmp_path, monkeypatch) -> 
 
 def test_without_a_size_it_is_said_what_to_set(flight, mesh, tmp_path) -> None:
     bare = shutil.copytree(flight, tmp_path / "field")
-    shutil.rmtree(bare / "color")
+    for folder in ("color", "depth"):
+        shutil.rmtree(bare / folder)
     options = {"root": bare, "surface": mesh, "casts": False}
     scene = open_dataset("posed_folder", options).scene("field")
     fails(DataError, "no colour image says the size of depth; set intrinsics_size", scene.depth, 0)

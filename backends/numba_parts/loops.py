@@ -9,14 +9,11 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import PARTITIONS, mix
-from semstab.backends.shared.prefetch import touch
+from semstab.backends.shared.prefetch import AHEAD, touch
 from semstab.model.results import RECURRENT
 from semstab.runtime.compiled import parallel, serial
 
 SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
-
-AHEAD = 16
-"""Voxels whose memory is asked for before its turn comes."""
 
 
 def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.observed import Observed
+from semstab.backends.shared.prefetch import AHEAD, touch
 from semstab.backends.shared.total import Change
 from semstab.model.results import RECURRENT
 from semstab.runtime.compiled import parallel
@@ -40,11 +41,21 @@ def _update_rows(
     last_frame, self_sum, frame_entropy_sum,
 ):  # fmt: skip
     K = evidence.shape[1]
+    flat = evidence.reshape(-1)
     for chunk in nb.prange(PARTITIONS):
         s = np.zeros(K)
         vss = entropy = drifted = 0.0
         new = recurrent = 0
         for i in range(chunks[chunk], chunks[chunk + 1]):
+            ahead = rows[min(i + AHEAD, chunks[chunk + 1] - 1)]
+            touch(op, ahead)
+            touch(flat, ahead * K)
+            touch(drift_sum, ahead)
+            touch(pixels, ahead)
+            touch(first_frame, ahead)
+            touch(last_frame, ahead)
+            touch(self_sum, ahead)
+            touch(frame_entropy_sum, ahead)
             r = rows[i]
             T = op[r]
             for e in range(start[i], start[i + 1]):

@@ -8,6 +8,9 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+AHEAD = 16
+"""Rows whose memory is asked for before their turn comes."""
+
 
 @intrinsic
 def touch(_typing: Any, array: Any, _index: Any) -> Any:

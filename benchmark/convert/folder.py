@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from semstab.runtime.files import (
     write_png,
     write_text,
 )
+from semstab.runtime.json_form import from_json
 
 SCHEMA = 1
 """Version of conversion.json."""
@@ -86,6 +88,18 @@ def depth_format(depths: Sequence[npt.NDArray[np.float32]], tolerance: float) ->
     errors = {scale: max(quantised(depth, scale)[1] for depth in depths) for scale in scales}
     best = min(scales, key=lambda scale: errors[scale])
     return DepthFormat(best if errors[best] <= tolerance else None)
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """What conversion.json says that a later start needs."""
+
+    key: str
+    depth_scale: float | None
+
+    def __post_init__(self) -> None:
+        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
+            raise ValueError(f"depth_scale is {self.depth_scale}")
 
 
 class DepthFormatError(Exception):
@@ -219,14 +233,15 @@ class SceneFolder:
             if self.path.exists() and (not self.path.is_dir() or any(self.path.glob("[!.]*"))):
                 raise ConfigError(f"{self.path}: is there already and holds no conversion; choose another --out")
             return None
-        there = read_json(manifest)
-        if not isinstance(there, dict) or not isinstance(there.get("depth_scale"), float | int | None):
-            raise DataError(f"{manifest}: damaged; delete {self.path}, and the scene is converted again")
-        if there.get("key") != self._key:
+        try:
+            there = from_json(_Conversion, read_json(manifest), manifest)
+        except DataError as error:
+            raise DataError(f"{manifest}: damaged; delete {self.path}, and the scene is converted again") from error
+        if there.key != self._key:
             raise ConfigError(
                 f"{self.path}: was converted from other data or with other settings; choose another --out"
             )
-        return DepthFormat(there["depth_scale"])
+        return DepthFormat(there.depth_scale)
 
 
 def folder_name(name: str) -> str:

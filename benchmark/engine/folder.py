@@ -20,6 +20,7 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.jobs import Outcome, shared_marker
 from semstab.errors import ConfigError, DataError
+from semstab.model.measures import measures
 from semstab.model.records import (
     EVENTS,
     FRAMES,
@@ -198,6 +199,8 @@ def load_result(folder: str | Path) -> Result:
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: not a summary of this version of semstab; run it again, into another folder")
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
+    if problem := _contradiction(result):
+        raise DataError(f"{path}: {problem}; it is damaged, or another version's; run it again")
     records = tuple(
         dataclasses.replace(
             record,
@@ -206,7 +209,21 @@ def load_result(folder: str | Path) -> Result:
         )
         for record in result.records
     )
-    return dataclasses.replace(result, records=records, manifest=read_json(folder / "manifest.json"))
+    manifest = from_json(dict[str, Any], read_json(folder / "manifest.json"), folder / "manifest.json")
+    return dataclasses.replace(result, records=records, manifest=manifest)
+
+
+def _contradiction(result: Result) -> str | None:
+    """What in a result refers to something that is not in it; None where nothing does."""
+    if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
+        return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
+    quantities = {"op", "evidence", *(measure.key for measure in measures())}
+    for row in result.agreement:
+        if lost := quantities - row.differences.keys():
+            return f"the agreement on {row.scene} lacks {min(lost)}"
+    files = (file for record in result.records for file in (record.voxels_file, record.truth_file) if file is not None)
+    outside = (file for file in files if file.is_absolute() or ".." in file.parts)
+    return next((f"{file} is not in the folder" for file in outside), None)
 
 
 def _in(folder: Path, records: Sequence[Record]) -> tuple[Record, ...]:

@@ -221,7 +221,9 @@ class Judged:
 class DriftTests:
     """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
 
-    trend_excess  the trend less that in random order
+    sbd_p, trend_p   whether stretches of time could have come in any order: so many `stretches`, over `voxels`
+    trend_excess     the trend less that in random order
+    trending_voxels  of the tested ones: their disagreement goes one way in time
     """
 
     sbd_p: float
@@ -229,9 +231,11 @@ class DriftTests:
     trend_null: float
     trend_excess: Interval
     trend_p: float
+    stretches: int
+    voxels: int
     tested_voxels: int
     unusual_sbd_voxels: int
-    drifting_voxels: int
+    trending_voxels: int
 
 
 @dataclass(frozen=True)
@@ -370,6 +374,18 @@ class StratumStatistics:
     entropy_between: float
 
 
+@dataclass(frozen=True)
+class BeyondCoin:
+    """What a coin tossed as often as places were seen would not show; 0 for it, whatever the OP.
+
+    disagreement  PSA of the places that two frames saw less that of the places that more saw
+    settling      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
+    """
+
+    disagreement: Interval
+    settling: Interval
+
+
 # --- One map ----------------------------------------------------------------------------------------------------------
 
 
@@ -397,6 +413,7 @@ class MapStatistics:
     correctness: CorrectnessStatistics | None
     fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
+    beyond_coin: BeyondCoin
 
     @property
     def sections(self) -> int:

@@ -12,7 +12,7 @@ from semstab.metrics import macro_mean, pool, split_last
 from semstab.model.measures import Measure
 from semstab.model.records import Record, Result, Variation
 from semstab.model.results import Means
-from semstab.statistics import Estimate, MapStatistics
+from semstab.model.statistics import UNDEFINED, Estimate, MapStatistics
 
 ENOUGH = 1000
 """Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its
@@ -33,6 +33,8 @@ class Pooled:
     psa        pairwise semantic agreement
     alpha      Krippendorff's alpha
     drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
+    disagreement, settling  as in `BeyondCoin`
+    vss_error  half of the 95 % interval of VSS; without statistics as if voxels were independent and at their worst
     """
 
     voxels: int
@@ -48,6 +50,9 @@ class Pooled:
     alpha: float = math.nan
     drift: float = math.nan
     drift_null: float = math.nan
+    disagreement: Estimate = UNDEFINED
+    settling: Estimate = UNDEFINED
+    vss_error: float = math.nan
 
     @property
     def excess_drift(self) -> float:
@@ -91,7 +96,29 @@ def pooled(records: Sequence[Record]) -> Pooled:
         alpha=_macro(records, lambda found: found.agreement.alpha),
         drift=_macro(records, lambda found: found.drift.sbd),
         drift_null=_macro(records, lambda found: found.drift.null),
+        disagreement=_together(records, lambda found: found.beyond_coin.disagreement),
+        settling=_together(records, lambda found: found.beyond_coin.settling),
+        vss_error=_vss_error(records, voxels),
     )
+
+
+def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
+    """The macro mean of an estimate with its interval, the units being independent."""
+    found = [take(record.statistics) for record in records if record.statistics is not None]
+    found = [estimate for estimate in found if not math.isnan(estimate.low)]
+    if not found:
+        return UNDEFINED
+    value = macro_mean([estimate.value for estimate in found])
+    below, above = (
+        math.hypot(*(end - estimate.value for end, estimate in zip(ends, found, strict=True))) / len(found)
+        for ends in ([e.low for e in found], [e.high for e in found])
+    )
+    return Estimate(value, value - below, value + above)
+
+
+def _vss_error(records: Sequence[Record], voxels: int) -> float:
+    vss = _together(records, lambda found: found.agreement.vss)
+    return (vss.high - vss.low) / 2 if not math.isnan(vss.low) else 1.96 * 0.5 / math.sqrt(max(voxels, 1))
 
 
 def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from semstab.model.measures import SBD, VSS
 from semstab.model.records import Result
+from semstab.model.statistics import Estimate
 from semstab.outputs.averages import ENOUGH, Level, Pooled, Sweep, complete_scenes, describe, levels, pooled
 
 VISIBLE_VSS = 10.0 ** -VSS.digits[0]
@@ -110,7 +112,8 @@ def _disagreement(result: Result) -> Finding:
     return Finding(
         "disagreement",
         "Recurrent voxels disagree more than the aggregate says.",
-        f"VSS of the voxels with OP>=3 lies at least {VISIBLE_VSS} below that of all voxels.",
+        f"VSS of the voxels with OP>=3 lies at least {VISIBLE_VSS} below that of all voxels, and two frames agree less"
+        " often on these places than on those that two frames saw, beyond the 95 % interval: of a coin they would not.",
         tuple(_base_evidence(result, backbone, more_disagreement) for backbone in result.backbones),
     )
 
@@ -119,11 +122,20 @@ def more_disagreement(voxels: Pooled) -> ClaimResult:
     """Is VSS of the recurrent voxels lower than that of all?"""
     if voxels.recurrent.voxels < ENOUGH:
         return _untested(f"{voxels.recurrent.voxels:,} voxels have OP>=3; {ENOUGH:,} are needed.")
-    every, recurrent = voxels.every[VSS], voxels.recurrent[VSS]
+    every, recurrent, beyond = voxels.every[VSS], voxels.recurrent[VSS], voxels.disagreement
+    if math.isnan(beyond.low):
+        return _untested("Too few places were seen by two frames, and by more, to tell it from a coin.")
     return _outcome(
         f"VSS {recurrent:.4f} for OP>=3 against {every:.4f} over all voxels: {100 * (1 - recurrent):.1f}% of the"
-        f" evidence disagrees, not {100 * (1 - every):.1f}%.",
-        [] if every - recurrent >= VISIBLE_VSS else ["The recurrent voxels agree as well as all voxels do."],
+        f" evidence disagrees, not {100 * (1 - every):.1f}%. From OP=2 to OP>=3 PSA falls by {_interval(beyond)}.",
+        [
+            *([] if every - recurrent >= VISIBLE_VSS else ["The recurrent voxels agree as well as all voxels do."]),
+            *(
+                []
+                if beyond.low > 0
+                else ["A coin tossed as often would show it: two frames agree no less often there."]
+            ),
+        ],
     )
 
 
@@ -134,11 +146,11 @@ def _drift(result: Result) -> Finding:
     return Finding(
         "drift",
         "Mean SBD falls with OP.",
-        f"Mean SBD falls by at least {VISIBLE_SBD} bits from each stratum of OP to the next; strata of fewer than"
-        f" {ENOUGH:,} voxels do not count.",
+        f"Mean SBD falls by at least {VISIBLE_SBD} bits from each stratum of OP to the next, strata of fewer than"
+        f" {ENOUGH:,} voxels left out, and with OP>=3 it is lower than in random order, beyond the 95 % interval.",
         tuple(_base_evidence(result, backbone, falling_drift) for backbone in result.backbones),
-        "The fall alone does not show that beliefs settle: the t-th observation moves the mean of t of them by about"
-        " 1/t, so that SBD falls with OP for observations in random order as well.",
+        "The fall alone shows nothing: the t-th observation moves the mean of t of them by about 1/t, so that SBD falls"
+        " with OP for observations in random order, of a coin, as well.",
     )
 
 
@@ -147,9 +159,15 @@ def falling_drift(voxels: Pooled) -> ClaimResult:
     strata = [row for row in voxels.strata if row.defined(SBD) >= ENOUGH]
     if len(strata) < 2:
         return _untested(f"Fewer than two strata of OP have {ENOUGH:,} voxels with an SBD.")
+    if math.isnan(voxels.settling.low):
+        return _untested("What a random order of the observations gives is not known; ask for statistics.")
+    why = [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a[SBD] - b[SBD] < VISIBLE_SBD]
+    if not voxels.settling.low > 0:
+        why.append("A coin tossed as often would show it: in random order SBD is no higher.")
     return _outcome(
-        f"SBD {', '.join(f'{row[SBD]:.4f} at {row.name}' for row in strata)}.",
-        [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a[SBD] - b[SBD] < VISIBLE_SBD],
+        f"SBD {', '.join(f'{row[SBD]:.4f} at {row.name}' for row in strata)};"
+        f" lower by {_interval(voxels.settling)} than in random order for OP>=3.",
+        why,
     )
 
 
@@ -161,7 +179,8 @@ def _association(result: Result) -> Finding:
         "association",
         "Finer voxels and geometric noise raise aggregate VSS while lowering the share of recurrent voxels.",
         "Against the coarsest voxels, or the undisturbed geometry, each other level has a VSS over all voxels at least"
-        f" {VISIBLE_VSS} higher and a share with OP>=3 at least {100 * VISIBLE_SHARE:g} points lower.",
+        f" {VISIBLE_VSS} higher and a share with OP>=3 at least {100 * VISIBLE_SHARE:g} points lower; and VSS is"
+        " higher, beyond the 95 % interval, than the VSS that the reference has at each OP would make it there.",
         _sweep_evidence(result, ASSOCIATION, less_association, "neither voxel size nor noise"),
     )
 
@@ -180,6 +199,10 @@ def less_association(sweep: Sweep, found: Sequence[Level]) -> ClaimResult:
     denser = [level for level in others if _share(reference) - _share(level) < VISIBLE_SHARE]
     rises = ", ".join(f"{_vss(level) - _vss(reference):+.4f} at {_values(sweep, [level])}" for level in lower)
     why = [f"VSS hardly rises or falls: {rises}."] if lower else []
+    if same := [level for level in others if level not in lower and not _beyond_op(reference, level) > 0]:
+        why.append(
+            f"At {_values(sweep, same)} a coin would show it: VSS rises no more than fewer observations make it."
+        )
     if denser:
         why.append(f"The share does not fall at {_values(sweep, denser)}.")
     if denser and sweep.noise:
@@ -203,7 +226,8 @@ def _sampling(result: Result) -> Finding:
         "Denser sampling lowers aggregate VSS while recurrent VSS hardly moves.",
         f"From the fewest to the most frames VSS over all voxels falls by at least {VISIBLE_VSS}, and VSS of the voxels"
         f" with OP>=3 moves by at most {HARDLY:g} times as much; levels with fewer than {ENOUGH:,} recurrent voxels do"
-        " not count.",
+        " not count; and it falls, beyond the 95 % interval, to less than the VSS that the fewest frames have at each"
+        " OP would make it.",
         _sweep_evidence(result, ("frame_count",), denser_sampling, "not the number of frames"),
         "The largest share of a few observations overestimates, of three as well as of two: VSS for OP>=3 falls a"
         " little with more frames even where the predictions stay the same.",
@@ -225,7 +249,10 @@ def denser_sampling(sweep: Sweep, found: Sequence[Level]) -> ClaimResult:
     if fall < VISIBLE_VSS:
         return _outcome(numbers, ["VSS over all voxels does not fall."])
     moves = f"VSS for OP>=3 moves by {move:.4f}, more than {HARDLY:g} times the {fall:.4f} over all voxels."
-    return _outcome(numbers, [moves] if move > HARDLY * fall else [])
+    why = [moves] if move > HARDLY * fall else []
+    if not _beyond_op(first, last, sign=-1) > 0:
+        why.append("A coin would show it: VSS falls no more than more observations make it.")
+    return _outcome(numbers, why)
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
@@ -276,6 +303,23 @@ def _untested(why: str) -> ClaimResult:
 
 def _values(sweep: Sweep, found: Sequence[Level], separator: str = ", ") -> str:
     return f"{separator.join(sweep.text(level.value) for level in found)} {sweep.unit}".strip()
+
+
+def _beyond_op(reference: Level, level: Level, sign: int = 1) -> float:
+    """How much more VSS rises (sign 1) or falls (-1) than the level's OP alone makes it, less what may be noise.
+
+    The OP alone: each stratum with the VSS that it has at the reference, weighted by its share at the level.
+    """
+    of = [reference.mean(lambda p, k=k: p.strata[k][VSS]) for k in range(len(reference.repeats[0].strata))]  # type: ignore[misc]
+    share = [level.mean(lambda p, k=k: p.strata[k].share) for k in range(len(of))]  # type: ignore[misc]
+    known = [(vss, part) for vss, part in zip(of, share, strict=True) if part and not math.isnan(vss)]
+    expected = sum(vss * part for vss, part in known) / sum(part for _, part in known)
+    noise = math.hypot(reference.mean(lambda p: p.vss_error), level.mean(lambda p: p.vss_error))
+    return sign * (_vss(level) - expected) - max(noise, VISIBLE_VSS)
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.value:.4f} ({estimate.low:.4f} to {estimate.high:.4f})"
 
 
 def _vss(level: Level) -> float:

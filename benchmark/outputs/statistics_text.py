@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import NEXT_FLIGHT, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
+from semstab.model.statistics import NEXT_FLIGHT, DriftTests, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -134,14 +134,14 @@ def _drift(found: MapStatistics) -> list[Row]:
     drift, tests, flips = found.drift, found.drift.tests, found.drift.flips
     rows: list[Row] = [
         ("SBD, bits", drift.sbd, ""),
-        ("SBD in random order", drift.null, ""),
-        ("excess drift", drift.excess, "" if tests is None else _p("p", tests.sbd_p)),
+        ("SBD in random order", drift.null, f"over {drift.voxels} voxels"),
+        ("excess drift", drift.excess, "" if tests is None else _order(tests)),
     ]
     if tests is not None:
-        drifting = f"{tests.drifting_voxels} of {tests.tested_voxels} voxels drift"
+        trending = f"{tests.trending_voxels} of {tests.tested_voxels} voxels do"
         rows += [
             ("disagreement that goes one way", tests.trend, ""),
-            ("  beyond random order", tests.trend_excess, f"{_p('p', tests.trend_p)}; {drifting}"),
+            ("  beyond random order", tests.trend_excess, f"{_p('p', tests.trend_p)}; {trending}"),
         ]
     if flips is not None:
         rows += [("flip rate", flips.rate, ""), ("  beyond random order", flips.excess, "")]
@@ -229,6 +229,13 @@ def _line(name: str, estimate: Estimate | float, note: str = "") -> str:
         return f"{name:<34}{_cell(estimate):>9}   {'':<20}{note}".rstrip()
     interval = f"{_cell(estimate.low)} to {_cell(estimate.high)}"
     return f"{name:<34}{_cell(estimate.value):>9}   {interval:<20}{note}".rstrip()
+
+
+def _order(tests: DriftTests) -> str:
+    """The p-value of the scene's SBD, and what was put in other orders for it."""
+    if math.isnan(tests.sbd_p):
+        return "no p: places are seen too shortly, or errors last too long"
+    return f"{_p('p', tests.sbd_p)}: {tests.stretches} stretches of time in other orders"
 
 
 def _p(name: str, value: float) -> str:

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
 from semstab.runtime.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png, write_stack
+from semstab.runtime.json_form import from_json
 
 SCHEMA = 1
 """Version of predictions.json."""
@@ -28,6 +30,23 @@ SAVE_SECONDS = 5.0
 
 Kind = Literal["labels", "scores", "regions"]
 ScoreType = Literal["float16", "float32"]
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """A frame's map: the digest of its image, and how long the model took for it."""
+
+    image: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Manifest:
+    """What predictions.json says that a later start needs."""
+
+    key: str
+    settings: Mapping[str, Any]
+    frames: Mapping[str, _Predicted]
 
 
 class PredictionFolder:
@@ -70,14 +89,14 @@ class PredictionFolder:
             "settings": said,
             **about,
         }
-        self._frames: dict[str, dict[str, Any]] = self._claim(overwrite)
+        self._frames: dict[str, _Predicted] = self._claim(overwrite)
         self._space = space
         self._saved = -math.inf
         self._lock: FolderLock | None = None
 
     def has(self, name: str, image: str) -> bool:
         """Whether the map of that frame is there, predicted from an image of that digest."""
-        return self._frames.get(name, {}).get("image") == image and self.file(name).is_file()
+        return name in self._frames and self._frames[name].image == image and self.file(name).is_file()
 
     def file(self, name: str) -> Path:
         """Where a frame's map is. Raises DataError for a name that leads out of the folder."""
@@ -113,7 +132,7 @@ class PredictionFolder:
             self._save()  # before the first map: without it, maps are taken for somebody else's
 
     def _done(self, name: str, image: str, seconds: float) -> None:
-        self._frames[name] = {"image": image, "seconds": round(seconds, 4)}
+        self._frames[name] = _Predicted(image, round(seconds, 4))
         if time.monotonic() - self._saved > SAVE_SECONDS:
             self.save()
 
@@ -123,7 +142,7 @@ class PredictionFolder:
         write_json(self.path / MANIFEST_FILE, self._content | {"frames": self._frames})
         self._saved = time.monotonic()
 
-    def _claim(self, overwrite: bool) -> dict[str, dict[str, Any]]:
+    def _claim(self, overwrite: bool) -> dict[str, _Predicted]:
         """The frames that an earlier start finished."""
         manifest = self.path / MANIFEST_FILE
         if not manifest.is_file():
@@ -131,18 +150,20 @@ class PredictionFolder:
             if any(file.suffix.lower() in suffixes for file in _files(self.path)):
                 raise ConfigError(f"{self.path}: holds maps that were not predicted here; choose another --name")
             return {}
-        there = read_json(manifest)
-        frames = there.get("frames") if isinstance(there, dict) else None
-        if not isinstance(frames, dict):
-            raise DataError(f"{manifest}: no manifest of predictions; delete the folder, or choose another --name")
-        if there.get("key") == self._content["key"]:
-            return frames
+        try:
+            there = from_json(_Manifest, read_json(manifest), manifest)
+        except DataError as error:
+            raise DataError(
+                f"{manifest}: no manifest of predictions; delete the folder, or choose another --name"
+            ) from error
+        if there.key == self._content["key"]:
+            return dict(there.frames)
         if not overwrite:
-            change = _first_change(there.get("settings", {}), self._content["settings"])
+            change = _first_change(there.settings, self._content["settings"])
             raise ConfigError(
                 f"{self.path}: holds predictions with other settings ({change}); choose another --name, or --overwrite"
             )
-        for file in (*map(self.file, frames), manifest):
+        for file in (*map(self.file, there.frames), manifest):
             file.unlink(missing_ok=True)
         return {}
 

@@ -38,16 +38,15 @@ from semstab.statistics.correctness import (
 from semstab.statistics.description import Analysis, analyse, describe
 from semstab.statistics.drift import (
     Flips,
-    SceneDrift,
     VoxelDrift,
     benjamini_hochberg,
     expected_sbd,
     flips,
-    scene_drift,
     voxel_drift,
 )
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.looks import Looks, Sample, Sampler, View, correlogram, reach_of
+from semstab.statistics.scene_drift import SceneDrift, scene_drift
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.verdict import verdict
 

@@ -17,9 +17,10 @@ from semstab.model.measures import MeasureMeans, Quantity, dominant, measures, v
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import STABLE, psa, ratio_of
+from semstab.statistics.agreement import STABLE, ratio_of
 from semstab.statistics.fusion_rules import Fused
 from semstab.statistics.sampling.places import Places
+from semstab.statistics.steady import LIKELY, steady
 
 Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -160,32 +161,34 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
 def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
-    `places` are those of all of the table's voxels.
+    A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
+    places were seen. `places` are those of all of the table's voxels.
     """
-    counted, steady, right = _masks(table, truth, stable)
+    counted, likely, right = _masks(table, truth, stable)
     if not counted.any():
         return Quadrants(0, *[UNKNOWN] * 5)
 
-    def share(where: Mask, of: Mask) -> Interval:
-        return places.estimate(np.stack([where & of, of], axis=1).astype(np.float64), ratio_of)
+    def share(part: Float64, of: Float64) -> Interval:
+        return places.estimate(np.stack([part * of, of], axis=1), ratio_of)
 
+    every = counted.astype(np.float64)
     return Quadrants(
         voxels=int(counted.sum()),
-        stable_right=share(steady & right, counted),
-        stable_wrong=share(steady & ~right, counted),
-        unstable_right=share(~steady & right, counted),
-        unstable_wrong=share(~steady & ~right, counted),
-        wrong_of_stable=share(~right, counted & steady),
+        stable_right=share(likely * right, every),
+        stable_wrong=share(likely * ~right, every),
+        unstable_right=share((1 - likely) * right, every),
+        unstable_wrong=share((1 - likely) * ~right, every),
+        wrong_of_stable=share((~right).astype(np.float64), every * likely),
     )
 
 
 def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
-    """(n,) the dangerous voxels: OP >= 3, all frames nearly agree, and they are wrong."""
-    counted, steady, right = _masks(table, truth, stable)
-    return counted & steady & ~right
+    """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
+    counted, likely, right = _masks(table, truth, stable)
+    return counted & (likely >= LIKELY) & ~right
 
 
-def _masks(table: VoxelTable, truth: Truth, stable: float) -> tuple[Mask, Mask, Mask]:
+def _masks(table: VoxelTable, truth: Truth, stable: float) -> tuple[Mask, Float64, Mask]:
+    """(n,) which voxels count, with what probability each is stable (0 where none is known), and which are right."""
     counted = truth.known & (table.op >= RECURRENT)
-    with np.errstate(invalid="ignore"):
-        return counted, psa(table) >= stable - 1e-9, dominant(table) == truth.label
+    return counted, np.nan_to_num(steady(table, stable=stable)), dominant(table) == truth.label

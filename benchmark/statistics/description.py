@@ -15,6 +15,7 @@ from semstab.metrics.matching import require_same_map
 from semstab.metrics.summary import STRATA
 from semstab.model.measures import MeasureMeans, dominant, mean, measures, sbd, vss
 from semstab.model.statistics import (
+    BeyondCoin,
     BlockCut,
     CorrectnessStatistics,
     DriftStatistics,
@@ -57,18 +58,19 @@ from semstab.statistics.drift import (
     benjamini_hochberg,
     expected_sbd,
     flips,
-    scene_drift,
     trend_columns,
     voxel_drift,
 )
 from semstab.statistics.looks import Sample, correlogram, reach_of
 from semstab.statistics.sampling import InfluenceSums, Places, influence_sums, judged_of
+from semstab.statistics.scene_drift import scene_drift
+from semstab.statistics.steady import steady
 from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 FALSE_DISCOVERIES = 0.05
-"""Rate at which drifting voxels are named."""
+"""Rate at which trending voxels are named."""
 
 Float64 = npt.NDArray[np.float64]
 Maps = dict[str, npt.NDArray[Any]]
@@ -134,7 +136,7 @@ def analyse(
         require_same_map(table, events)
     again = table.op >= 2
     means = _Means(again, Places(table.index[again], table.voxel_size))
-    maps: Maps = {"psa": psa(table)}
+    maps: Maps = {"psa": psa(table), "stable": steady(table)}
     known = None if truth is None else join_truth(table, truth)
     agreement = _agreement(table, events, means, maps)
     drift = _drift(table, events, means, maps, seed)
@@ -180,6 +182,7 @@ def analyse(
         correctness=right,
         fusion_rules=None if events is None else _fusion_rules(table, events, known),
         strata=_strata(table, maps, edges),
+        beyond_coin=_beyond_coin(table, means, maps),
     )
     return Analysis(summary, maps, sums)
 
@@ -275,9 +278,11 @@ def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, 
         trend_null=scene.trend_null,
         trend_excess=means.function(excess, ratio_of, (-1.0, 1.0)),
         trend_p=scene.trend_p,
+        stretches=scene.stretches,
+        voxels=scene.voxels,
         tested_voxels=int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
         unusual_sbd_voxels=_discoveries(maps["drift_q"]),
-        drifting_voxels=_discoveries(maps["trend_q"]),
+        trending_voxels=_discoveries(maps["trend_q"]),
     )
 
 
@@ -328,6 +333,21 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tup
         relabelled = fusion_rules.labels(fused.evidence) != usual
         rows.append(RuleOutcome(rule, rule_means(fused, again, truth), mean(relabelled[again])))
     return tuple(rows)
+
+
+def _beyond_coin(table: VoxelTable, means: _Means, maps: Maps) -> BeyondCoin:
+    """PSA does not depend on OP for a coin, nor does SBD on the order."""
+    op, agreement = table.op[means.again], maps["psa"][means.again]
+    excess = np.where(table.op > 2, maps["sbd_excess"], np.nan)
+    groups = [np.stack([agreement * where, where], axis=1) for where in (op == 2, op > 2)]
+    return BeyondCoin(
+        means.function(np.concatenate(groups, axis=1), _less, (-1.0, 1.0)), means.mean(-excess, (-1.0, 1.0))
+    )
+
+
+def _less(sums: Float64) -> Float64:
+    """A ratio less another, (...,) from sums (..., 4)."""
+    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
 
 
 def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> tuple[StratumStatistics, ...]:

@@ -6,7 +6,6 @@ less. So it is compared with what a random order of the very same observations g
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.model.measures import Quantity, mean, sbd
+from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT
 
@@ -34,10 +33,9 @@ CLEAR, LIKELY = 1e-4, 0.02
 """P-values of the trend from its mean and variance over orders stand from LIKELY on; those from CLEAR on are computed
 from random orders; a lower one becomes the lowest that these could give."""
 
-DRIFT_SAMPLE, SCENE_SAMPLE = 5_000, 30_000
-"""At most so many voxels are tested for an unusual SBD, and about so many observations tell whether a scene drifts."""
+DRIFT_SAMPLE = 5_000
+"""At most so many voxels are tested for an unusual SBD."""
 
-FRAME_ORDERS = 499
 TESTABLE = 6
 """Lowest OP of the voxels that are tested one by one: of fewer one-hot labels no order is rare enough."""
 
@@ -62,24 +60,6 @@ class VoxelDrift:
     trend: Float64
     trend_null: Float64
     trend_p: Float64
-
-
-@dataclass(frozen=True)
-class SceneDrift:
-    """The order of observations over all voxels, tested by putting the frames into random orders.
-
-    sbd, null    means over the voxels with OP >= 2, bits
-    p_value      of a mean SBD this far from what random orders of the frames give, either way
-    trend        share of all disagreement, over voxels with OP >= 3, that goes one way in time; null: in random order
-    trend_p      of a trend this large
-    """
-
-    sbd: float
-    null: float
-    p_value: float
-    trend: float
-    trend_null: float
-    trend_p: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +90,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
     base = kernels.LONGEST_TABLE + 1
     pairs, of = np.unique(count * base + T[known][voxel], return_inverse=True)
     part = np.zeros(len(pairs))
-    drifts, _ = _drift_tables(T[known])
+    drifts, _ = drift_tables(T[known])
     kernels.in_chunks(kernels.expected_one_hot, *np.divmod(pairs, base), _log_factorials(base), drifts, part)
     expected = np.bincount(voxel, weights=part[of], minlength=len(entries)) / (T[known] - 1)
     return _spread_out(expected, known)
@@ -136,7 +116,7 @@ def voxel_drift(
     """
     if not (draws >= 1 and most >= 1 and enough >= 1):
         raise ConfigError(f"draws = {draws}, most = {most}, enough = {enough}: use 1 or more")
-    vary, _, T = _varying(table, events)
+    vary, _, T = varying(table, events)
     orders = _Orders.of(table, events, vary, seed)
     null, p, variance = orders.measure(draws)
     spread = T * (T * T - 1.0) / 12 * variation(table)[vary]
@@ -188,7 +168,7 @@ class _Orders:
         from semstab.statistics import kernels
 
         first, T = events.starts[where], table.op[where].astype(np.int64)
-        seeds = _streams(table.rows(where).index, seed)
+        seeds = streams(table.rows(where).index, seed)
         return cls(first, T, events.evidence.entries, table.K, seeds, np.zeros((len(T), 2)), kernels.ENUMERATED)
 
     def measure(self, draws: int) -> tuple[Float64, Float64, Float64]:
@@ -209,7 +189,7 @@ class _Orders:
 
     def _shared(self) -> tuple[Any, ...]:
         entries = self.log[0][self.first + self.T] - self.log[0][self.first]
-        return self.first, self.T, self.log, self.K, int(entries.max(initial=0)), *_drift_tables(self.T), self.seeds
+        return self.first, self.T, self.log, self.K, int(entries.max(initial=0)), *drift_tables(self.T), self.seeds
 
 
 def _beta_tail(trend: Float64, variance: Float64, T: Int64) -> Float64:
@@ -221,59 +201,6 @@ def _beta_tail(trend: Float64, variance: Float64, T: Int64) -> Float64:
         size = mean * (1 - mean) / variance - 1
     p: Float64 = betaincc(mean * size, (1 - mean) * size, np.clip(trend - ROUNDING, 0.0, 1.0))
     return np.where(size > 0, p, 1.0)
-
-
-def scene_drift(
-    table: VoxelTable, events: Events, drift: VoxelDrift, *, seed: int = 0, frame_orders: int = FRAME_ORDERS
-) -> SceneDrift:
-    """Test the scene as a whole: its frames in `frame_orders` random orders, the same order for all voxels.
-
-    What neighbouring voxels have in common in a frame stays in common, so that the test holds its level however
-    strongly voxels depend on each other. `drift` is what `voxel_drift` says of the same map.
-    """
-    vary, first, T = _varying(table, events)
-    chosen = _some_observations(T, _streams(table.rows(vary).index, seed), SCENE_SAMPLE)
-    drifted, trended = _frame_orders(events, table.K, first[chosen], T[chosen], seed, frame_orders)
-    tested = np.flatnonzero(vary)[chosen]
-    moved = drift.trend * variation(table)
-    total_drift = _total(sbd(table)[tested])
-    p_value = min(1.0, 2 * min(_tail(-drifted, -total_drift), _tail(drifted, total_drift)))
-    trend = trend_columns(table, drift).sum(axis=0)
-    return SceneDrift(
-        sbd=mean(sbd(table)),
-        null=mean(drift.null),
-        p_value=p_value if vary.any() else math.nan,
-        trend=trend[0] / trend[2] if trend[2] else math.nan,
-        trend_null=trend[1] / trend[2] if trend[2] else math.nan,
-        trend_p=_tail(trended, _total(moved[tested])) if trend[2] else math.nan,
-    )
-
-
-def _some_observations(T: Int64, streams: npt.NDArray[np.uint64], most: int) -> Int64:
-    """Numbers of voxels of OP T (n,), drawn at random, that have about `most` observations together; ascending."""
-    drawn = np.argsort(streams)
-    return np.sort(drawn[: np.searchsorted(np.cumsum(T[drawn]), most) + 1])
-
-
-def _frame_orders(
-    events: Events, K: int, first: Int64, T: Int64, seed: int, frame_orders: int
-) -> tuple[Float64, Float64]:
-    """Sums over voxels of their SBD and of their trends (R,), in random orders of the frames."""
-    from semstab.statistics import kernels
-
-    at = np.concatenate([[0], np.cumsum(T)])
-    rows = np.arange(at[-1]) + np.repeat(first - at[:-1], T)
-    frames, rank = np.unique(events.frame[rows], return_inverse=True)
-    as_seen = np.tile(np.arange(len(frames)), (frame_orders, 1))
-    orders = np.random.default_rng(seed).permuted(as_seen, axis=1)
-    voxels = np.arange(kernels.CHUNKS + 1) * len(T) // kernels.CHUNKS
-    edges = np.stack([voxels, at[voxels]], axis=1)
-    sums = np.zeros((kernels.CHUNKS, frame_orders, 2))
-    kernels.in_chunks(
-        kernels.permute_frames, edges, first, T, events.evidence.entries, K, rank, orders, *_drift_tables(T), sums
-    )
-    drifted, trended = sums.sum(axis=0).T
-    return drifted, trended
 
 
 def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
@@ -328,13 +255,13 @@ def variation(table: VoxelTable) -> Float64:
     return np.maximum(squares, 0.0)
 
 
-def _varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
+def varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
     """The voxels (n,) whose observations differ, with their first rows and OP; the others cannot drift."""
     vary = variation(table) > ONE_HOT * table.op
     return vary, events.starts[vary], table.op[vary].astype(np.int64)
 
 
-def _drift_tables(T: Int64) -> tuple[Float64, Float64]:
+def drift_tables(T: Int64) -> tuple[Float64, Float64]:
     """What the kernels look up for voxels of up to that OP."""
     from semstab.statistics import kernels
 
@@ -342,13 +269,13 @@ def _drift_tables(T: Int64) -> tuple[Float64, Float64]:
     return kernels.one_hot_drifts(min(longest, kernels.LONGEST_TABLE)), kernels.step_terms(longest)
 
 
-def _streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
+def streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
     """A random number (n,) of each voxel that depends on its index (n, 3) and the seed only."""
     from semstab.statistics import kernels
 
-    streams = np.empty(len(index), np.uint64)
-    kernels.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), streams)
-    return streams
+    drawn = np.empty(len(index), np.uint64)
+    kernels.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
+    return drawn
 
 
 def _log_factorials(count: int) -> Float64:
@@ -362,13 +289,3 @@ def _spread_out(values: Float64, where: npt.NDArray[np.bool_]) -> Float64:
     out = np.full(len(where), np.nan)
     out[where] = values
     return out
-
-
-def _tail(values: Float64, seen: float) -> float:
-    """P-value of a value as high as the one seen, of which `values` are random draws."""
-    slack = 1e-9 * (1 + abs(seen))
-    return float((np.count_nonzero(values >= seen - slack) + 1) / (len(values) + 1))
-
-
-def _total(values: Float64) -> float:
-    return float(np.nansum(values))

@@ -118,13 +118,17 @@ class CastDepth:
 
 
 def shape_of(frame: FrameSource, options: FileOptions) -> Shape:
-    """(H, W) of what is cast for a frame: the size that its camera is for, else that of its colour image.
+    """(H, W) of what is cast for a frame: the size that its camera is for, else that of its depth file or colour image.
 
-    Raises DataError where neither is known.
+    Raises DataError where none is known.
     """
     size = options.intrinsics_size or frame.camera.size
-    if size is None:
-        if frame.color is None or not frame.color.is_file():
-            raise DataError(f"{frame.color or frame.name}: no colour image says the size of depth; set intrinsics_size")
-        size = color_size(frame.color)
-    return size[1], size[0]
+    if size is not None:
+        return size[1], size[0]
+    if frame.depth.is_file():
+        H, W = read_depth(frame.depth, 1.0).shape
+        return H, W
+    if frame.label_camera is not None or frame.color is None or not frame.color.is_file():
+        raise DataError(f"{frame.color or frame.name}: no colour image says the size of depth; set intrinsics_size")
+    width, height = color_size(frame.color)
+    return height, width

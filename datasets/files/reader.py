@@ -22,6 +22,7 @@ from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.scene import Dataset
 from semstab.datasets.surfaces.casts import usual_folder
 from semstab.datasets.surfaces.surface import Surface
+from semstab.datasets.surfaces.triangles import SEEN_FROM_ABOVE
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError, DataError
@@ -175,9 +176,13 @@ def frames_of(
 
 
 def _surface(options: FileOptions, georeference: Georeference | None) -> Surface | None:
-    """What depth is cast from, where the options say so."""
+    """What depth is cast from, where the options say so. Raises ConfigError for heights over another axis than z."""
     if options.surface is None:
         return None
+    if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):
+        raise ConfigError(
+            f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take a mesh"
+        )
     casts = None if options.casts is False else options.casts or usual_folder()
     return Surface(options.surface, options.surface_cell, georeference, casts)
 

@@ -123,3 +123,6 @@ POINTS_AT_ONCE = 2_000_000
 READERS: Mapping[str, Callable[[Path, float | None, Georeference | None], Triangles]] = {
     ".tif": _raster, ".tiff": _raster, ".las": _las, ".laz": _las,
 }  # fmt: skip
+
+SEEN_FROM_ABOVE = tuple(READERS)
+"""Suffixes of files that hold heights over x and y, whatever is in them."""

@@ -157,12 +157,22 @@ class DaskCluster:
     def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """As they finish. The scheduler gives the job of a worker that died to another one."""
         with self._client:
-            futures = {self._client.submit(run_job, job, pure=False): job for job in jobs}
+            futures = {self._client.submit(_run_settled, job, pure=False): job for job in jobs}
             try:
                 for future in _distributed().as_completed(list(futures), loop=self._client.loop):
                     yield futures[future], _outcomes(future, futures[future])
             finally:
                 self._client.cancel(list(futures))
+
+
+def _run_settled(job: Job) -> tuple[Outcome, ...]:
+    """Run a job in a worker of the cluster, which has nobody else to settle it, with as many threads as are its own."""
+    settle()
+    import numba
+
+    with contextlib.suppress(ValueError):  # called outside of a worker
+        numba.set_num_threads(min(_distributed().get_worker().state.nthreads, numba.get_num_threads()))
+    return run_job(job)
 
 
 def _distributed() -> Any:

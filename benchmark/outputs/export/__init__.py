@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,7 +85,8 @@ def export(
     record = result.record(scene=scene, backbone=backbone, backend=backend)
     settings = Settings(cell, None if asprs is None else Path(asprs))
 
-    def chosen(usual: Sequence[str] | None) -> Voxels:
+    @functools.cache
+    def chosen(usual: tuple[str, ...] | None) -> Voxels:
         return voxels_of(result, record, columns=measures or usual, min_op=min_op, classes=classes)
 
     if onto is not None:

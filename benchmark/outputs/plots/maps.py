@@ -19,8 +19,8 @@ from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.outputs.plots.topdown import EMPTY, Float64, FromAbove, Int64
-from semstab.statistics import decompose, psa
-from semstab.statistics.agreement import STABLE
+from semstab.statistics import decompose
+from semstab.statistics.steady import LIKELY, steady
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +95,7 @@ def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | Non
 def right_or_wrong(table: VoxelTable, truth: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """What is known of each voxel (n,), a row of RIGHT_COLORS, by its true class (n,), -1 where that is not known."""
     with np.errstate(invalid="ignore"):
-        stable = psa(table) >= STABLE - 1e-9
+        stable = np.nan_to_num(steady(table)) >= LIKELY
     right = dominant(table) == truth
     known = (truth >= 0) & (table.op >= RECURRENT)
     return np.where(known, np.where(right, np.where(stable, 1, 2), np.where(stable, 4, 3)), 0)

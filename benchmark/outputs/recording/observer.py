@@ -21,7 +21,7 @@ from semstab.config import Config
 from semstab.engine.observer import Factory, Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned, PlannedUnit
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, one_line
 from semstab.model.frames import Frame
 from semstab.model.measures import measures
 from semstab.model.records import RECORDING_PARTS, Result, Variation
@@ -208,7 +208,19 @@ class Recording(Observer):
                 if camera.unread is not None:
                     stream.log(path(camera.scene.name, "log"), rr.TextLog(f"without colour: {camera.unread}"))
         finally:
+            self._finish(stream)
+
+    def _finish(self, stream: rr.RecordingStream) -> None:
+        """Write the file's end. Raises ConfigError where that fails: the disk is full, for example."""
+        try:
             stream.flush()
+        except RuntimeError as error:
+            what = "did the viewer go away?" if self.target.live else "is the disk full?"
+            raise ConfigError(
+                f"{self.target.file}: the recording is not whole ({one_line(error)}; {what}); all else is kept, and the"
+                " same command makes it again"
+            ) from error
+        finally:
             stream.disconnect()
 
     @property

@@ -18,7 +18,7 @@ from semstab.statistics.verdict import ADVICE
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
-INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
+INTERVALS = "In brackets: intervals at 95% for this map; those of verdicts for the next flight if 60 frames tell of it."
 SEEN_TWICE = "Over the voxels seen twice or more."
 
 T = TypeVar("T")
@@ -89,7 +89,7 @@ def drift(result: Result) -> list[Table]:
         Column("trend", "one way", 3, over="Trend"),
         Column("trend_null", "random order", 3, over="Trend"),
         Column("trend_p", "p", 3, over="Trend"),
-        Column("drifting_voxels", "drifting", 0, over="Voxels"),
+        Column("trending_voxels", "trending", 0, over="Voxels"),
         Column("tested_voxels", "tested", 0, over="Voxels"),
     )
     numbers: tuple[Number, ...] = (
@@ -101,7 +101,7 @@ def drift(result: Result) -> list[Table]:
         tested(lambda tests: tests.trend),
         tested(lambda tests: tests.trend_null),
         tested(lambda tests: tests.trend_p),
-        tested(lambda tests: tests.drifting_voxels),
+        tested(lambda tests: tests.trending_voxels),
         tested(lambda tests: tests.tested_voxels),
     )
     logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())

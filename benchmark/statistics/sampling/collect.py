@@ -13,14 +13,12 @@ from semstab.metrics.matching import voxel_keys
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.agreement import ONE_HOT, STABLE, psa
+from semstab.statistics.agreement import ONE_HOT, psa
 from semstab.statistics.sampling.influence import MOST_CELLS, MOST_CLASSES, MOST_GROUPS, InfluenceSums, layout
+from semstab.statistics.steady import steady
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-
-NEARLY = STABLE - 1e-9
-"""A place is stable from this PSA on."""
 
 
 def influence_sums(
@@ -43,26 +41,29 @@ def influence_sums(
     """
     index = table.index[table.op >= 2]
     edge = cell_edge(index, table.voxel_size) if edge is None else edge
-    whole = _of_table(table, true_label, edge) if events is None else _of_log(events, true_label, edge)
+    likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
+    whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
     whole = dataclasses.replace(whole, classes=table.classes)
     if sample is None:
         return whole
-    seen, limit = (dataclasses.replace(_of_log(log, None, edge), classes=table.classes) for log in sample)
+    seen, limit = (
+        dataclasses.replace(_of_log(log, None, edge, np.zeros(len(log.ix))), classes=table.classes) for log in sample
+    )
     whole = _with_frames(whole, seen) if events is None else whole
     return dataclasses.replace(whole, seen=seen, limit=limit)
 
 
-def _of_table(table: VoxelTable, true_label: Int64 | None, edge: float) -> InfluenceSums:
+def _of_table(table: VoxelTable, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
     again = np.flatnonzero(table.op >= 2)
     at, of = cells_of(table.index[again], table.voxel_size, edge)
-    columns = _sums_of_table(table, again, of, len(at), true_label)
+    columns = _sums_of_table(table, again, of, len(at), true_label, likely)
     unknown = np.full(len(at), -1, dtype=np.int32)
     return InfluenceSums(
         at, unknown, columns, edge, 0, table.voxel_size, table.K, table.classes, true_label is not None
     )
 
 
-def _of_log(events: Events, true_label: Int64 | None, edge: float) -> InfluenceSums:
+def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
     starts = events.starts
     op = np.diff(np.append(starts, len(events)))
     again = np.flatnonzero(op >= 2)
@@ -70,7 +71,7 @@ def _of_log(events: Events, true_label: Int64 | None, edge: float) -> InfluenceS
     at, of = cells_of(index[again], events.voxel_size, edge)
     step, K = _step(events.frame), int(events.evidence.shape[1])
     frames, group = np.unique(events.frame // step, return_inverse=True)
-    sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label)
+    sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
         at[cell],
@@ -145,6 +146,7 @@ def _sums_of_log(
     group: Int64,
     groups: int,
     true_label: Int64 | None,
+    likely: Float64,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
     from semstab.statistics.kernels import in_chunks
@@ -167,14 +169,16 @@ def _sums_of_log(
         K,
         group,
         truth,
-        STABLE,
+        likely,
         *options,
         sums,
     )
     return sums
 
 
-def _sums_of_table(table: VoxelTable, again: Int64, of: Int64, cells: int, true_label: Int64 | None) -> Float64:
+def _sums_of_table(
+    table: VoxelTable, again: Int64, of: Int64, cells: int, true_label: Int64 | None, likely: Float64
+) -> Float64:
     """(cells, C) from the voxels' rows alone; sums by class are NaN for evidence that is not one-hot."""
     T, e = table.op[again].astype(np.float64), table.evidence[again]
     agreement, recurrent = psa(table)[again], (table.op[again] >= RECURRENT).astype(np.float64)
@@ -192,11 +196,11 @@ def _sums_of_table(table: VoxelTable, again: Int64, of: Int64, cells: int, true_
     if true_label is not None:
         label = true_label[again]
         known, right = label >= 0, label == dominant(table)[again]
-        steady = known & (agreement >= NEARLY) & (recurrent > 0)
+        stable = known * likely[again] * recurrent
         looks = np.take_along_axis(e, np.maximum(label, 0)[:, None], axis=1)[:, 0]
         values |= {
             "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
-            "stable": steady, "stable_wrong": steady & ~right,
+            "stable": stable, "stable_wrong": stable * ~right,
         }  # fmt: skip
         if table.K <= MOST_CLASSES:
             true = (label[:, None] == np.arange(table.K)).astype(np.float64)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from semstab.model.statistics import THIS_MAP, Question
 from semstab.statistics.sampling.influence import Statistic
@@ -139,6 +138,8 @@ class TwoWay:
 
     def half(self, level: float) -> float:
         """Half the width of the interval."""
+        from scipy import stats
+
         if not self.degrees > 0:
             return math.nan
         return float(stats.t.ppf((1 + level) / 2, self.degrees)) * math.sqrt(self.total)

@@ -73,7 +73,7 @@ def _label_without(total, row, active, A):
 
 
 @serial
-def _add_truth(out, rows, first, T, group, truth, stable, counts_stable, total, active, A, without, column, K):
+def _add_truth(out, rows, first, T, group, truth, likely, total, active, A, without, column, K):
     """What is right: of the fused label by leaving a frame out, of each look by itself."""
     right = 1.0 if _label(total, active, A) == truth else 0.0
     mean = 0.0
@@ -87,20 +87,21 @@ def _add_truth(out, rows, first, T, group, truth, stable, counts_stable, total, 
         sums[column + RIGHT] += own
         sums[column + LOOKS] += 1.0
         sums[column + LOOKS_RIGHT] += rows[t, truth]
-        if counts_stable and stable:
-            sums[column + STABLE] += 1.0 / T
-            sums[column + STABLE_WRONG] += (1.0 - right) / T
+        if T > 2:
+            sums[column + STABLE] += likely / T
+            sums[column + STABLE_WRONG] += likely * (1.0 - right) / T
         if K:
             sums[column + 6 + truth] += 1.0 / T
             sums[column + 6 + K + truth] += own
 
 
 @serial
-def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, stable, by_class, with_truth, sums):
+def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likely, by_class, with_truth, sums):
     """Add the observations of the voxels with T >= 2 to `sums` (cells, groups, C).
 
     order (n,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts, op (n,) are a voxel's rows
-    of the log and of group (m,), truth (n,) its true class or -1, stable the PSA from which a place is. A place's
+    of the log and of group (m,), truth (n,) its true class or -1, likely (n,) how likely it is
+    stable. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
     against, and the shares add up to T P.
@@ -156,7 +157,7 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, stabl
                         add[ENTROPY + 1 + 2 * K + k] += s[k] ** 2
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    out, rows, first, T, group, truth[i], agreed >= stable, T > 2, total, active, A, without,
+                    out, rows, first, T, group, truth[i], likely[i], total, active, A, without,
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
             _cleared(log, first, T, rows)

@@ -1,0 +1,171 @@
+"""Does a scene drift? Stretches of time are put into other orders, the same for all voxels.
+
+Frames that follow each other err alike, for reasons that are no drift: so they stay together, in stretches as long as
+errors are seen to last, and what is tested is whether the stretches could have come in any order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.evidence import row_chunks
+from semstab.model.measures import mean, sbd
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.drift import VoxelDrift, drift_tables, streams, trend_columns, variation, varying
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+SAMPLE, ORDERS = 30_000, 499
+"""About so many observations are put into so many orders."""
+
+MOST_STRETCHES, LEAST_STRETCHES, LEAST_SPAN = 12, 6, 4
+"""Stretches of time, at most and at least, and in how many of them a voxel must be seen to be put to the test."""
+
+
+@dataclass(frozen=True)
+class SceneDrift:
+    """The order of observations over all voxels, tested by putting stretches of time into random orders.
+
+    sbd, null    means over the voxels with OP >= 2, bits
+    p_value      of a mean SBD this far from what random orders of the stretches give, either way; NaN where errors last
+                 so long that there are fewer than LEAST_STRETCHES, or no place was seen in LEAST_SPAN of them
+    trend        share of all disagreement, over voxels with OP >= 3, that goes one way in time; null: in random order
+    trend_p      of a trend this large
+    stretches    of time that were put in other orders
+    voxels       whose observations tell, a random sample
+    """
+
+    sbd: float
+    null: float
+    p_value: float
+    trend: float
+    trend_null: float
+    trend_p: float
+    stretches: int
+    voxels: int
+
+
+def scene_drift(
+    table: VoxelTable, events: Events, drift: VoxelDrift, *, seed: int = 0, frame_orders: int = ORDERS
+) -> SceneDrift:
+    """Test whether stretches of time are exchangeable, in `frame_orders` random orders.
+
+    What neighbouring voxels have in common in a frame stays in common, and so does what frames of one stretch have.
+    `drift` is what `voxel_drift` says of the same map.
+    """
+    sampled = _sampled(table, events, seed)
+    tested, drifted, trended = sampled.orders(events, table.K, seed, frame_orders)
+    known = len(tested) > 0
+    total_drift, total_trend = _total(sbd(table)[tested]), _total((drift.trend * variation(table))[tested])
+    p_value = min(1.0, 2 * min(_tail(-drifted, -total_drift), _tail(drifted, total_drift)))
+    trend = trend_columns(table, drift).sum(axis=0)
+    return SceneDrift(
+        sbd=mean(sbd(table)),
+        null=mean(drift.null),
+        p_value=p_value if known else math.nan,
+        trend=trend[0] / trend[2] if trend[2] else math.nan,
+        trend_null=trend[1] / trend[2] if trend[2] else math.nan,
+        trend_p=_tail(trended, total_trend) if known and total_trend > 0 else math.nan,
+        stretches=sampled.stretches,
+        voxels=len(tested),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """Voxels drawn at random from those whose observations differ.
+
+    voxel, first, T  (n,) their rows of the table and of the log, and OP
+    stretch          (m,) of each of their observations, one voxel after the other; they are numbered in time
+    stretches        how many there are
+    """
+
+    voxel: Int64
+    first: Int64
+    T: Int64
+    stretch: Int64
+    stretches: int
+
+    def orders(self, events: Events, K: int, seed: int, count: int) -> tuple[Int64, Float64, Float64]:
+        """Voxels that many stretches see, and the sums over them of SBD and of trends (R,), in random orders."""
+        from semstab.statistics import kernels
+
+        at = np.concatenate([[0], np.cumsum(self.T)])
+        changes = np.diff(self.stretch, prepend=-1) != 0
+        changes[at[:-1]] = True
+        span = np.add.reduceat(changes, at[:-1]) if len(self.T) else self.T
+        kept = (span >= LEAST_SPAN) & (self.stretches >= LEAST_STRETCHES)
+        first, T = self.first[kept], self.T[kept]
+        stretch = self.stretch[np.repeat(kept, self.T)]
+        at = np.concatenate([[0], np.cumsum(T)])
+        as_seen = np.tile(np.arange(self.stretches), (count, 1))
+        orders = np.random.default_rng(seed).permuted(as_seen, axis=1)
+        voxels = np.arange(kernels.CHUNKS + 1) * len(T) // kernels.CHUNKS
+        edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((kernels.CHUNKS, count, 2))
+        log, tables = events.evidence.entries, drift_tables(T)
+        kernels.in_chunks(kernels.permute_frames, edges, first, T, log, K, stretch, orders, *tables, sums)
+        drifted, trended = sums.sum(axis=0).T
+        return self.voxel[kept], drifted, trended
+
+
+def _sampled(table: VoxelTable, events: Events, seed: int) -> _Sampled:
+    """So many voxels that they have about SAMPLE observations, with the stretches that frames are cut into."""
+    vary, first, T = varying(table, events)
+    drawn = np.argsort(streams(table.rows(vary).index, seed))
+    chosen = np.sort(drawn[: np.searchsorted(np.cumsum(T[drawn]), SAMPLE) + 1])
+    voxel, first, T = np.flatnonzero(vary)[chosen], first[chosen], T[chosen]
+    of = np.repeat(np.arange(len(T)), T)
+    rows = np.arange(len(of)) + (first - np.cumsum(T) + T)[of]
+    frames, rank = np.unique(events.frame[rows], return_inverse=True)
+    lasting = _lasting(_departures(table, events, voxel, of, rows), rank, len(frames))
+    stretches = min(MOST_STRETCHES, len(frames) // lasting)
+    return _Sampled(voxel, first, T, rank * stretches // max(len(frames), 1), stretches)
+
+
+def _departures(table: VoxelTable, events: Events, voxel: Int64, of: Int64, rows: Int64) -> Float64:
+    """(m,) how much less an observation agrees with its voxel's mean than the voxel's observations do on average."""
+    agrees = np.zeros(len(rows))
+    for some in row_chunks(len(rows), table.K):
+        at = voxel[of[some]]
+        agrees[some] = (events.evidence[rows[some]] * table.evidence[at]).sum(axis=1) / table.op[at]
+    mean_of = np.bincount(of, weights=agrees) / np.maximum(np.bincount(of), 1)
+    departures: Float64 = mean_of[of] - agrees
+    return departures
+
+
+def _lasting(departures: Float64, frame: Int64, frames: int) -> int:
+    """For how many frames what departs in one is seen to depart in the next ones, 1 where each errs anew.
+
+    Twice the sum of the autocorrelations of the frames' mean departures, as long as pairs of them are positive (Geyer
+    1992, Statistical Science 7).
+    """
+    if frames < 2:
+        return 1
+    series = np.bincount(frame, weights=departures, minlength=frames) / np.bincount(frame, minlength=frames)
+    series = series - series.mean()
+    length = float(series @ series)
+    if length <= 0:
+        return 1
+    rho = [float(series[lag:] @ series[:-lag]) / length for lag in range(1, frames)]
+    total = 0.0
+    for a, b in zip(rho[::2], rho[1::2], strict=False):
+        if a + b <= 2 / math.sqrt(frames):
+            break
+        total += a + b
+    return 1 + round(2 * total)
+
+
+def _total(values: Float64) -> float:
+    """Their sum, where defined."""
+    return float(np.nansum(values))
+
+
+def _tail(values: Float64, seen: float) -> float:
+    """P-value of a value as high as the one seen, of which `values` are random draws."""
+    slack = 1e-9 * (1 + abs(seen))
+    return float((np.count_nonzero(values >= seen - slack) + 1) / (len(values) + 1))

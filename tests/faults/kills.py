@@ -1,0 +1,146 @@
+"""Kill runs, studies, predictions and conversions at random moments, half of them at their folder's birth.
+
+    python tests/faults/kills.py [COUNT [SEED]]         make faults: 100
+
+Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
+machine, a kill may come after the end: those are counted apart.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import functools
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import predicted_scene
+import tiny_scene
+import tiny_study
+import yaml
+
+from semstab.cli import app
+from semstab.outputs.recording.target import is_whole
+
+Words = list[str]
+TIMES = ("fuse_ms_per_frame", "stages_ms")
+
+
+def in_a_child(words: Words, log: Path) -> int:
+    """Start the command line in a process of its own, which has loaded everything already; its id."""
+    child = os.fork()
+    if child:
+        return child
+    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(out, 1), os.dup2(out, 2)
+    code = 1
+    with contextlib.suppress(BaseException):
+        try:
+            app(words, standalone_mode=True)
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    os._exit(code)
+
+
+def finished(words: Words, log: Path) -> None:
+    """Let it come to its end, which must be a good one."""
+    _, status = os.waitpid(in_a_child(words, log), 0)
+    if os.waitstatus_to_exitcode(status) != 0:
+        raise SystemExit(f"{' '.join(words)}: {log.read_text()[-2000:]}")
+
+
+def killed(words: Words, log: Path, wait: Callable[[], None]) -> bool:
+    """Kill it after a while; whether it was still at work."""
+    child = in_a_child(words, log)
+    wait()
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+
+
+def of_run(out: Path) -> Any:
+    """What a run or a study leaves: the summary without times, its files, and whether the recording is whole."""
+    found = json.loads((out / "summary.json").read_text())
+    runs = [{key: value for key, value in run.items() if key not in TIMES} for run in found["runs"]]
+    recording = out / "recording.rrd"
+    names = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
+    return {**found, "runs": runs}, names, not recording.exists() or is_whole(recording)
+
+
+def of_files(out: Path) -> Any:
+    """What a conversion or a prediction leaves, file by file; manifests without times and places."""
+    manifests = ("conversion.json", "predictions.json")
+    files = sorted(path for path in out.rglob("*") if path.is_file())
+    kept = {str(path.relative_to(out)): path.read_bytes() for path in files if path.name not in manifests}
+    frames = [list(json.loads(path.read_text()).get("frames", {})) for path in files if path.name in manifests]
+    return kept, frames
+
+
+def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path], Any]]]:
+    """What is killed: its words for a folder, and what is compared of that."""
+    wall = tiny_scene.write(base / "wall", backbones=("a", "b"), frames=20)
+    flight = predicted_scene.write(base / "flight")
+    study = base / "tiny.yaml"
+    study.write_text(yaml.safe_dump(tiny_study.content(tiny_study.write(base / "walls"), backends=["numpy"])))
+    common = ["--data", str(wall), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
+    return {
+        "run": (lambda out: [*common, "--out", str(out)], of_run),
+        "study": (lambda out: ["study", str(study), "--report", "off", "--quiet", "--out", str(out)], of_run),
+        "predict": (
+            lambda out: ["predict", "-m", "colour-clusters", "--data", str(flight), "--out", str(out), "--quiet"],
+            of_files,
+        ),
+        "convert": (lambda out: ["convert", "--data", str(wall), "--out", str(out), "--quiet"], of_files),
+    }
+
+
+def until_birth(out: Path, seconds: float) -> None:
+    """Wait for the folder, or what lies in it, and a moment longer."""
+    deadline = time.monotonic() + 30
+    while not out.exists() and time.monotonic() < deadline:
+        time.sleep(0.0002)
+    time.sleep(seconds)
+
+
+def main(count: int, seed: int) -> None:
+    """Kill so many, say how many ended as they should, and fail where one did not."""
+    rng, told, wrong = random.Random(seed), collections.Counter[str](), []
+    with tempfile.TemporaryDirectory() as temporary:
+        base = Path(temporary)
+        made, whole, seconds = kinds(base), {}, {}
+        for kind, (words, left) in made.items():
+            started = time.monotonic()
+            finished(words(base / kind), base / "log")
+            seconds[kind] = time.monotonic() - started
+            whole[kind] = left(base / kind)
+        with contextlib.suppress(KeyboardInterrupt):  # says what it has come to
+            for k in range(count):
+                kind, birth = list(made)[k % len(made)], (k // len(made)) % 2 == 0
+                (words, left), out = made[kind], base / f"{kind}{k}"
+                moment = rng.random() * (0.03 if birth else seconds[kind])
+                wait = functools.partial(until_birth, out, moment) if birth else functools.partial(time.sleep, moment)
+                at_work = killed(words(out), base / "log", wait)
+                finished(words(out), base / "log")
+                told[f"{kind}, {'birth' if birth else 'later'}{'' if at_work else ', had ended'}"] += 1
+                if left(out) != whole[kind]:
+                    wrong.append(f"{kind} {k}: differs, killed at {moment:.3f} s{' of its birth' if birth else ''}")
+    for what, times in sorted(told.items()):
+        print(f"{times:3} {what}")
+    print(f"{told.total() - len(wrong)} of {told.total()} left what one without a kill leaves")
+    for line in wrong:
+        print(line)
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main(*map(int, (*sys.argv[1:], *("100", "0")[len(sys.argv) - 1 :])))

@@ -1,0 +1,72 @@
+"""A disk that is full, and Ctrl-C while modules are still loaded: one line, and what is finished is kept."""
+
+from __future__ import annotations
+
+import json
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import tiny_scene
+from command_line import environment
+from posed_config import configure
+
+import semstab
+from semstab.errors import ConfigError
+from semstab.outputs.recording import Recording
+from semstab.runtime.files import write_text
+
+
+def test_a_recording_that_finds_no_room_costs_no_result(tmp_path, monkeypatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")  # what rerun says of a full disk
+
+    monkeypatch.setattr("rerun.RecordingStream.flush", full)
+    config, out = configure(tiny_scene.write(tmp_path / "wall", backbones=("a",)), check=None), tmp_path / "out"
+    recording = Recording(out / "recording.rrd", run=out)
+    with pytest.raises(ConfigError, match=r"recording\.rrd: the recording is not whole .*is the disk full"):
+        semstab.engine.run(config, out=out, observers=[recording])
+    assert len(json.loads((out / "summary.json").read_text())["runs"]) == 1
+
+
+def test_a_file_that_finds_no_room_is_named(tmp_path) -> None:
+    """No file may grow beyond 64 kB, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (65_536, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            write_text(tmp_path / "large.txt", "x" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "large.txt")
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_while_modules_are_loaded_is_one_line(tmp_path) -> None:
+    """From where our code begins; before that, Python itself is interrupted."""
+    marker = tmp_path / "begun"
+    program = (
+        f"import pathlib, sys; sys.argv = ['semstab-bench', 'list']; from semstab.__main__ import main\n"
+        f"import signal, threading; begun = pathlib.Path({str(marker)!r})\n"
+        "threading.Timer(0, begun.touch).start(); main()"
+    )
+    moments = random.Random(0)
+    for _ in range(3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", program], env=environment(80), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+            text=True,
+        )  # fmt: skip
+        while not marker.exists():
+            time.sleep(0.001)
+        time.sleep(0.01 + moments.random() * 0.3)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+        marker.unlink()
+        assert "Traceback" not in said
+        assert process.returncode in (130, 0)
+        if process.returncode:
+            assert said.startswith("interrupted")

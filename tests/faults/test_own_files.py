@@ -1,0 +1,125 @@
+"""Files of one's own, damaged: one line that names the file, and what can be computed again is."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_scene
+from posed_config import configure
+from rich.console import Console
+
+import semstab
+from semstab.convert import convert
+from semstab.engine import load_result
+from semstab.errors import LONGEST_LINE, SemstabError
+from semstab.model.records import UnitContent
+from semstab.outputs.tables import tables
+from semstab.outputs.terminal import print_summary
+from semstab.predict.folder import PredictionFolder
+from semstab.runtime.files import read_json
+from semstab.runtime.json_form import from_json
+
+VALUES = (None, True, -1, 1e308, float("nan"), "x", "\ud800", [], {}, "../../x", 10**400, "a" * 5000, 0)
+WHOLES = (b"", b"[]", b"null", b"{}", b"[" * 100_000, b'{"a":' * 50_000, b"\xff\xfe", b"1" * 6000, b'"x"')
+DAMAGES = 30
+"""Of each file."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """OUT/run, OUT/converted, OUT/labels/net: a run with two backends, a conversion, predictions."""
+    out = tmp_path_factory.mktemp("own")
+    config = configure(tiny_scene.write(out / "wall"), backends=["numpy", "numba"], check=None)
+    semstab.engine.run(config, out=out / "run")
+    list(convert(config, out / "converted"))
+    predicted(out).close()
+    return out
+
+
+def predicted(out: Path, **settings: Any) -> PredictionFolder:
+    folder = PredictionFolder(out / "labels" / "net", "labels", settings, {}, None)
+    if not folder.has("0", "digest"):
+        folder.write("0", "digest", np.zeros((3, 3), np.uint8), 0.1)
+    return folder
+
+
+def damaged(text: str, rng: random.Random) -> bytes:
+    """Bytes changed, the end cut, a value replaced somewhere, or something else altogether."""
+    how = rng.random()
+    if how < 0.05:
+        return rng.choice(WHOLES)
+    if how < 0.15:
+        return text.encode()[: rng.randrange(len(text))]
+    if how < 0.4:
+        content = bytearray(text.encode())
+        for _ in range(rng.randrange(1, 5)):
+            content[rng.randrange(len(content))] = rng.randrange(256)
+        return bytes(content)
+    values = json.loads(text)
+    replace_somewhere(values, rng)
+    return json.dumps(values).encode("utf-8", "surrogatepass")
+
+
+def replace_somewhere(values: Any, rng: random.Random) -> None:
+    keys = list(values) if isinstance(values, dict) else list(range(len(values)))
+    key = rng.choice(keys)
+    if isinstance(values[key], dict | list) and values[key] and rng.random() < 0.8:
+        replace_somewhere(values[key], rng)
+    elif isinstance(values, dict) and rng.random() < 0.2:
+        del values[key]
+    else:
+        values[key] = rng.choice(VALUES)
+
+
+def read_again(file: Path) -> None:
+    result = load_result(file.parent)
+    tables(result)
+    if result.select():
+        print_summary(result, Console(file=StringIO()))
+
+
+def read_unit(file: Path) -> None:
+    from_json(UnitContent, read_json(file), file)
+
+
+def converted_again(file: Path) -> None:
+    out = file.parents[2]
+    list(convert(configure(out / "wall", backends=["numpy", "numba"], check=None), out / "converted"))
+
+
+def predicted_again(file: Path) -> None:
+    predicted(file.parents[2]).close()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "read"),
+    [
+        ("run/summary.json", read_again),
+        ("run/manifest.json", read_again),
+        ("run/units/*.json", read_unit),
+        ("converted/wall/conversion.json", converted_again),
+        ("labels/net/predictions.json", predicted_again),
+    ],
+)
+def test_a_damaged_file_is_one_line_or_still_whole(folder, pattern, read: Callable[[Path], None]) -> None:
+    rng, refused = random.Random(pattern), list[str]()
+    file = min(folder.glob(pattern))
+    whole = file.read_text()
+    for _ in range(DAMAGES):
+        file.write_bytes(damaged(whole, rng))
+        try:
+            read(file)
+        except SemstabError as error:
+            refused.append(str(error))
+        finally:
+            file.write_text(whole)
+    assert [line for line in refused if str(file.parent) not in line or len(line) > LONGEST_LINE] == []
+    read(file)
+    assert len(refused) > DAMAGES / 10
