@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.resources
+import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 from semstab.runtime.files import parse_yaml
+
+logger = logging.getLogger("semstab")
 
 Leniency = Literal["strict", "lenient"]
 
@@ -61,7 +64,7 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
 
     A class goes where its vocabulary says, or to the class of `target` with its name or among whose members it is; one
     of which the vocabulary says nothing else goes to its rest. Where `target` knows none of these, strict raises
-    ConfigError and names the class, lenient leaves the class out.
+    ConfigError and names the class, lenient leaves the class out, and warns where these are most.
     """
     vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
     known, rows, lost = target.row_of, [], []
@@ -76,6 +79,12 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
             f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {source.name}; add the names to a class's"
             " members or to ignored, or leave them out with the lenient mapping"
         )
+    if 2 * len(lost) > len(source):
+        logger.warning(
+            "taxonomy %s: %d of the %d classes of %s are none of its classes and are left out, among them %s; does the"
+            " taxonomy fit? Its members and its ignored list take names",
+            target.name, len(lost), len(source), source.name, ", ".join(lost[:3]),
+        )  # fmt: skip
     return LabelMapping(source, target, tuple(rows))
 
 

@@ -23,7 +23,7 @@ def load_config(
     Overrides go on top. Raises ConfigError.
     """
     base = settings if isinstance(settings, Mapping) else _of_file(settings)
-    content = merge(_in_full(base), _in_full(overrides or {}))
+    content = _over(base, overrides or {})
     where = "configuration" if settings is None or isinstance(settings, Mapping) else str(settings)
     return Config.build(merge(dataset_defaults(content), content), where)
 
@@ -40,7 +40,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
     such study.
     """
     path = _find(str(study))
-    content = merge(_in_full(read_yaml(path)), _in_full(overrides or {}))
+    content = _over(read_yaml(path), overrides or {})
     own = {"name": path.stem, "check": None}
     return Config.build(merge(merge(dataset_defaults(content), own), content), str(path))
 
@@ -65,7 +65,7 @@ def predicted_config(
 
     Without a list of backbones in `overrides` all predictors are used.
     """
-    content = merge(_in_full(_of_file(path)), _in_full(overrides))
+    content = _over(_of_file(path), overrides)
     inner = content.pop("dataset", {"name": "city"})
     content["backbones"] = overrides.get("backbones")
     content["dataset"] = {
@@ -99,6 +99,12 @@ def _in_full(content: Mapping[str, Any]) -> dict[str, Any]:
     if "frames" in long:
         long["frames"] = in_full(long["frames"])
     return long
+
+
+def _over(content: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Overrides on top of a file; scene_frames are named by their scenes, so none at all clears what the file says."""
+    merged = merge(_in_full(content), _in_full(overrides))
+    return merged | {"scene_frames": {}} if overrides.get("scene_frames") == {} else merged
 
 
 def _find(study: str) -> Path:

@@ -78,6 +78,20 @@ def test_other_classes_go_by_their_own_names():
     assert targets(water, leniency="lenient") == {"road": "road", "water": None}
 
 
+def test_a_mapping_that_leaves_out_most_classes_warns(caplog):
+    """Names as some checkpoints have them, of a vocabulary that is not recognised: 145 of 150."""
+    known = ("building, edifice", "road, route", "tree", "car, auto, automobile, machine, motorcar", "human")
+    model = LabelSpace("model", (*known, *(f"thing {k}" for k in range(145))))
+    mapping = class_mapping(model, UAVID, "lenient")
+    assert sum(row is not None for row in mapping.rows) == 5
+    assert (
+        "145 of the 150 classes of model are none of its classes and are left out, among them thing 0," in caplog.text
+    )
+    caplog.clear()
+    class_mapping(LabelSpace("model", (*known, "thing 0")), UAVID, "lenient")
+    assert not caplog.text
+
+
 def test_vocabularies_name_classes_of_uavid_once():
     for vocabulary in vocabularies().values():
         known = {*UAVID.classes}

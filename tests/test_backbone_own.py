@@ -11,11 +11,12 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import predicted_scene
 import pytest
-from command_line import bench, error_of
 from pictures import blobs
+from typer.testing import CliRunner
 
 from semstab.backbones import Backbone, Prediction, create
 from semstab.backbones.outside.border import Checked
+from semstab.cli import app
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.model.labels import LabelSpace
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
@@ -269,13 +270,19 @@ def test_answers_that_cannot_be_used(tmp_path, gives, message):
         create(f"{path}:f").predict([IMAGE])
 
 
-def test_from_the_command_line(file, tmp_path):
-    scene = predicted_scene.write(tmp_path / "flight", frames=2)
+def test_from_the_command_line(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = str(predicted_scene.write(tmp_path / "flight", frames=2))
     options = ("--classes", "dark,bright", "--set", "above=100.0")
-    bench("predict", "-m", "models.py:bright", "--data", scene, *options, cwd=tmp_path)
-    said = json.loads((scene / "labels/bright/predictions.json").read_text())
+    done = CliRunner().invoke(app, ["predict", "-m", "models.py:bright", "--data", scene, *options])
+    assert done.exit_code == 0, done.output
+    said = json.loads((tmp_path / "flight/labels/bright/predictions.json").read_text())
     assert said["settings"]["classes"] == ["dark", "bright"]
-    assert "models.py: has no 'light'" in error_of("--predict", "models.py:light", "--data", scene, cwd=tmp_path)
+    done = CliRunner().invoke(app, ["--predict", "models.py:light", "--data", scene])
+    assert (done.exit_code, done.output.count("\n")) == (2, 1)
+    assert "models.py: has no 'light'; did you mean 'bright'?" in done.output
+    done = CliRunner().invoke(app, ["--classes", "a,b", "--data", scene])
+    assert done.output == "error: --classes names what a model predicts; say which one with --predict\n"
 
 
 # --- The border -------------------------------------------------------------------------------------------------------

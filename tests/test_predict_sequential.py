@@ -185,7 +185,7 @@ def live(monkeypatch):
 
 
 def live_config(root, **settings) -> Config:
-    settings = {"dataset": dataset_of(root), "voxel_size": 0.25, "check": None, **settings}
+    settings = {"dataset": dataset_of(root), "voxel_size": 0.25, "backends": ["numpy"], "check": None, **settings}
     return predicted_config([PredictorConfig(backbone="colour-clusters", name="average")], None, settings)
 
 
@@ -236,7 +236,9 @@ def test_live_and_by_way_of_the_disk_are_the_same(scene, live):
     frames = {"stride": 2, "start": 1}
     (found,) = run(live_config(scene, frames=frames)).runs
     predict(scene, Average(), FrameSelection(**frames).indices(6))
-    (stored,) = run(Config(dataset=dataset_of(scene), frames=frames, voxel_size=0.25, check=None)).runs
+    (stored,) = run(
+        Config(dataset=dataset_of(scene), frames=frames, voxel_size=0.25, backends=["numpy"], check=None)
+    ).runs
     assert found.table == stored.table
     assert found.flicker_percent == stored.flicker_percent
 

@@ -193,7 +193,7 @@ def test_the_line_says_what_to_do_and_why():
 def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames_are_said():
     events = backbone(0.1, 3)
     few = describe(events.table(), events).verdict.line
-    assert "intervals are for these 8 frames: fly 40 or more to tell of the next flight" in few
+    assert "intervals are for these 8 frames: fly 60 or more to tell of the next flight" in few
     assert "these frames: keep a log" in describe(events.table()).verdict.line
     alike = Interval(0.9, 0.85, 0.95, undecided="errors reach as far as the scene: fly more of it")
     found = verdict("net", judged=Judged(*[alike] * 5, UNKNOWN), reach=None, voxels=5000, share=0.5, blocks=40)
@@ -204,7 +204,7 @@ def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames
 def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
     found = judged(0.82, 0.9, ceiling=0.7)
     assert found.level == "stable"
-    assert "alpha between frames 0.86 is 86% (82% to 90%) of the 0.70 that the ground truth allow" in found.line
+    assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70 by the ground truth" in found.line
     assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
     assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
 

@@ -107,7 +107,10 @@ def test_the_shipped_studies_fit_together() -> None:
     paper = load_study("uavid3d")
     assert paper.scene_frames["scene1"].indices(200) == [*range(0, 80, 4)]
     assert len(paper.frames.indices(200)) == 20
-    assert (paper.taxonomy, paper.shared_taxonomy, paper.voxel_size) == ("uavid7", "uavid3", 0.2)
+    assert load_study("uavid3d", {"scene_frames": {}}).scene_frames == {}
+    some = load_study("uavid3d", {"scene_frames": {"scene1": {"stop": 40}}}).scene_frames
+    assert (some["scene0"].stop, some["scene1"].stop) == (80, 40)
+    assert (paper.taxonomy, paper.shared_taxonomy, paper.voxel_size) == ("uavid6", "uavid3", 0.2)
 
 
 def test_a_part_of_a_study(tmp_path) -> None:

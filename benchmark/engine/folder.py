@@ -215,8 +215,8 @@ def load_result(folder: str | Path) -> Result:
 
 def _contradiction(result: Result) -> str | None:
     """What in a result refers to something that is not in it; None where nothing does."""
-    if result.records and not any(record.unit.backend == result.backend for record in result.records):
-        return f"no run is fused by the base backend '{result.backend}'"
+    if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
+        return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
     quantities = {"op", "evidence", *(measure.key for measure in measures())}
     for row in result.agreement:
         if lost := quantities - row.differences.keys():

@@ -89,7 +89,7 @@ def _reached(reach: Reach) -> list[str]:
     share = reach.reached
     said = [
         f"alpha between frames {reach.alpha.value:.2f} is {share.value:.0%} ({share.low:.0%} to {share.high:.0%})"
-        f" of the {reach.ceiling.value:.2f} that {reach.by} allow"
+        f" of its ceiling, {reach.ceiling.value:.2f} by {reach.by}"
     ]
     if (worst := reach.worst) is not None:
         said.append(f"worst class {worst.name} {_class_share(worst)}")

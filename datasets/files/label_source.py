@@ -173,11 +173,12 @@ def label_space(options: FileOptions, folder: Path, name: str, source: LabelSour
 
     None where nothing says it. Raises ConfigError for one that cannot be used.
     """
-    beside = next(iter(source.files.values())).parent / LABEL_SPACE_FILE
     if name in options.taxonomies:
         return LabelSpace.load(options.taxonomies[name])
-    if beside.is_file():
-        return LabelSpace.load(beside)
+    frame, file = next(iter(source.files.items()))
+    for parent in file.parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
+        if (beside := parent / LABEL_SPACE_FILE).is_file():
+            return LabelSpace.load(beside)
     try:
         if options.classes is not None:
             return LabelSpace(name="classes of the scene", classes=options.classes)

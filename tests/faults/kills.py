@@ -123,19 +123,20 @@ def main(count: int, seed: int) -> None:
             finished(words(base / kind), base / "log")
             seconds[kind] = time.monotonic() - started
             whole[kind] = left(base / kind)
-        for k in range(count):
-            kind, birth = list(made)[k % len(made)], (k // len(made)) % 2 == 0
-            (words, left), out = made[kind], base / f"{kind}{k}"
-            moment = rng.random() * (0.03 if birth else seconds[kind])
-            wait = functools.partial(until_birth, out, moment) if birth else functools.partial(time.sleep, moment)
-            at_work = killed(words(out), base / "log", wait)
-            finished(words(out), base / "log")
-            told[f"{kind}, {'birth' if birth else 'later'}{'' if at_work else ', had ended'}"] += 1
-            if left(out) != whole[kind]:
-                wrong.append(f"{kind} {k}: differs after a kill at {moment:.3f} s{' of its birth' if birth else ''}")
+        with contextlib.suppress(KeyboardInterrupt):  # says what it has come to
+            for k in range(count):
+                kind, birth = list(made)[k % len(made)], (k // len(made)) % 2 == 0
+                (words, left), out = made[kind], base / f"{kind}{k}"
+                moment = rng.random() * (0.03 if birth else seconds[kind])
+                wait = functools.partial(until_birth, out, moment) if birth else functools.partial(time.sleep, moment)
+                at_work = killed(words(out), base / "log", wait)
+                finished(words(out), base / "log")
+                told[f"{kind}, {'birth' if birth else 'later'}{'' if at_work else ', had ended'}"] += 1
+                if left(out) != whole[kind]:
+                    wrong.append(f"{kind} {k}: differs, killed at {moment:.3f} s{' of its birth' if birth else ''}")
     for what, times in sorted(told.items()):
         print(f"{times:3} {what}")
-    print(f"{count - len(wrong)} of {count} left what one without a kill leaves")
+    print(f"{told.total() - len(wrong)} of {told.total()} left what one without a kill leaves")
     for line in wrong:
         print(line)
     sys.exit(1 if wrong else 0)

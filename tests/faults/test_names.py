@@ -7,12 +7,13 @@ import shutil
 import pytest
 import tiny_scene
 import yaml
-from command_line import bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from posed_config import configure
+from typer.testing import CliRunner
 
 import semstab
+from semstab.cli import app
 from semstab.engine.folder import require_file_names
 from semstab.errors import ConfigError
 from semstab.model.results import Unit, slug
@@ -66,10 +67,12 @@ def test_every_hostile_name_gets_results_of_its_own(tmp_path) -> None:
     assert again.manifest["units"]["kept"] == len(files)
 
 
-def test_a_study_is_kept_below_studies_whatever_its_name(tmp_path) -> None:
+def test_a_study_is_kept_below_studies_whatever_its_name(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
     tiny_scene.write(tmp_path / "wall")
     content = {"name": "../../escape", "dataset": {"name": "posed_folder", "options": {"root": "wall"}}}
     (tmp_path / "study.yaml").write_text(yaml.safe_dump({**content, "backends": ["numpy"], "backbones": ["a"]}))
-    bench("study", "study.yaml", "--report", "off", "--quiet", cwd=tmp_path)
+    done = CliRunner().invoke(app, ["study", "study.yaml", "--report", "off", "--quiet"])
+    assert done.exit_code == 0, done.stderr
     assert len(list((tmp_path / "studies").iterdir())) == 1
     assert not list(tmp_path.parent.parent.glob("escape"))

@@ -6,12 +6,17 @@ from collections.abc import Iterator, Sequence
 
 from semstab.model.statistics import LagBin, MapStatistics
 
-AXES = (("angle", "degrees"), ("time", "frames"), ("baseline", "metres"), ("range", "times the range"))
+AXES = (
+    ("angle", "degrees between the views"),
+    ("time", "frames apart"),
+    ("baseline", "metres between the cameras"),
+    ("range", "ratio of the ranges"),
+)
 
 
 def looks_report(found: MapStatistics) -> str:
     """The verdict, and agreement by how far apart two looks at a place are, in Markdown."""
-    return "\n".join([f"**{found.verdict.level}**: {found.verdict.line}", "", *_correlogram(found)])
+    return "\n".join([found.verdict.line, "", *_correlogram(found)])
 
 
 def _correlogram(found: MapStatistics) -> Iterator[str]:
@@ -21,7 +26,7 @@ def _correlogram(found: MapStatistics) -> Iterator[str]:
     for axis, unit in AXES:
         bins: Sequence[LagBin] = getattr(found.correlogram, axis)
         if bins:
-            yield from ("", f"| {unit} apart | alpha | 95% | ceiling |", "|---|---|---|---|")
+            yield from ("", f"| {unit} | alpha | 95% | ceiling |", "|---|---|---|---|")
             for row in bins:
                 alpha = row.alpha
                 yield (

@@ -215,9 +215,10 @@ class Recording(Observer):
         try:
             stream.flush()
         except RuntimeError as error:
+            what = "did the viewer go away?" if self.target.live else "is the disk full?"
             raise ConfigError(
-                f"{self.target.file}: the recording is not whole ({one_line(error)}; is the disk full?); all else is"
-                " kept: free some space, and the same command makes it again"
+                f"{self.target.file}: the recording is not whole ({one_line(error)}; {what}); all else is kept, and the"
+                " same command makes it again"
             ) from error
         finally:
             stream.disconnect()
