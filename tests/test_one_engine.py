@@ -83,7 +83,7 @@ def test_every_folder_has_tables_figures_and_a_report_unless_told_otherwise(root
     out = bench(*data, "--out", "bare", "--report", "off", cwd=tmp_path).stdout
     assert "report" not in out
     assert {path.name for path in (tmp_path / "bare").iterdir()} == {
-        "config.yaml", "manifest.json", "summary.json", "units", "voxels", "frames", "influence", "overview"
+        "config.yaml", "manifest.json", "summary.json", "units", "voxels", "frames", "influence", "looks", "overview"
     }  # fmt: skip
     refused = bench(*data, "--report", "maybe", cwd=tmp_path, code=2)
     assert refused.stderr == "error: --report maybe: write on or off\n"

@@ -20,6 +20,7 @@ from semstab import backends
 from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
 from semstab.model.measures import SBD_MAX, VSS, measures
+from semstab.model.palette import palette
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.averages import ENOUGH, describe, levels
 from semstab.outputs.plots import figures, topdown
@@ -369,3 +370,35 @@ def test_matplotlib_is_imported_only_when_something_is_drawn():
     heavy = "{'matplotlib', 'jinja2', 'PIL'}"
     code = f"import sys, semstab.outputs.plots, semstab.outputs.report; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- What is shown ----------------------------------------------------------------------------------------------------
+
+
+def test_colours_are_as_many_as_classes_and_each_is_unlike_the_others() -> None:
+    colors = np.array(palette(60))
+    assert len(np.unique(colors, axis=0)) == 60
+    apart = np.linalg.norm((colors[:, None] - colors[None]).astype(float), axis=2) + 1e9 * np.eye(60)
+    assert apart.min() > 20
+    assert palette(60)[:8] == palette(8)
+
+
+def test_a_room_is_cut_open_beneath_its_ceiling_and_a_wall_is_seen_from_the_side() -> None:
+    x, y = (index.ravel() for index in np.meshgrid(range(20), range(20)))
+    floor, ceiling = np.stack([x, y, 0 * x], axis=1), np.stack([x, y, 0 * x + 15], axis=1)
+    room = FromAbove.of(table_at(np.concatenate([floor, ceiling])), (0, 0, 1))
+    assert room.view.startswith("from above, cut open at")
+    assert (room.table.iz == 0).all()
+    assert FromAbove.of(table_at(floor), (0, 0, 1)).view == "from above"
+    assert FromAbove.of(table_at(np.stack([x, 0 * x, y], axis=1)), (0, 0, 1)).view == "from the side"
+
+
+def table_at(index) -> VoxelTable:
+    """Voxels of 0.1 m at these indices (n, 3), sorted."""
+    index = index[np.lexsort(index.T[::-1])].astype(np.int32)
+    n, ones = len(index), np.ones(len(index), dtype=np.int64)
+    return VoxelTable(
+        ix=index[:, 0], iy=index[:, 1], iz=index[:, 2], op=ones, evidence=np.tile([1.0, 0.0], (n, 1)),
+        drift_sum=np.zeros(n), pixels=ones, first_frame=0 * ones, last_frame=0 * ones, self_sum=np.ones(n),
+        frame_entropy_sum=np.zeros(n), voxel_size=0.1,
+    )  # fmt: skip

@@ -82,22 +82,22 @@ def test_errors_that_reach_as_far_as_the_scene_decide_nothing():
 
 
 def test_frames_of_uneven_quality_widen_what_is_said_of_the_next_flight():
-    sums = simulated(frames=48, looks=48, quality="bad", side=32)
+    sums = simulated(frames=64, looks=64, quality="bad", side=32)
     here, next_one = estimate(sums, "alpha", question=THIS_MAP), estimate(sums, "alpha")
     assert next_one.high - next_one.low > 1.5 * (here.high - here.low)
-    assert (here.question, next_one.question, next_one.frames) == (THIS_MAP, NEXT_FLIGHT, 48)
+    assert (here.question, next_one.question, next_one.frames) == (THIS_MAP, NEXT_FLIGHT, 64)
     assert next_one.decided
 
 
 def test_where_frames_are_alike_the_next_flight_is_like_this_one():
-    sums = simulated(frames=48, looks=48, side=32)
+    sums = simulated(frames=64, looks=64, side=32)
     here, next_one = estimate(sums, "alpha", question=THIS_MAP), estimate(sums, "alpha")
     assert next_one.high - next_one.low == pytest.approx(here.high - here.low, rel=0.25)
 
 
 def test_few_frames_and_no_frames_say_so():
     few = estimate(simulated(frames=8, looks=4), "alpha")
-    assert "fly 40 or more" in few.undecided
+    assert "fly 60 or more" in few.undecided
     sums = simulated(frames=8, looks=4)
     without = estimate(sums.coarsened(sums.edge, 0), "alpha")
     assert without.question == THIS_MAP
@@ -105,7 +105,7 @@ def test_few_frames_and_no_frames_say_so():
 
 
 def test_every_number_has_an_interval_around_it():
-    sums = simulated(frames=48, looks=6, quality="uneven")
+    sums = simulated(frames=64, looks=6, quality="uneven")
     for key, k in [(key, None) for key in ("psa", "vss", "entropy", "accuracy", "look_accuracy", "wrong_of_stable")] + [
         ("alpha", 0),
         ("accuracy", 1),
@@ -119,12 +119,12 @@ def test_every_number_has_an_interval_around_it():
 
 
 def test_a_map_does_not_differ_from_itself_and_a_worse_one_does():
-    sums = simulated(frames=48, looks=48, side=32)
+    sums = simulated(frames=64, looks=64, side=32)
     same = difference(sums, sums, "psa")
     assert same.value == 0
     assert same.low < 0 < same.high
     rng = np.random.default_rng(0)
-    flight = Flight(frames=48, looks=48, side=32)
+    flight = Flight(frames=64, looks=64, side=32)
     over = world(flight, rng)
     worse = sums_of(fly(flight, over, rng, ease=0.4), over)
     found = difference(sums, worse, "alpha")
@@ -134,7 +134,7 @@ def test_a_map_does_not_differ_from_itself_and_a_worse_one_does():
 
 def test_places_and_frames_are_paired_where_both_maps_have_them():
     """One scene and the same bad frames for both: what they share does not blur the difference."""
-    flight = Flight(frames=48, looks=48, side=32, quality="bad")
+    flight = Flight(frames=64, looks=64, side=32, quality="bad")
     over = world(flight, np.random.default_rng(0))
     pair = [sums_of(fly(flight, over, np.random.default_rng(1), ease=ease), over) for ease in (1.0, 0.8)]
     paired, apart = difference(*pair, "alpha"), difference(*pair, "alpha", same_frames=False)
@@ -166,8 +166,8 @@ def covered(row: Row) -> bool:
     [
         (Flight(side=64, reach=2.0), THIS_MAP),
         (Flight(side=64, reach=4.0, ease=2.0), THIS_MAP),
-        (Flight(24, 1.5, 1.0, 40, 40, "bad"), NEXT_FLIGHT),
-        (Flight(24, 1.5, 1.0, 40, 5, "uneven"), NEXT_FLIGHT),
+        (Flight(24, 1.5, 1.0, 60, 60, "bad"), NEXT_FLIGHT),
+        (Flight(24, 1.5, 1.0, 60, 5, "uneven"), NEXT_FLIGHT),
     ],
 )
 def test_intervals_hold_what_they_are_about(flight, question):

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import yaml
 
 from semstab.errors import ConfigError, DataError
+from semstab.model.palette import Color, palette
 from semstab.runtime.files import MAX_YAML_BYTES, parse_yaml, read_limited, write_text
 
 IGNORE_8BIT = 255
@@ -24,15 +25,6 @@ LEFT_OUT = -1
 """The row of a name that a label space ignores."""
 UNKNOWN = -1
 """In a mapping's table: an id that the source label space does not have."""
-
-# Paul Tol's 'bright' and 'muted' schemes: distinguishable with any colour vision.
-PALETTE = (
-    (68, 119, 170), (238, 102, 119), (34, 136, 51), (204, 187, 68), (102, 204, 238), (170, 51, 119), (187, 187, 187),
-    (51, 34, 136), (136, 204, 238), (68, 170, 153), (17, 119, 51), (153, 153, 51), (221, 204, 119), (204, 102, 119),
-    (136, 34, 85), (170, 68, 153),
-)  # fmt: skip
-
-Color = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -61,7 +53,7 @@ class LabelSpace:
         if K < 2:
             raise ConfigError(f"taxonomy {self.name}: {K} class; stability needs at least 2 (entropy divides by log K)")
         object.__setattr__(self, "ids", self.ids or tuple(range(K)))
-        object.__setattr__(self, "colors", self.colors or tuple(PALETTE[k % len(PALETTE)] for k in range(K)))
+        object.__setattr__(self, "colors", self.colors or palette(K))
         object.__setattr__(self, "members", self.members or ((),) * K)
         for what in ("ids", "colors", "members"):
             if len(getattr(self, what)) != K:
@@ -106,7 +98,7 @@ class LabelSpace:
             classes=tuple(entry["name"] for entry in entries),
             ids=_ids(entries, where),
             colors=tuple(
-                _color(entry.get("color", PALETTE[k % len(PALETTE)]), where) for k, entry in enumerate(entries)
+                _color(entry.get("color", palette(len(entries))[k]), where) for k, entry in enumerate(entries)
             ),
             members=tuple(_names(entry.get("members", []), where) for entry in entries),
             ignored=_names(content.get("ignored", []), where),

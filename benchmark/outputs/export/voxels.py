@@ -15,8 +15,9 @@ from semstab.config import nearest
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import categories
 from semstab.metrics.matching import rows_of
+from semstab.model import palette as colors
 from semstab.model.georeference import Georeference
-from semstab.model.labels import PALETTE, name_key
+from semstab.model.labels import name_key
 from semstab.model.measures import dominant, measures
 from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
@@ -162,5 +163,5 @@ def _colors(overview: Path, K: int) -> npt.NDArray[np.uint8]:
     try:
         palette = Overview.load(overview).palette
     except DataError:
-        palette = np.array([PALETTE[k % len(PALETTE)] for k in range(K)], dtype=np.uint8)
+        palette = np.array(colors.palette(K), dtype=np.uint8)
     return palette

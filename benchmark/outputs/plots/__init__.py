@@ -82,7 +82,8 @@ def _overview(record: Record, up: tuple[float, float, float], views: Views, path
     return Figure(
         slug("overview", scene, backbone),
         f"Overview: {scene}, {backbone}",
-        "A frame, its prediction, and the map that all sampled frames were fused into, seen from above: the dominant"
+        "A frame, its prediction, and the map that all sampled frames were fused into, seen from above, beneath a"
+        " ceiling where there is one, or from the side where more of it shows: the dominant"
         " class of the topmost voxels, in the prediction's colours.",
         f"A camera image of {scene}, the classes that {backbone} predicts for it, and the fused map from above in the"
         " same colours.",
@@ -135,7 +136,8 @@ def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
             yield Figure(
                 slug("stability_map", scene, backbone),
                 f"Stability from above: {scene}, {backbone}",
-                "The topmost voxel of each column along the up axis: its stability category and every measure; grey:"
+                "The topmost voxel of each column along the up axis, beneath a ceiling where there is one, or of a wall"
+                " the foremost: its stability category and every measure; grey:"
                 " seen once, which says nothing. Values beyond a scale look like its end.",
                 f"Maps of {scene} from above with the stability category and each measure of {backbone}'s voxels.",
                 partial(_draw_map, record, result.up[scene], views),

@@ -34,7 +34,7 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
         _draw_curves(axes, {name: found[measure.key] for name, found in scenes.items()}, everything[measure.key])
         label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
         unit = f" ({measure.unit})" if measure.unit else ""
-        axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(None, 1.0))
+        axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(0.0, 1.02))
         mark_panel(axes, letter, f"{label}, voxels with OP ≥ {measure.lowest_op}" if measure.lowest_op > 1 else label)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
@@ -45,10 +45,17 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
 def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
     """One curve a scene, and a dashed one of all recurrent voxels, where there are any."""
     for k, (name, found) in enumerate(scenes.items()):
-        axes.step(found.values, found.ecdf(), where="post", color=color(k), label=name)
+        axes.step(found.values, found.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
     recurrent = everything.ecdf(RECURRENT)
     if recurrent[-1]:
-        axes.step(everything.values, recurrent, "k--", where="post", linewidth=1.0, label="OP ≥ 3, all scenes")
+        axes.step(
+            everything.values,
+            recurrent,
+            "k--",
+            where="post",
+            linewidth=1.0,
+            label="voxels with OP ≥ 3" + (", all scenes" if len(scenes) > 1 else ""),
+        )
 
 
 def informative(units: Iterable[Histograms]) -> dict[str, float]:

@@ -54,7 +54,7 @@ def _agreement(judged: Judged) -> Iterator[Figure]:
             "temporal_agreement",
             "Agreement of the frames, with intervals",
             "Pairwise agreement (PSA) and Krippendorff's alpha of the voxels seen twice or more, with intervals at"
-            " 95% from a bootstrap over blocks of space. Dotted: alpha from which conclusions are tentative (0.667),"
+            " 95% for this map. Dotted: alpha from which conclusions are tentative (0.667),"
             " and from which data are reliable (0.8).",
             "Two panels with one interval a scene and backbone: pairwise agreement and Krippendorff's alpha.",
             lambda: draw_intervals(

@@ -43,6 +43,9 @@ RIGHT_COLORS = (
 )
 """What is known of a voxel, in Okabe and Ito's colours."""
 
+LEGEND_LINE, LEGEND_KEY, LEGEND_LETTER = 0.15, 0.5, 0.066
+"""Inches of a legend: height of a line; width of a key with its margins, and of a letter."""
+
 WIDE = 1.4
 """A map this many times as wide as high or more has its panels beneath each other."""
 
@@ -56,7 +59,8 @@ def draw_stability(above: FromAbove) -> Figure:
     for axes, measure in zip(panels, shown, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
         _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
-    titles = ("stability", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
+    where = "" if above.view == "from above" else f", {above.view}"
+    titles = (f"stability{where}", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         _frame(axes)
@@ -144,15 +148,23 @@ def draw_overview(above: FromAbove, overview: Overview) -> Figure:
         mark_panel(panel, letter, f"{title}, frame {overview.frame}")
     label = dominant(table)
     axes[-1].imshow(_painted(rows, label, palette), interpolation_stage="rgba")
-    mark_panel(axes[-1], "abc"[len(images)], "fused, from above")
+    mark_panel(axes[-1], "abc"[len(images)], f"fused, {above.view}")
     for panel in axes:
         _frame(panel)
     _scale_bar(axes[-1], rows.shape[1], above.cell)
     names = table.classes or tuple(str(k) for k in range(table.K))
-    shown = {int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K}
-    entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in sorted(shown)]
-    figure.legend(handles=_handles(entries), loc="outside lower center", ncols=min(8, len(entries)))
+    shown = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
+    entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
+    columns = legend_columns([name for name, _ in entries])
+    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * math.ceil(len(entries) / columns))
+    figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
     return figure
+
+
+def legend_columns(names: Sequence[str]) -> int:
+    """So many columns of a legend with these names fit the page."""
+    longest = max(len(name) for name in names)
+    return max(1, min(len(names), int(PAGE / (LEGEND_KEY + LEGEND_LETTER * longest))))
 
 
 def _panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
@@ -207,11 +219,18 @@ def _draw_measure(
     image = colors.to_rgba(np.ma.masked_invalid(values[rows]), bytes=True)
     image[rows == EMPTY, :3] = BLANK
     axes.imshow(image, interpolation_stage="rgba")
-    _color_bar(figure, axes, colors)
+    _color_bar(figure, axes, colors, extend=_beyond(values, ends))
 
 
-def _color_bar(figure: Figure, axes: Axes, colors: ScalarMappable) -> Colorbar:
-    bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03)
+def _beyond(values: Float64, ends: tuple[float, float]) -> str:
+    """At which ends of a scale there are values beyond it: a colour bar has an arrow there."""
+    with np.errstate(invalid="ignore"):
+        below, above = bool(np.any(values < ends[0] - 1e-9)), bool(np.any(values > ends[1] + 1e-9))
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
+
+
+def _color_bar(figure: Figure, axes: Axes, colors: ScalarMappable, extend: str = "neither") -> Colorbar:
+    bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03, extend=extend)
     bar.outline.set_linewidth(0.4)
     return bar
 

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+APART = 0.06
+"""Of a step along the x axis: series that have the same values lie beside each other."""
+
+
 def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
     """The recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
     shown = measures()
@@ -23,10 +27,11 @@ def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figu
     share, *panels = figure.subplots(rows, 3, squeeze=False).ravel()
     values = sorted({level.value for levels in backbones.values() for level in levels})
     for k, levels in enumerate(backbones.values()):
-        x = [values.index(level.value) for level in levels]
+        aside = APART * (k - (len(backbones) - 1) / 2)
+        x = [values.index(level.value) + aside for level in levels]
         draw_line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), marker="s")
         enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
-        at = [values.index(level.value) for level in enough]
+        at = [values.index(level.value) + aside for level in enough]
         for axes, measure in zip(panels, shown, strict=False):
             draw_line(axes, x, levels, over_all(measure), color(k))
             draw_line(axes, at, enough, over_recurrent(measure), color(k), open_=True)
@@ -36,7 +41,7 @@ def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figu
         mark_panel(axes, letter, title)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
-    share.set_ylim(bottom=0)
+    share.set_ylim(bottom=-0.04 * share.get_ylim()[1])
     figure.legend(handles=_legend(list(backbones)), loc="outside lower center", ncols=len(backbones) + 2)
     return figure
 
@@ -45,12 +50,13 @@ def mark_values(axes: Axes, sweep: Sweep, values: Sequence[float]) -> None:
     """The swept values along the x axis, at equal distances."""
     axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
     axes.set_xlim(-0.3, len(values) - 0.7)
+    axes.margins(y=0.1)  # a point at an axis' end is seen whole
     axes.set_xlabel(f"{sweep.title.split(',')[0]} ({sweep.unit})" if sweep.unit else sweep.title)
 
 
 def draw_line(
     axes: Axes,
-    x: Sequence[int],
+    x: Sequence[float],
     levels: Sequence[Level],
     measure: Callable[[Pooled], float],
     shade: str,

@@ -18,7 +18,14 @@ EMPTY = -1
 LARGEST = 2000
 """Cells of a map's longer side; a larger map gets cells of several voxels."""
 
-OUTLIERS = 0.002
+LID, LIDDED = 0.4, 0.2
+"""A map is cut open where more than the second share of its columns are covered by voxels of the upper part, the first
+share of its height, that have others below them at half of its height or more: a ceiling, or a shelf's board."""
+
+SLENDER = 2.0
+"""A map that is seen to be so many times as large from a side is shown from there: a wall, a facade."""
+
+OUTLIERS = 0.01
 """Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
 
 
@@ -66,20 +73,52 @@ def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tupl
     return cells, np.tile(np.arange(len(plane)), len(corners))
 
 
+def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], Float64, str]:
+    """Which voxels (n,) to look at, against which axis (3,), and what that view is called."""
+    right, ahead, up_axis = level_axes(up)
+    every = np.ones(len(table), dtype=np.bool_)
+    areas = [_area(table, axis) for axis in (up_axis, right, ahead)]
+    if max(areas[1:]) > SLENDER * areas[0]:
+        return every, -right if areas[1] > areas[2] else -ahead, "from the side"
+    heights = table.centers @ up_axis
+    low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
+    cut = high - LID * (high - low)
+    cells = np.floor(np.stack([table.centers @ right, table.centers @ ahead], axis=1) / table.voxel_size).astype(
+        np.int64
+    )
+    _, column = np.unique(cells, axis=0, return_inverse=True)
+    top, bottom = (np.full(column.max() + 1, end) for end in (-np.inf, np.inf))
+    np.maximum.at(top, column, heights)
+    np.minimum.at(bottom, column, heights)
+    covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
+    if np.mean(covered_columns) <= LIDDED or high - low < 4 * table.voxel_size:
+        return every, up_axis, "from above"
+    return heights <= cut, up_axis, f"from above, cut open at {cut:.3g} m"
+
+
+def _area(table: VoxelTable, axis: Float64) -> int:
+    """Cells that voxels cover, seen along an axis."""
+    right, ahead, _ = level_axes(axis)
+    plane = np.stack([table.centers @ right, table.centers @ ahead], axis=1)
+    return len(np.unique(np.floor(plane / table.voxel_size).astype(np.int64), axis=0))
+
+
 @dataclass(frozen=True, eq=False)
 class FromAbove:
-    """The voxels that are seen from above.
+    """The voxels that are seen from above, or from where more of them shows.
 
     table  these voxels alone
     shown  (n,) whether a voxel of the map is one of them
     rows   (H, W) the row of each cell's voxel in `table`, EMPTY where there is none
     cell   the edge of a cell in metres
+    view   what the view is called
     """
 
     table: VoxelTable
     shown: npt.NDArray[np.bool_]
     rows: Int64
     cell: float
+    view: str = "from above"
 
     @property
     def nbytes(self) -> int:
@@ -88,9 +127,11 @@ class FromAbove:
 
     @classmethod
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
-        """See `top_down`."""
-        rows, cell = top_down(table, up)
+        """See `best_view` and `top_down`."""
+        kept, axis, view = best_view(table, up)
+        rows, cell = top_down(rows_of(table, kept), axis)
+        rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(kept)[rows])
         shown = np.zeros(len(table), dtype=np.bool_)
         shown[rows[rows != EMPTY]] = True
         renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
-        return cls(rows_of(table, shown), shown, renumbered, cell)
+        return cls(rows_of(table, shown), shown, renumbered, cell, view)

@@ -44,6 +44,9 @@ CSS_INCH = 122
 """Pixels of the page an inch of a figure: its smallest type then is as large as the text of the tables."""
 
 
+ABSENT = "absent"
+"""What a table notes of a class that covers no voxel: the page names such classes in a line."""
+
 WORTH_A_PROCESS = 5.0
 """Seconds of work from which on figures are drawn by two processes."""
 
@@ -292,15 +295,18 @@ def _blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iter
 
 def _table(table: Table) -> dict[str, Any]:
     headers = [f"{column.header} {ARROWS[column.better]}".strip() for column in table.columns]
+    absent = [*dict.fromkeys(row[0] for _, rows in sections(table) for row in rows if row[-1] == ABSENT)]
+    left_out = f" Absent: {', '.join(absent)}." if absent else ""
     return {
         "name": table.name,
         "title": relations(table.title),
-        "caption": relations(table.caption),
+        "caption": relations(table.caption + left_out),
         "headers": [relations(header) for header in headers],
         "over": _runs([relations(column.over) for column in table.columns]),
         "numeric": [column.digits is not None for column in table.columns],
         "sections": [
-            (relations(name), [[_cell(cell) for cell in row] for row in rows]) for name, rows in sections(table)
+            (relations(name), [[_cell(cell) for cell in row] for row in rows if row[-1] != ABSENT])
+            for name, rows in sections(table)
         ],
     }
 

@@ -18,7 +18,7 @@ from semstab.statistics.verdict import ADVICE
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
-INTERVALS = "In brackets: intervals at 95% from a bootstrap over blocks of space."
+INTERVALS = "In brackets: intervals at 95% for this map; those of verdicts for the next flight if 60 frames tell of it."
 SEEN_TWICE = "Over the voxels seen twice or more."
 
 T = TypeVar("T")

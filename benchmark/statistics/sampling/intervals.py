@@ -24,7 +24,7 @@ from semstab.statistics.sampling.influence import (
 
 Float64 = npt.NDArray[np.float64]
 
-LEAST_FRAMES = 40
+LEAST_FRAMES = 60
 """Of fewer frames nothing is said about the next flight: bad ones may all have been missed, and a quality that lasts
 looks constant."""
 
@@ -64,7 +64,6 @@ def difference(
                  paired if both maps have the same
     Each map counts with all its voxels: those of the cubes that only one holds add to the variance.
     """
-    from scipy import stats
 
     a, b = aligned(a, b)
     found = value(a, key, k) - value(b, key, k)
@@ -79,8 +78,9 @@ def difference(
     if spread.total <= TINY:
         ends = [estimate(sums, key, k, question, level) for sums in (a, b)]
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    p = 2 * stats.t.sf(abs(found) / math.sqrt(spread.total), spread.degrees) if spread.total > TINY else math.nan
-    return dataclasses.replace(_interval(found, low, high, one.minus(other), spread, question), p_value=float(p))
+    return dataclasses.replace(
+        _interval(found, low, high, one.minus(other), spread, question), p_value=_p_value(found, spread)
+    )
 
 
 def of_places(
@@ -166,6 +166,15 @@ def _ends(found: float, spread: TwoWay, unseen: float, scale: Scale, level: floa
         return found - half, found + half
     ratio = min(half / (1 - found), 30.0)
     return 1 - (1 - found) * math.exp(ratio), 1 - (1 - found) * math.exp(-ratio)
+
+
+def _p_value(found: float, spread: TwoWay) -> float:
+    """That a number of that spread is 0, two-sided, by Student's t."""
+    from scipy import stats
+
+    if spread.total <= TINY:
+        return math.nan
+    return float(2 * stats.t.sf(abs(found) / math.sqrt(spread.total), spread.degrees))
 
 
 def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay, question: Question) -> Interval:

@@ -20,8 +20,9 @@ Float64 = npt.NDArray[np.float64]
 REACHES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """How far errors may reach, in cells, besides not at all."""
 
-ALONE = (0.0, 0.5)
-"""Shares of a cell's variance that it may have for itself."""
+ALONE, DOUBT = (0.0, 0.5), 2.0
+"""Shares of a cell's variance that it may have for itself, and by how much the log likelihood must be better for that:
+a weak correlation that reaches far is seldom real, and leaves hardly anything to say."""
 
 ROUNDING = 1e-13
 """Influences below are rounding's."""
@@ -116,6 +117,7 @@ class Arrangement:
                 if left <= 0:
                     continue
                 likely = -0.5 * (float(np.log(v).sum()) + math.log(within) + (self.count - 1) * math.log(left))
+                likely -= DOUBT if alone else 0.0
                 if likely > best:
                     best, found, share = likely, model, alone
         return found.reach, (1 - share) * found.matrix + share * np.eye(self.count)
