@@ -89,9 +89,15 @@ def fuse_by_rule(chunk, starts, log, K, entries, rule, floor, own, drift_sum):
     )
     total, before, after, now = np.empty(K + 1), np.empty(K + 1), np.empty(K + 1), np.empty(K + 1)
     pooled = rule >= 2
+    unanimous = np.full((most + 1, 3), np.nan)  # by T: drift, belief and rest where all say the same with certainty
     for i in range(chunk, starts.shape[0] - 1, CHUNKS):
         T = starts[i + 1] - starts[i]
         A, _ = load(log, starts[i], T, number, at, column, share)
+        same = A == 1 and share[: at[T]].min() == 1.0
+        if same and not np.isnan(unanimous[T, 0]):
+            drift_sum[i], belief[first[i]], rest[i] = unanimous[T, 0], unanimous[T, 1], unanimous[T, 2]
+            label[first[i]] = log[1][log[0][starts[i]]]
+            continue
         total[: A + 1] = 0.0
         others = K - A
         for t in range(T):
@@ -127,6 +133,8 @@ def fuse_by_rule(chunk, starts, log, K, entries, rule, floor, own, drift_sum):
                 before[a] = after[a]
             drift_sum[i] += min(max(step, 0.0), 1.0)
         rest[i] = after[A]
+        if same:
+            unanimous[T, 0], unanimous[T, 1], unanimous[T, 2] = drift_sum[i], after[0], after[A]
         for e in range(at[T]):
             k = np.int64(log[1][log[0][starts[i]] + e])
             number[k] = column[e]

@@ -93,7 +93,7 @@ def test_names_that_no_terminal_and_no_format_likes_are_reported_whole(tmp_path)
     truth = [np.tile(((np.arange(8) + i) // 4 % 3).astype(np.uint8), (6, 1)) for i in range(3)]
     frames = [tiny_scene.frame(i, labels) for i, labels in enumerate(truth)]
     sources = dict.fromkeys(("net $x^{", "=cmd", "[b]"), frames)
-    root = write_posed(tmp_path / "[/x] ä", ["a", "b", "c"], sources, classes=["$x^{ $", "=wall", "[/x]"], up_axis="-y")
+    root = write_posed(tmp_path / "[x] ä", ["a", "b", "c"], sources, classes=["$x^{ $", "=wall", "[/x]"], up_axis="-y")
     words = ["--data", root, "--backend", "numpy", "--check", "none", "--rerun", "off", "--report", "off"]
     done = subprocess.run(
         [sys.executable, "-m", "semstab", *words, "--out", "run"],
@@ -102,7 +102,7 @@ def test_names_that_no_terminal_and_no_format_likes_are_reported_whole(tmp_path)
     assert done.returncode == 0, done.stderr
     assert "[b]" in done.stdout
     assert "net $x^{" in done.stdout
-    assert r"[/x] \xe4" in done.stdout
+    assert r"[x] \xe4" in done.stdout
     cells = [to_csv(table) for table in tables(load_result(tmp_path / "run"))]
     assert any(",'=wall," in text for text in cells)
     assert not [line for text in cells for line in text.splitlines() if line.startswith("=")]

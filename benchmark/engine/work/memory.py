@@ -44,7 +44,7 @@ def require_memory(task: Task, config: Config, first: Frame) -> None:
     free = available_bytes() if config.memory_gb is None else int(config.memory_gb * GB)
     frames = len(task.indices)
     voxels = DOUBT * frames * len(_pixels(task, config).observe(first.every(2)).key)
-    if _expected(task, config, voxels, voxels).bytes <= free:
+    if _expected(task, config, voxels, voxels, soft=first.scores is not None).bytes <= free:
         return
     expected = estimate(task, config)
     if expected.bytes <= free:
@@ -59,14 +59,16 @@ def estimate(task: Task, config: Config) -> Expected:
     average: too many where the camera comes back to a place.
     """
     pixels = _pixels(task, config)
-    seen, new = [], []
+    seen, new, soft = [], [], False
     for pair in _pairs(task.indices):
-        keys = [pixels.observe(read(task, index, config.pixel_stride)).key.copy() for index in pair]
+        frames_there = [read(task, index, config.pixel_stride) for index in pair]
+        keys = [pixels.observe(frame).key.copy() for frame in frames_there]
+        soft = soft or any(frame.scores is not None for frame in frames_there)
         seen += [len(key) for key in keys]
         new += [int(np.isin(keys[1], keys[0], invert=True).sum())] if len(keys) > 1 else []
     frames = len(task.indices)
     voxels = np.mean(seen) + (frames - 1) * (np.mean(new) if new else 0)
-    return _expected(task, config, int(voxels), int(frames * np.mean(seen)))
+    return _expected(task, config, int(voxels), int(frames * np.mean(seen)), soft=soft)
 
 
 def _pixels(task: Task, config: Config) -> Aggregator:
@@ -92,23 +94,23 @@ def _pairs(indices: Sequence[int]) -> list[Sequence[int]]:
     return [indices[start : start + 2] for start in starts]
 
 
-def _expected(task: Task, config: Config, voxels: int, observations: int) -> Expected:
+def _expected(task: Task, config: Config, voxels: int, observations: int, *, soft: bool) -> Expected:
     K = len(task.mapping.target)
     maps = sum(expected_bytes(name, voxels, observations, K) for name in task.backends)
-    logs = log_bytes(observations, K) if config.statistics or config.events else 0
+    logs = log_bytes(observations, K, soft=soft) if config.statistics or config.events else 0
     truth = expected_bytes(task.backends[0], voxels, observations, K) if config.statistics else 0
-    tables = (len(task.backends) + config.statistics) * result_bytes(voxels, K)
+    tables = (len(task.backends) + config.statistics) * result_bytes(voxels, K, soft=soft)
     return Expected(voxels, observations, maps + logs + truth + tables)
 
 
-def log_bytes(observations: int, num_classes: int) -> int:
-    """A log of observations: kept frame by frame, sorted by voxel, and put into other orders and rules."""
-    return observations * (32 * num_classes + 100)
+def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
+    """A log of observations: kept frame by frame, and sorted by voxel; of soft scores with most of the classes."""
+    return observations * (100 + (20 * num_classes if soft else 0))
 
 
-def result_bytes(voxels: int, num_classes: int) -> int:
-    """A voxel table, and what comes from it when it is measured and written: about twice its own columns."""
-    return 2 * voxels * (8 * num_classes + 90)
+def result_bytes(voxels: int, num_classes: int, *, soft: bool) -> int:
+    """A voxel table, and what comes from it when it is measured and written."""
+    return voxels * (120 + (10 * num_classes if soft else 0))
 
 
 def _keeps_observations(backend: str) -> bool:

@@ -169,6 +169,7 @@ class Pass:
                     row = self._integrate(one, now, fetched)
                     one.rows.append(self._told(one, now.frame, row))
                     one.observations += row.report.voxels
+                    one.soft = one.soft or now.frame.scores is not None
             if watched:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
         lost = {outcome.identity for outcome in self._outcomes}

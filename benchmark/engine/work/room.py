@@ -64,8 +64,8 @@ def end_bytes(one: UnitMap) -> int:
     """What measuring and writing a map takes beside what it takes already."""
     config, K = one.request.config, len(one.task.mapping.target)
     voxels = one.rows[-1].report.map_voxels
-    tables = (1 + (one.truth is not None)) * result_bytes(voxels, K)
-    return tables + (log_bytes(one.observations, K) if config.statistics or config.events else 0)
+    tables = (1 + (one.truth is not None)) * result_bytes(voxels, K, soft=one.soft)
+    return tables + (log_bytes(one.observations, K, soft=one.soft) if config.statistics or config.events else 0)
 
 
 def _bytes(one: UnitMap) -> int:

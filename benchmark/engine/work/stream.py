@@ -34,6 +34,7 @@ class UnitMap:
     reference  follows a sample of its voxels, where it is checked so
     sizes      maps of some frames at other voxel sizes
     hard       of soft scores, a map of each pixel's likeliest class
+    soft       whether the frames have scores
     """
 
     request: Request
@@ -47,6 +48,7 @@ class UnitMap:
     hard: FusionBackend | None = None
     rows: list[FrameRow] = field(default_factory=list)
     observations: int = 0
+    soft: bool = False
 
 
 @dataclass(frozen=True, eq=False)
