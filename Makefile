@@ -1,11 +1,12 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
 
-.PHONY: help setup setup-dev bench test faults lint format clean
+.PHONY: help setup setup-dev bench test fuzz fuzz-short faults lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types, import contract and the whole test suite'
+	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: a minute'
 	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, and see that none of it is lost'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
@@ -22,6 +23,15 @@ bench: setup
 
 test: setup-dev lint
 	$(BIN)/pytest -n auto --maxprocesses 4
+	$(BIN)/python tests/fuzz/fuzz.py --seconds 60 --seed 1
+
+FUZZ_SECONDS := 3600
+FUZZ_SEED := 1
+fuzz: setup-dev
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(FUZZ_SECONDS) --seed $(FUZZ_SEED)
+
+fuzz-short: setup-dev
+	$(BIN)/python tests/fuzz/fuzz.py --seconds 60 --seed 1
 
 faults: setup-dev
 	$(BIN)/python tests/faults/kills.py 100

@@ -2,6 +2,7 @@
 
 import re
 
+EXCEPTION_NAMES = re.compile(r"\b\w+(?:Error|Exception): ")
 TERMINAL_CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 LONGEST = 200
@@ -57,6 +58,6 @@ def _escaped(text: str) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """What another library's error says, in bounds, without line breaks and colours; or its type."""
-    text = " ".join(TERMINAL_CODES.sub("", str(error)).split()) or type(error).__name__
+    """What another library's error says, in bounds, without line breaks, colours and names of exceptions."""
+    text = EXCEPTION_NAMES.sub("", " ".join(TERMINAL_CODES.sub("", str(error)).split())) or "no reason is given"
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -54,8 +54,8 @@ def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that ship for the dataset which the content names, or for the built-in one."""
     dataset = content.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else dataset
-    shipped = _shipped("datasets") / f"{name or 'city'}.yaml"
-    return read_yaml(shipped) if shipped.is_file() else {}
+    shipped = {path.stem: path for path in _shipped("datasets").glob("*.yaml")}.get(str(name or "city"))
+    return {} if shipped is None else read_yaml(shipped)
 
 
 def predicted_config(

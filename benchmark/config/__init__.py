@@ -232,10 +232,7 @@ class Config(Settings):
     @classmethod
     def build(cls, content: Mapping[str, Any], where: str = "configuration") -> Self:
         """Validate settings. Raises ConfigError that names `where`, the setting, the nearest known one."""
-        try:
-            return cls.model_validate(content)
-        except ValidationError as error:
-            raise ConfigError(f"{where}: {explain(error, cls)}") from error
+        return validated(cls, content, f"{where}: ")
 
     @property
     def sets_voxel_size(self) -> bool:

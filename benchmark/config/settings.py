@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, one_line
 from semstab.runtime.files import MAX_YAML_BYTES, parse_yaml, read_limited
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -53,6 +53,10 @@ def validated(model: type[Model], content: Any, where: str = "") -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         raise ConfigError(f"{where}{explain(error, model)}") from error
+    except UnicodeEncodeError as error:  # pydantic reads text as UTF-8; YAML's "\\ud800" is half a character
+        raise ConfigError(f"{where}{error.object[:80]!r} is no text ({error.reason})") from error
+    except TypeError as error:  # pydantic passes some groups on by name
+        raise ConfigError(f"{where}a setting has a name that is no text ({one_line(error)})") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:

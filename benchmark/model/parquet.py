@@ -49,7 +49,7 @@ def reading(path: str | Path) -> Iterator[None]:
 
     try:
         yield
-    except (OSError, LookupError, TypeError, ValueError, pa.ArrowException) as error:
+    except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
         raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
 
 

@@ -39,15 +39,10 @@ class Run:
         self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None
     ) -> pd.DataFrame:
         """The time series of a unit: one row a frame. Raises DataError where its file cannot be read."""
-        import pyarrow as pa
-        from pyarrow import csv
-
         file = self.result.record(scene=scene, backbone=backbone, backend=backend).series
-        try:
-            read = csv.read_csv(str(file))
-        except (OSError, pa.ArrowException) as error:
-            raise DataError(f"{file}: cannot be read ({one_line(error)})") from error
-        return tabular.to_pandas({name: read.column(name) for name in read.column_names})
+        if file is None:
+            raise DataError(f"{self.folder}: the run kept no series of this unit; run it again")
+        return read_series(file)
 
     def events(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Events:
         """The log of a unit's observations. Raises ConfigError where the run kept none."""
@@ -63,3 +58,21 @@ class Run:
 def load(folder: str | Path) -> Run:
     """A finished run from its folder. Raises DataError where it is not there or damaged."""
     return Run(Path(folder), load_result(folder))
+
+
+def read_series(file: Path) -> pd.DataFrame:
+    """The time series in a file: one row a frame. Raises DataError where it cannot be read."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    try:
+        read = csv.read_csv(str(file))
+        columns = {name: read.column(name) for name in read.column_names}
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        pa.ArrowException,
+    ) as error:  # LookupError: a name that is there twice
+        raise DataError(f"{file}: cannot be read ({one_line(error)})") from error
+    return tabular.to_pandas(columns)

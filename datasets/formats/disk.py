@@ -49,7 +49,8 @@ def file_digest(path: Path) -> bytes:
 
 def natural(name: str) -> tuple[list[str | int], str]:
     """Sort key with numbers by value: frame2 before frame10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
+    # a number has as many digits as Python turns into one; names of more are told apart by the whole
+    return [int(part[:4000]) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
 def subfolders(folder: Path) -> list[str]:

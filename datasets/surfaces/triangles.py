@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.datasets.formats.las_files import opened, points_at_once
 from semstab.datasets.surfaces.grids import Heights, heights_of_points, read_heights, require_same_projection
 from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
 from semstab.model.georeference import INSTALL, Georeference
@@ -64,15 +65,13 @@ def _raster(path: Path, cell: float | None, georeference: Georeference | None) -
 
 
 def _las(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
-    import laspy
-
     offset = np.zeros(3) if georeference is None else np.array(georeference.offset)
 
     def chunks() -> Iterator[Float64]:
-        with laspy.open(path) as file:
+        with opened(path) as file:
             if georeference is not None and (crs := file.header.parse_crs()) is not None:
                 require_same_projection(path, crs.to_wkt(), georeference)
-            for points in file.chunk_iterator(POINTS_AT_ONCE):
+            for points in file.chunk_iterator(points_at_once(file.header)):
                 yield np.stack([points.x, points.y, points.z], axis=1) - offset
 
     return _of_points(path, np.concatenate([*chunks(), np.zeros((0, 3))]), cell)
@@ -90,6 +89,8 @@ def _mesh(path: Path, cell: float | None, _: Georeference | None) -> Triangles:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertices = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
     faces = np.concatenate([np.asarray(mesh.faces) + start for mesh, start in zip(meshes, starts, strict=False)])
+    if (vertices.shape[1], faces.shape[1]) != (3, 3):
+        raise DataError(f"{path}: has vertices of {vertices.shape[1]} coordinates, and no triangles; export it again")
     if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise DataError(f"{path}: a triangle has corner {faces.max()}, but there are {len(vertices)}; export it again")
     faces = faces[np.isfinite(vertices).all(axis=1)[faces].all(axis=1)]
@@ -117,8 +118,6 @@ def _of_heights(heights: Heights, what: str) -> Triangles:
     vertices = np.stack([X.ravel()[used], Y.ravel()[used], z.ravel()[used]], axis=1)
     return Triangles(vertices, faces.reshape(-1, 3).astype(np.int32), what)
 
-
-POINTS_AT_ONCE = 2_000_000
 
 READERS: Mapping[str, Callable[[Path, float | None, Georeference | None], Triangles]] = {
     ".tif": _raster, ".tiff": _raster, ".las": _las, ".laz": _las,

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import ConfigError, DataError, SemstabError, one_line
+from semstab.datasets.formats.las_files import opened, points_at_once
+from semstab.errors import ConfigError, DataError
 from semstab.outputs.export import las, ply
 from semstab.outputs.export.lookup import NONE, VoxelLookup, for_points
 from semstab.outputs.export.voxels import Voxels
@@ -102,22 +103,17 @@ def _beside(cloud: Path, tally: Tally, lookup: VoxelLookup, *, georeferenced: bo
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
     library = las.library(cloud)
-    try:
-        with library.open(cloud) as reader:
-            _require_same_crs(voxels, reader.header, cloud)
-            header = _extended(reader.header, voxels)
-            compress = out.suffix.lower() == ".laz"
-            with library.open(out, mode="w", header=header, do_compress=compress) as writer:
-                for points in reader.chunk_iterator(CHUNK):
-                    writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
-                if (read := writer.header.point_count) < reader.header.point_count:
-                    raise DataError(f"{cloud}: ends after {read:,} of {reader.header.point_count:,} points")
-                if extended := _without_copc(reader.evlrs or ()):
-                    writer.write_evlrs(type(reader.header.vlrs)(extended))
-    except SemstabError:
-        raise
-    except (OSError, ValueError, library.errors.LaspyException, RuntimeError) as error:
-        raise DataError(f"{cloud}: cannot be read ({one_line(error)})") from error
+    with opened(cloud) as reader:
+        _require_same_crs(voxels, reader.header, cloud)
+        header = _extended(reader.header, voxels)
+        compress = out.suffix.lower() == ".laz"
+        with library.open(out, mode="w", header=header, do_compress=compress) as writer:
+            for points in reader.chunk_iterator(min(CHUNK, points_at_once(reader.header))):
+                writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
+            if (read := writer.header.point_count) < reader.header.point_count:
+                raise DataError(f"{cloud}: ends after {read:,} of {reader.header.point_count:,} points")
+            if extended := _without_copc(reader.evlrs or ()):
+                writer.write_evlrs(type(reader.header.vlrs)(extended))
 
 
 def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import DataError
+from semstab.errors import DataError, one_line
 from semstab.outputs.export.voxels import Voxels, crs_name
 from semstab.runtime.files import atomic_path
 
@@ -44,6 +44,15 @@ class Header:
     def read(cls, file: BinaryIO, path: Path) -> Header:
         """Of a cloud. Raises DataError for what is no binary PLY file of points alone, or one that is cut short."""
         lines = list(_header_lines(file, path))
+        try:
+            return cls._parsed(lines, file.tell(), path)
+        except DataError:
+            raise
+        except (LookupError, ValueError) as error:  # a word that is missing, no number, a name that is there twice
+            raise DataError(f"{path}: its header cannot be read ({one_line(error)}); save the cloud anew") from error
+
+    @classmethod
+    def _parsed(cls, lines: list[str], size: int, path: Path) -> Header:
         words = [line.split() for line in lines]
         form = next((word[1] for word in words if word[:1] == ["format"]), "")
         elements = [word for word in words if word[:1] == ["element"]]
@@ -60,7 +69,9 @@ class Header:
                 properties.append((word[2], ORDERS[form] + TYPES[word[1]]))
             elif word[0] != "comment":
                 raise DataError(f"{path}: '{' '.join(word)[:60]}' in its header cannot be read; save the cloud anew")
-        header = cls(np.dtype(properties), int(elements[0][2]), file.tell(), _comments(lines))
+        header = cls(np.dtype(properties), int(elements[0][2]), size, _comments(lines))
+        if header.count < 0:
+            raise DataError(f"{path}: has {header.count} points in its header; save the cloud anew")
         missing = {"x", "y", "z"} - set(header.dtype.names or ())
         if missing:
             raise DataError(f"{path}: its points have no {', '.join(sorted(missing))}")

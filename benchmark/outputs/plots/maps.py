@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 from collections.abc import Sequence
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.datasets.formats.arrays import decode_array
+from semstab.datasets.formats.disk import read_bytes
 from semstab.errors import DataError, one_line
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
 from semstab.model.measures import dominant, measures
@@ -123,10 +126,12 @@ class Overview:
         Raises DataError where the file is damaged or of another kind.
         """
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
-                color = content.get("color")
-                return cls(int(content["frame"]), content["labels"], color, content["palette"])
-        except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+            data = read_bytes(path)
+            frame, labels, palette = (decode_array(path, data, key) for key in ("frame", "labels", "palette"))
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                color = decode_array(path, data, "color") if "color.npy" in archive.namelist() else None
+            return cls(int(frame), labels, color, palette)
+        except (ValueError, TypeError) as error:
             raise DataError(
                 f"{path}: not a saved frame ({one_line(error)}); delete it, and it is made again"
             ) from error

@@ -166,7 +166,7 @@ class Looks:
             return cls(
                 cell, view.astype(np.int64), label.astype(np.int64), weight, drawn.astype(np.int64), views, **about
             )
-        except (OSError, LookupError, TypeError, ValueError, pa.ArrowException, DataError) as error:
+        except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of sampled looks ({one_line(error)})") from error
 
 

@@ -172,7 +172,7 @@ class InfluenceSums:
                 made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
                 found.append(made if own.any() or not number else None)
             whole, seen, limit = found
-        except (OSError, LookupError, TypeError, ValueError, pa.ArrowException, DataError) as error:
+        except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of influence sums ({one_line(error)})") from error
         assert whole is not None
         return dataclasses.replace(whole, seen=seen, limit=limit)
