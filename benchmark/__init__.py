@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from semstab.outputs.relabel import Belief, relabel
     from semstab.settings import load_config, load_study
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "Belief",

@@ -63,9 +63,11 @@ def select_frames(
 
 
 def _tell_missing(scene: Scene, paths: list[str], complete: int, selected: int, needs: Sequence[str]) -> None:
-    where = scene.folder or scene.name
+    where = str(scene.folder or scene.name)
     if not scene.skips_incomplete:
-        raise DataError(f"{where}: {listed(paths)}; add them, or set incomplete: skip to leave such frames out")
+        raise DataError(f"{where}: {listed(paths, where)}; add them, or set incomplete: skip to leave such frames out")
     if not complete:
-        raise DataError(f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths)})")
-    logger.warning("%s: %d of %d frames left out: %s", where, selected - complete, selected, listed(paths))
+        raise DataError(
+            f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths, where)})"
+        )
+    logger.warning("%s: %d of %d frames left out: %s", where, selected - complete, selected, listed(paths, where))

@@ -12,7 +12,7 @@ from simulated_events import log_of
 from wall_study import BACKBONES, wall_study
 
 from semstab.metrics import op, vss
-from semstab.model.statistics import BeyondCoin, Interval
+from semstab.model.statistics import BeyondCoin, Estimate, Interval
 from semstab.outputs.averages import ENOUGH, Level, describe, pooled
 from semstab.outputs.findings import (
     HARDLY,
@@ -140,6 +140,13 @@ def test_sbd_that_falls_from_stratum_to_stratum():
         "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5; lower by 0.0100 (0.0050 to 0.0150) than in random"
         " order for OP>=3."
     )
+
+
+def test_numbers_below_zero_are_said_the_other_way_round():
+    below = Estimate(-0.01, -0.015, -0.005)
+    against = dataclasses.replace(drifting((N, 2, 0.05), (N, 4, 0.02)), settling=below, disagreement=below)
+    assert "; higher by 0.0100 (0.0050 to 0.0150) than in random order" in falling_drift(against).numbers
+    assert more_disagreement(against).numbers.endswith("From OP=2 to OP>=3 PSA rises by 0.0100 (0.0050 to 0.0150).")
 
 
 def test_sbd_that_rises_once_does_not_fall():

@@ -27,8 +27,9 @@ from semstab.outputs.plots import figures, topdown
 from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
 from semstab.outputs.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
 from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability, scale_length
-from semstab.outputs.plots.style import COLUMN, DPI, PAGE
-from semstab.outputs.plots.sweeps import draw_sweep
+from semstab.outputs.plots.statistics import draw_agreement
+from semstab.outputs.plots.style import COLUMN, DPI, PAGE, legend_columns
+from semstab.outputs.plots.sweeps import LEAST_SPAN, draw_sweep
 from semstab.outputs.plots.topdown import EMPTY, FromAbove, level_axes, top_down
 from semstab.testing import SEQUENCES, as_frames, checks
 
@@ -248,6 +249,29 @@ def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
     assert [label.get_text() for label in share.get_xticklabels()] == ["0", "1"]
     shares = share.containers[0].lines[0].get_ydata()
     assert shares == pytest.approx([100 * level.mean(lambda p: p.recurrent.share) for level in found["calm"]])
+
+
+def test_a_small_difference_looks_small_and_no_bar_is_cut(walls):
+    found = {name: levels(walls, "depth_noise", name) for name in BACKBONES}
+    vss_axes, psa, alpha, drift = draw_agreement(describe("depth_noise"), found).axes
+    for axes, take in ((psa, lambda p: p.psa), (alpha, lambda p: p.alpha), (drift, lambda p: p.drift)):
+        low, high = axes.get_ylim()
+        expected = [level.interval(take) for rows in found.values() for level in rows]
+        assert all(low < e.low <= e.value <= e.high < high for e in expected)
+        drawn = [segment[:, 1] for c in axes.containers if c.has_yerr for segment in c.lines[2][0].get_segments()]
+        wide = [(e.low, e.high) for e in expected if e.low < e.high]
+        assert wide
+        assert all(any(bar == pytest.approx(ends) for bar in drawn) for ends in wide)
+    assert min(np.ptp(axes.get_ylim()) for axes in (vss_axes, psa, alpha)) >= LEAST_SPAN - 1e-9
+    share, stability, change, *_ = draw_sweep(describe("depth_noise"), found).axes
+    assert np.ptp(stability.get_ylim()) >= LEAST_SPAN - 1e-9
+    assert share.get_ylim()[0] < 0 < share.get_ylim()[1]
+    assert change.get_ylim()[0] <= 0
+
+
+def test_a_long_legend_takes_more_lines():
+    names = [f"a backbone with a long name {k}" for k in range(8)]
+    assert legend_columns(names, PAGE) < legend_columns(["a", "b", "c", "d", "e", "f", "g", "h"], PAGE) == 8
 
 
 def test_recurrent_values_of_few_voxels_are_not_drawn():

@@ -347,11 +347,25 @@ def test_the_voxel_that_flickers_is_the_first_suspect_with_the_frames_to_blame(t
             expected[view.index] = name
     lane = {row["frame"]: row["StateChange:state"][0] for row in rows["/s/flips/net/voxel_1"] if "frame" in row}
     assert lane == expected
+    numbers = {row["frame"]: row for row in rows["/s/camera/net/flips"]}
+    for view in alternating(6):
+        (H, W), found = view.shape, numbers[view.index]
+        at = np.reshape(found["Points2D:positions"], (-1, 2))
+        assert len(at) == len(found["Points2D:labels"])
+        assert np.all((at > 0) & (at < (W, H)))
     (report,) = (row["TextDocument:text"][0] for row in rows["/s/flips_report/net"])
     first, _, _ = report.partition("**voxel 2**")
     blamed = {int(frame) for frame in re.findall(r"- frame (\d+) \(0*\1\.png\): ", first)}
     assert blamed >= set(list(expected)[1:])
     assert 1 in blamed  # two classes are level then, so none of them flips, but no frame moved the belief more
+
+
+def test_a_number_is_drawn_where_it_lies_inside_the_image() -> None:
+    T_wc = np.array([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    seen_by = flips.Camera(np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]), T_wc, (80, 100))
+    pixels, inside = seen_by.project(np.array([[5.0, 0, 2], [5.2, 0.1, 2], [5.0, 0, -2], [5.98, 0, 2], [8, 0, 2]]))
+    assert inside.tolist() == [True, True, False, False, False]  # behind, at the edge, outside
+    np.testing.assert_allclose(pixels[:2], [[50.5, 40.5], [60.5, 45.5]])
 
 
 def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -> None:

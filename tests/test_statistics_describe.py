@@ -170,6 +170,13 @@ def test_the_interval_decides_the_level(low, high, level):
     assert judged(low, high).level == level
 
 
+def test_agreement_below_zero_is_no_share_of_anything():
+    line = judged(-0.2, -0.1, ceiling=0.9, classes=(of_class("tree", -0.2, -0.1),)).line
+    assert "alpha between frames -0.15, no better than chance, is -15%" in line
+    assert "worst class tree no better than chance, -15%" in line
+    assert "chance" not in judged(0.1, 0.2, ceiling=0.9).line
+
+
 def test_what_is_stably_wrong_is_not_called_stable():
     assert judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).level == "misleading"
     assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"

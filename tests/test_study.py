@@ -28,7 +28,7 @@ from semstab.model.records import Variation
 from semstab.model.results import Unit
 from semstab.runtime.json_form import to_json
 from semstab.settings import resolve
-from semstab.statistics import compare_backbones
+from semstab.statistics import Looks, compare_backbones
 from semstab.task import read
 
 
@@ -128,8 +128,9 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
     assert summary(tmp_path / "tight") == summary(tmp_path / "whole")
 
 
-def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path) -> None:
-    config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, memory_gb=0.00003)
+def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("semstab.engine.work.room.resident_bytes", lambda: 0)  # what is estimated counts alone
+    config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, memory_gb=0.00007)
     result = run_study(config, tmp_path / "out")
     assert {failure.variation.sweep for failure in result.failures} == {"base"}
     assert "would take" in result.failures[0].message
@@ -321,7 +322,9 @@ def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_p
     (found,) = result.comparisons
     maps = {record.unit.backbone: record.table() for record in result.select()}
     truth = maps.pop("gt")
-    expected = compare_backbones(maps, truth=truth, scene="wall")
+    looks = {record.unit.backbone: Looks.load(record.looks_file) for record in result.select()}
+    looks.pop("gt")
+    expected = compare_backbones(maps, truth=truth, looks=looks, scene="wall")
     assert to_json(found) == to_json(expected)
     assert {row.measure for row in found.paired.differences} >= {"psa", "alpha", "accuracy"}
     for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept

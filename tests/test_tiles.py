@@ -18,7 +18,7 @@ def noisy_frame(rng: np.random.Generator, index: int, shape: tuple[int, int], fa
     depth = (far * (0.2 + 0.8 * rng.random((H, 1)) * rng.random(W) ** 3)).astype(np.float32)
     depth[rng.random(shape) < 0.1] = 0
     labels = np.where(rng.random(shape) < 0.3, rng.integers(0, K, shape), 0)
-    dtype = np.uint8 if index % 2 else np.uint16
+    dtype = np.uint8 if index % 2 or far > 1000 else np.uint16
     labels[rng.random(shape) < 0.05] = np.iinfo(dtype).max  # ignored
     T_wc = np.eye(4)
     T_wc[:3, 3] = rng.normal(scale=0.3, size=3)

@@ -50,7 +50,7 @@ from semstab.runtime.json_form import from_json, to_json
 
 logger = logging.getLogger("semstab")
 
-LAYOUT = "# semstab, folder layout 2"
+LAYOUT = "# semstab, folder layout 3"
 """First line of config.yaml: a folder that begins otherwise is of another version."""
 
 SETTINGS = "config.yaml"

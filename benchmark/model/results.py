@@ -48,7 +48,7 @@ def slug(*names: str) -> str:
     long is cut, and a digest of the name follows.
 
     >>> slug("scene-1", "a b"), slug("scene-1", "a-b")
-    ('scene-1__a-b~8b9dcb43cd', 'scene-1__a-b')
+    ('scene-1__a-b~2847e54c57', 'scene-1__a-b')
     """
     return "__".join(map(_slug, names))
 

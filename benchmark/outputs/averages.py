@@ -29,7 +29,7 @@ class Pooled:
     classes    by dominant class, in order of appearance
     well_seen  the last stratum in parts, where most voxels are in it
 
-    Of the voxels with OP >= 2, macro means over the units, NaN where none has statistics:
+    Of the voxels with OP >= 2, macro means over the units with 95 % intervals, NaN where none has statistics:
     psa        pairwise semantic agreement
     alpha      Krippendorff's alpha
     drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
@@ -46,9 +46,9 @@ class Pooled:
     classes: tuple[Means, ...]
     well_seen: tuple[Means, ...]
     fuse_ms_per_frame: float
-    psa: float = math.nan
-    alpha: float = math.nan
-    drift: float = math.nan
+    psa: Estimate = UNDEFINED
+    alpha: Estimate = UNDEFINED
+    drift: Estimate = UNDEFINED
     drift_null: float = math.nan
     disagreement: Estimate = UNDEFINED
     settling: Estimate = UNDEFINED
@@ -57,7 +57,7 @@ class Pooled:
     @property
     def excess_drift(self) -> float:
         """SBD less that of the same observations in random order, bits."""
-        return self.drift - self.drift_null
+        return self.drift.value - self.drift_null
 
     @property
     def mean_op(self) -> float:
@@ -92,9 +92,9 @@ def pooled(records: Sequence[Record]) -> Pooled:
         classes=tuple(pool(rows, voxels) for rows in of_class),
         well_seen=tuple(split_last(tables)),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
-        psa=_macro(records, lambda found: found.agreement.psa),
-        alpha=_macro(records, lambda found: found.agreement.alpha),
-        drift=_macro(records, lambda found: found.drift.sbd),
+        psa=_estimate(records, lambda found: found.agreement.psa),
+        alpha=_estimate(records, lambda found: found.agreement.alpha),
+        drift=_estimate(records, lambda found: found.drift.sbd),
         drift_null=_macro(records, lambda found: found.drift.null),
         disagreement=_together(records, lambda found: found.beyond_coin.disagreement),
         settling=_together(records, lambda found: found.beyond_coin.settling),
@@ -114,6 +114,14 @@ def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
         for ends in ([e.low for e in found], [e.high for e in found])
     )
     return Estimate(value, value - below, value + above)
+
+
+def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
+    """As `_together`, of every unit that has a value; without an interval where one of them has none."""
+    found = [take(record.statistics) for record in records if record.statistics is not None]
+    if any(math.isnan(estimate.low) for estimate in found if not math.isnan(estimate.value)):
+        return Estimate(macro_mean([estimate.value for estimate in found]), math.nan, math.nan)
+    return _together(records, take)
 
 
 def _vss_error(records: Sequence[Record], voxels: int) -> float:
@@ -167,10 +175,16 @@ class Level:
         """The measure's mean over the repeats."""
         return self.spread(measure).mean
 
+    def interval(self, estimate: Callable[[Pooled], Estimate]) -> Estimate:
+        """An estimate's mean over the repeats, and the mean of their intervals: they err alike, in the same scenes."""
+        found = [estimate(repeat) for repeat in self.repeats]
+        value, low, high = (macro_mean(ends) for ends in zip(*((e.value, e.low, e.high) for e in found), strict=True))
+        return Estimate(value, low, high)
+
     @property
     def judged(self) -> bool:
         """Whether it has statistics that are defined."""
-        return not math.isnan(self.mean(lambda pooled: pooled.psa))
+        return not math.isnan(self.mean(lambda pooled: pooled.psa.value))
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,8 @@ def more_disagreement(voxels: Pooled) -> ClaimResult:
         return _untested("Too few places were seen by two frames, and by more, to tell it from a coin.")
     return _outcome(
         f"VSS {recurrent:.4f} for OP>=3 against {every:.4f} over all voxels: {100 * (1 - recurrent):.1f}% of the"
-        f" evidence disagrees, not {100 * (1 - every):.1f}%. From OP=2 to OP>=3 PSA falls by {_interval(beyond)}.",
+        f" evidence disagrees, not {100 * (1 - every):.1f}%. From OP=2 to OP>=3 PSA"
+        f" {_way(beyond, 'falls', 'rises')}.",
         [
             *([] if every - recurrent >= VISIBLE_VSS else ["The recurrent voxels agree as well as all voxels do."]),
             *(
@@ -166,7 +167,7 @@ def falling_drift(voxels: Pooled) -> ClaimResult:
         why.append("A coin tossed as often would show it: in random order SBD is no higher.")
     return _outcome(
         f"SBD {', '.join(f'{row[SBD]:.4f} at {row.name}' for row in strata)};"
-        f" lower by {_interval(voxels.settling)} than in random order for OP>=3.",
+        f" {_way(voxels.settling, 'lower', 'higher')} than in random order for OP>=3.",
         why,
     )
 
@@ -318,8 +319,11 @@ def _beyond_op(reference: Level, level: Level, sign: int = 1) -> float:
     return sign * (_vss(level) - expected) - max(noise, VISIBLE_VSS)
 
 
-def _interval(estimate: Estimate) -> str:
-    return f"{estimate.value:.4f} ({estimate.low:.4f} to {estimate.high:.4f})"
+def _way(estimate: Estimate, positive: str, negative: str) -> str:
+    """Which way it goes and how far; with the interval, of the same sign."""
+    if estimate.value < 0:
+        return f"{negative} by {-estimate.value:.4f} ({-estimate.high:.4f} to {-estimate.low:.4f})"
+    return f"{positive} by {estimate.value:.4f} ({estimate.low:.4f} to {estimate.high:.4f})"
 
 
 def _vss(level: Level) -> float:

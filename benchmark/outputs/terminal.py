@@ -211,7 +211,7 @@ def _sweep_table(result: Result, sweep: Sweep) -> Table:
             table.add_row(escape(backbone), style="bold")
         for level in found:
             means = (level.mean(over_all(VSS)), level.mean(over_recurrent(VSS)))
-            share, alpha = 100 * level.mean(lambda p: p.recurrent.share), level.mean(lambda p: p.alpha)
+            share, alpha = 100 * level.mean(lambda p: p.recurrent.share), level.mean(lambda p: p.alpha.value)
             cells = (*(_number(mean, VSS.digits[0]) for mean in means), _number(share, 2), _number(alpha, 2))
             table.add_row(f"  {sweep.text(level.value)}", *cells)
     return table

@@ -87,10 +87,9 @@ def _alpha(alpha: Estimate) -> str:
 
 def _reached(reach: Reach) -> list[str]:
     share = reach.reached
-    said = [
-        f"alpha between frames {reach.alpha.value:.2f} is {share.value:.0%} ({share.low:.0%} to {share.high:.0%})"
-        f" of its ceiling, {reach.ceiling.value:.2f} by {reach.by}"
-    ]
+    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {reach.ceiling.value:.2f} by {reach.by}"
+    chance = ", no better than chance," if share.value < 0 else ""
+    said = [f"alpha between frames {reach.alpha.value:.2f}{chance} is {share.value:.0%} {far}"]
     if (worst := reach.worst) is not None:
         said.append(f"worst class {worst.name} {_class_share(worst)}")
     return said
@@ -99,7 +98,8 @@ def _reached(reach: Reach) -> list[str]:
 def _class_share(row: ClassReach) -> str:
     if math.isnan(row.reached.value):
         return "not known"
-    return f"{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
+    chance = "no better than chance, " if row.reached.value < 0 else ""
+    return f"{chance}{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
 
 
 def _level(judged: Judged, reach: Reach | None) -> str:

@@ -73,7 +73,9 @@ class LabelMaps:
         source = self.source(backbone)
         if name not in source.files:
             lost = [path for each in self._names for path in source.missing(each)]
-            raise DataError(f"{self._folder}: {listed(lost)}; choose frames that have them, or add them")
+            raise DataError(
+                f"{self._folder}: {listed(lost, str(self._folder))}; choose frames that have them, or add them"
+            )
         return source.files[name]
 
     def space(self, backbone: str) -> LabelSpace | None:

@@ -158,7 +158,8 @@ def _sweeps(result: Result) -> Iterator[Figure]:
                 f"Sensitivity to {sweep.title}",
                 "The share of recurrent voxels, and every measure over all voxels (solid) and over the recurrent ones"
                 f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes; bars are the standard deviation"
-                " over repeats. Read the others with (a): which voxels there are to average changes along the sweep.",
+                " over repeats. The axes of VSS and margin span 0.1 or more, the others begin at 0. Read the others"
+                " with (a): which voxels there are to average changes along the sweep.",
                 f"Panels against {sweep.title}: the recurrent share and each measure, for all voxels and for the"
                 " recurrent ones.",
                 partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in backbones}),

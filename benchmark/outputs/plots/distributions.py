@@ -12,7 +12,7 @@ from semstab.model.measures import measures
 from semstab.model.results import RECURRENT
 from semstab.outputs.averages import ENOUGH
 from semstab.outputs.plots.histograms import Histograms, MeasureByOP, lacking, op_position, together
-from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, mark_panel
+from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, legend_columns, mark_panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +38,8 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
         mark_panel(axes, letter, f"{label}, voxels with OP ≥ {measure.lowest_op}" if measure.lowest_op > 1 else label)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(6, len(scenes) + 1))
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=legend_columns(labels, figure.get_figwidth()))
     return figure
 
 

@@ -180,7 +180,8 @@ def _sweeps(result: Result) -> Iterator[Figure]:
                 f"Agreement against {sweep.title}",
                 "VSS over all voxels, beside what random thinning of the frames does not change: pairwise agreement"
                 " (PSA) and Krippendorff's alpha of the voxels seen twice or more, macro means of the scenes; and"
-                " their SBD as seen and in random order. Bars are the standard deviation over repeats.",
+                " their SBD as seen and in random order. Bars: the 95% interval over blocks of space for these frames,"
+                " of VSS the standard deviation over repeats. (a) to (c) span 0.1 or more, (d) begins at 0.",
                 f"Four panels against {sweep.title}: VSS, pairwise agreement, alpha, and SBD with its null.",
                 partial(draw_agreement, sweep, found),
             )

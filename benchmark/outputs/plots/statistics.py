@@ -16,8 +16,8 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.averages import ENOUGH, Level, Pooled, Sweep, over_all
 from semstab.outputs.plots.distributions import mark_op
 from semstab.outputs.plots.histograms import OP_BOUNDS, op_position
-from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, mark_panel
-from semstab.outputs.plots.sweeps import draw_line, mark_values
+from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, legend_columns, mark_panel
+from semstab.outputs.plots.sweeps import draw_line, mark_values, positions, settle_scale
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,12 +27,15 @@ Float64 = npt.NDArray[np.float64]
 
 # --- Along a sweep ----------------------------------------------------------------------------------------------------
 
-_PANELS: tuple[tuple[str, Callable[[Pooled], float]], ...] = (
-    ("VSS, all voxels", over_all(VSS)),
+_JUDGED: tuple[tuple[str, Callable[[Pooled], Estimate]], ...] = (
     ("PSA", lambda pooled: pooled.psa),
     ("alpha", lambda pooled: pooled.alpha),
     ("SBD (bits)", lambda pooled: pooled.drift),
 )
+
+
+def _value(take: Callable[[Pooled], Estimate]) -> Callable[[Pooled], float]:
+    return lambda pooled: take(pooled).value
 
 
 def draw_agreement(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
@@ -40,21 +43,28 @@ def draw_agreement(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> 
     from matplotlib.lines import Line2D
 
     figure = canvas(PAGE, 2.5)
-    panels = figure.subplots(1, 4)
+    vss, *judged = figure.subplots(1, 4)
+    drift = judged[-1]
     values = sorted({level.value for levels in backbones.values() for level in levels})
     for k, levels in enumerate(backbones.values()):
-        x = [values.index(level.value) for level in levels]
-        for axes, (_, measure) in zip(panels, _PANELS, strict=True):
-            draw_line(axes, x, levels, measure, color(k))
-        draw_line(panels[3], x, levels, lambda pooled: pooled.drift_null, color(k), open_=True)
-    for axes, letter, (title, _) in zip(panels, "abcd", _PANELS, strict=True):
+        x, seen, shuffled = (
+            positions(values, levels, i, n * len(backbones)) for i, n in ((k, 1), (2 * k, 2), (2 * k + 1, 2))
+        )
+        draw_line(vss, x, levels, over_all(VSS), color(k))
+        for axes, (_, take) in zip(judged, _JUDGED, strict=True):
+            at = seen if axes is drift else x
+            draw_line(axes, at, levels, _value(take), color(k), interval=take)
+        draw_line(drift, shuffled, levels, lambda pooled: pooled.drift_null, color(k), open_=True)
+    titles = ("VSS, all voxels", *(title for title, _ in _JUDGED))
+    for axes, letter, title in zip((vss, *judged), "abcd", titles, strict=True):
         mark_values(axes, sweep, values)
         mark_panel(axes, letter, title)
-    panels[3].set_ylim(bottom=0)
+        settle_scale(axes, from_zero=axes is drift)
     handles = [Line2D([], [], color=color(k), label=name) for k, name in enumerate(backbones)]
-    seen = Line2D([], [], color=INK, marker="o", label="as seen")
+    own = Line2D([], [], color=INK, marker="o", label="as seen")
     null = Line2D([], [], color=INK, marker="o", linestyle="--", markerfacecolor="white", label="(d) in random order")
-    figure.legend(handles=[*handles, seen, null], loc="outside lower center", ncols=len(handles) + 2)
+    columns = legend_columns([*backbones, "as seen", "(d) in random order"], PAGE)
+    figure.legend(handles=[*handles, own, null], loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -94,7 +104,7 @@ def draw_drift(backbones: Mapping[str, DriftByOP]) -> Figure:
         axes.set_title(name)
         axes.set_xlabel("OP (frames)")
     panels[0].set_ylabel("mean SBD (bits)")
-    panels[0].set_ylim(bottom=0)
+    settle_scale(panels[0], from_zero=True)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2 if columns == 1 else 3)
     return figure
 
@@ -130,8 +140,8 @@ def draw_reliability(backbones: Mapping[str, Sequence[Reliability]]) -> Figure:
         upper.plot(confidence[few], accuracy[few], color=color(k), marker="o", markerfacecolor="white", linewidth=0)
         width = 0.8 / 15 / len(backbones)
         lower.bar(middle + (k - (len(backbones) - 1) / 2) * width, voxels, width=width, color=color(k))
-    upper.set(ylabel="accuracy", ylim=(0, 1.03))
-    lower.set(xlabel="largest belief (confidence)", ylabel="voxels", yscale="log", xlim=(0, 1.03))
+    upper.set(ylabel="accuracy", ylim=(-0.03, 1.03))
+    lower.set(xlabel="largest belief (confidence)", ylabel="voxels", yscale="log", xlim=(-0.03, 1.03))
     handles, labels = upper.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
@@ -180,7 +190,8 @@ def draw_intervals(panels: Mapping[str, Rows], marks: Mapping[str, Sequence[floa
         axes.set_ylim(len(scenes) - 0.5, -0.5)
         axes.locator_params(axis="x", nbins=4)
         mark_panel(axes, letter, title)
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(4, len(names)))
+    beside = legend_columns(names, figure.get_figwidth())
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=beside)
     return figure
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -119,6 +119,12 @@ def canvas(width: float, height: float) -> Canvas:
 def color(k: int) -> str:
     """The k-th colour; they repeat after eight."""
     return COLORS[k % len(COLORS)]
+
+
+def legend_columns(names: Sequence[str], width: float) -> int:
+    """How many entries of a legend stand beside each other in a figure that wide (inches), so that none is cut."""
+    widths = [0.55 + 0.06 * len(name) for name in names]
+    return len(names) if sum(widths) <= width else max(1, int(width / max(widths)))
 
 
 LETTERS = "abcdefghijklmnop"

@@ -11,6 +11,7 @@ map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; compone
 series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
 flips/BACKBONE/voxel_N                  StateChange: the dominant class of the voxels that drifted most
 flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them; Points3D: where those voxels are
+camera/BACKBONE/flips                   Points2D: those voxels in the frame, where their numbers lie inside its image
 difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
 difference_report/BACKBONE/A and B      TextDocument: how many they are
 legend, drift_legend                    Points2D: the classes and their colours; SegmentationImage: the levels of drift

@@ -27,6 +27,9 @@ MAX_MOVES = 2_000_000
 MOVED_BITS = 0.05
 """Drift from which on a frame is to blame, also where the dominant class stays: that of a drifting voxel."""
 
+NUMBER = 0.04
+"""Of an image's longer side, what a number takes up beside its point."""
+
 MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
 COLORS = (*LINE_COLORS, (255, 255, 255), (170, 255, 195), (220, 190, 255))
@@ -52,6 +55,25 @@ class Suspect:
     moves: npt.NDArray[np.void]
 
 
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """What projects a point of the world into a frame: K (3, 3), T_wc (4, 4), and the image's height and width."""
+
+    K: npt.NDArray[np.float64]
+    T_wc: npt.NDArray[np.float64]
+    shape: tuple[int, int]
+
+    def project(self, points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """Of points (n, 3) where they are in the viewer's image (n, 2), and which of them with their number inside."""
+        R, t = self.T_wc[:3, :3], self.T_wc[:3, 3]
+        x, y, z = self.K @ ((points - t) @ R).T
+        before = z > 0
+        pixels = np.stack([x, y], axis=1) / np.where(before, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
+        size = np.array(self.shape[::-1], dtype=np.float64)
+        room = NUMBER * size.max()
+        return pixels, before & np.all((pixels >= room) & (pixels <= size - room), axis=1)
+
+
 class FlipLog:
     """Keeps what moved a voxel's belief, above all its dominant class, and from which file the frame's labels came."""
 
@@ -60,6 +82,7 @@ class FlipLog:
         """Records of `MOVE`, in the order of the frames."""
         self._count = 0
         self._frames: dict[int, tuple[float | None, str]] = {}  # timestamp, label file
+        self._cameras: dict[int, Camera] = {}
 
     def update(self, tracker: Tracker, frame: Frame) -> None:
         """Keep what the frame that the tracker followed last has moved."""
@@ -73,6 +96,7 @@ class FlipLog:
         name = frame.files.get("labels") or frame.files.get("scores") or ""
         file = PurePath(name)
         self._frames[frame.index] = frame.timestamp, file.name if file.suffix else ""
+        self._cameras[frame.index] = Camera(frame.intrinsics.matrix, frame.T_wc, frame.shape)
         if self._count > MAX_MOVES:
             self._drop(tracker.map.column("drift_sum"))
 
@@ -122,6 +146,22 @@ class FlipLog:
             radii = rr.Radius.ui_points([5.0] * len(suspects))
             points = rr.Points3D(at, labels=labels, colors=marks, radii=radii, show_labels=True)
             stream.log(path(scene, "flips_at", backbone), points, static=True)
+            self._log_numbers(stream, path(scene, "camera", backbone, "flips"), suspects, clock)
+
+    def _log_numbers(self, stream: rr.RecordingStream, entity: str, suspects: list[Suspect], clock: Clock) -> None:
+        """Where the suspects are in each frame; in the view of an image 3D points would stand beside it as well."""
+        for frame, camera in self._cameras.items():
+            pixels, inside = camera.project(np.array([suspect.center for suspect in suspects]))
+            seen = np.flatnonzero(inside)
+            clock.set(stream, frame, self._frames[frame][0])
+            numbers = rr.Points2D(
+                pixels[seen],
+                labels=[f"{suspects[k].number}" for k in seen],
+                colors=[COLORS[k % len(COLORS)] for k in seen],
+                radii=rr.Radius.ui_points([4.0] * len(seen)),
+                show_labels=True,
+            )
+            stream.log(entity, numbers)
 
     def _log_state(self, stream: rr.RecordingStream, lane: str, frame: int, name: str, clock: Clock) -> None:
         clock.set(stream, frame, self._frames.get(frame, (None, ""))[0])

@@ -195,7 +195,7 @@ def _cameras(scene: str, tasks: list[Task]) -> rrb.Container:
 
 def _camera_views(scene: str, task: Task) -> list[rrb.View]:
     color, labels = path(scene, "camera", "color"), path(scene, "camera", task.backbone, "labels")
-    drift, flips = path(scene, "camera", task.backbone, "drift"), path(scene, "flips_at", task.backbone)
+    drift, flips = (path(scene, "camera", task.backbone, name) for name in ("drift", "flips"))
     origin = path(scene, "camera")
     seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
     return [

@@ -380,7 +380,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
 
 
 def _subtitle(result: Result) -> str:
-    counts = [(len(result.scenes), "scene"), (len(result.backbones), "backbone"), (len(result.records), "unit")]
+    units = {record.key for record in result.records}  # a sweep shares some with the base, as the manifest counts them
+    counts = [(len(result.scenes), "scene"), (len(result.backbones), "backbone"), (len(units), "unit")]
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     return " · ".join([*parts, f"fused by {result.backend}"])
 

@@ -71,9 +71,9 @@ def _agreement_row(sweep: Sweep, level: Level) -> Row:
         sweep.text(level.value),
         level.mean(lambda p: p.mean_op),
         spread(over_all(VSS)),
-        spread(lambda p: p.drift),
-        spread(lambda p: p.psa),
-        spread(lambda p: p.alpha),
+        spread(lambda p: p.drift.value),
+        spread(lambda p: p.psa.value),
+        spread(lambda p: p.alpha.value),
         spread(lambda p: p.excess_drift),
     )
 
