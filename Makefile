@@ -23,7 +23,6 @@ bench: setup
 
 test: setup-dev lint
 	$(BIN)/pytest -n auto --maxprocesses 4
-	$(BIN)/python tests/fuzz/fuzz.py --seconds 60 --seed 1
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1
