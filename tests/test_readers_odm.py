@@ -355,6 +355,7 @@ def test_several_reconstructions_are_named_and_one_can_be_chosen(tmp_path) -> No
             {"projection_type": "spherical"},
             "camera 'c': the camera model 'spherical' is not known; there is perspective",
         ),
+        ({"projection_type": []}, r"camera 'c': the camera model '\[\]' is not known"),
         ({"width": 0}, "camera 'c': 'width' is 0; expected a number of pixels"),
         ({"focal": None}, "camera 'c': 'focal' is missing"),
         ({"focal": 0.0}, "camera 'c': intrinsics: fx = 0; focal lengths must be positive"),

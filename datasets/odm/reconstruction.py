@@ -121,7 +121,7 @@ def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
     The pinhole is that of OpenSfM's own undistorted images: the mean focal length, the centre of the image.
     """
     kind = values.get("projection_type", "perspective")
-    if kind not in COEFFICIENTS:
+    if not isinstance(kind, str) or kind not in COEFFICIENTS:
         raise DataError(
             f"{where}: the camera model {str(kind)[:40]!r} is not known; there is {', '.join(COEFFICIENTS)}; undistort"
             " the images (opensfm undistort)"
