@@ -24,9 +24,9 @@ class SizeMaps:
 
     def __init__(self, task: Task, config: Config) -> None:
         self._frames = frozenset(task.indices[k] for k in evenly(len(task.indices), FRAMES))
-        (backend,), K = config.backends, len(task.mapping.target)
-        self._maps: dict[float, FusionBackend] = {
-            size: create(backend.name, voxel_size=size, num_classes=K, **backend.options)
+        K = len(task.mapping.target)
+        self._maps: dict[float, FusionBackend] = {  # of few pixels, for which blocks of voxels would cost too much
+            size: create("numba", voxel_size=size, num_classes=K)
             for size in (config.voxel_size * factor for factor in FACTORS)
         }
 
