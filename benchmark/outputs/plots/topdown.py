@@ -83,10 +83,7 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool
     heights = table.centers @ up_axis
     low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
     cut = high - LID * (high - low)
-    cells = np.floor(np.stack([table.centers @ right, table.centers @ ahead], axis=1) / table.voxel_size).astype(
-        np.int64
-    )
-    _, column = np.unique(cells, axis=0, return_inverse=True)
+    _, column = np.unique(_columns(table, up_axis), return_inverse=True)
     top, bottom = (np.full(column.max() + 1, end) for end in (-np.inf, np.inf))
     np.maximum.at(top, column, heights)
     np.minimum.at(bottom, column, heights)
@@ -98,9 +95,16 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool
 
 def _area(table: VoxelTable, axis: Float64) -> int:
     """Cells that voxels cover, seen along an axis."""
+    return len(np.unique(_columns(table, axis)))
+
+
+def _columns(table: VoxelTable, axis: Float64) -> Int64:
+    """A number (n,) for the column of cells along an axis that each voxel lies in."""
     right, ahead, _ = level_axes(axis)
-    plane = np.stack([table.centers @ right, table.centers @ ahead], axis=1)
-    return len(np.unique(np.floor(plane / table.voxel_size).astype(np.int64), axis=0))
+    centers = table.centers
+    x, y = (np.floor(centers @ along / table.voxel_size).astype(np.int64) for along in (right, ahead))
+    columns: Int64 = (x - x.min()) * (np.ptp(y) + 1) + (y - y.min())
+    return columns
 
 
 @dataclass(frozen=True, eq=False)
