@@ -97,6 +97,11 @@ class InfluenceSums:
             limit=None if self.limit is None else self.limit.coarsened(edge, step),
         )
 
+    def without_truth(self) -> InfluenceSums:
+        """Without what is right and wrong."""
+        columns = self.columns[:, : width(self.K, truth=False)]
+        return dataclasses.replace(self, columns=columns, truth=False)
+
     def bounded(self) -> InfluenceSums:
         """With at most MOST_CELLS cubes and MOST_GROUPS groups."""
         edge, step = self.edge, self.step
