@@ -2,7 +2,16 @@
 
 from semstab.statistics.sampling.collect import influence_sums
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
-from semstab.statistics.sampling.intervals import LEAST_FRAMES, difference, estimate, judged_of, question_of
+from semstab.statistics.sampling.intervals import (
+    LEAST_FRAMES,
+    difference,
+    estimate,
+    judged_of,
+    mean_of,
+    question_of,
+    standard_error,
+    unpaired,
+)
 from semstab.statistics.sampling.places import Places
 
 __all__ = [
@@ -14,7 +23,10 @@ __all__ = [
     "estimate",
     "influence_sums",
     "judged_of",
+    "mean_of",
     "merged",
     "question_of",
+    "standard_error",
+    "unpaired",
     "value",
 ]
