@@ -12,6 +12,7 @@ from semstab.statistics.sampling.intervals import (
     standard_error,
     unpaired,
 )
+from semstab.statistics.sampling.paired import coverage, identical, mean_over_frames, same_flight
 from semstab.statistics.sampling.places import Places
 
 __all__ = [
@@ -19,13 +20,17 @@ __all__ = [
     "InfluenceSums",
     "Places",
     "aligned",
+    "coverage",
     "difference",
     "estimate",
+    "identical",
     "influence_sums",
     "judged_of",
     "mean_of",
+    "mean_over_frames",
     "merged",
     "question_of",
+    "same_flight",
     "standard_error",
     "unpaired",
     "value",
