@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from semstab.compare.opening import Entry
+from semstab.compare.opening import Entry, Flicker
 from semstab.compare.pairing import Common
 from semstab.compare.quantities import (
     BY_CLASS,
@@ -21,10 +21,9 @@ from semstab.compare.quantities import (
     REACHED,
     quantities,
 )
-from semstab.errors import DataError
 from semstab.metrics import macro_mean
 from semstab.model.contrast import Contrast
-from semstab.model.measures import Measure, Quantity, dominant, mean
+from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
@@ -32,17 +31,19 @@ from semstab.statistics.comparison import LEAST_VOXELS, holm
 from semstab.statistics.sampling import (
     InfluenceSums,
     Places,
+    aligned,
+    coverage,
     difference,
     estimate,
     mean_of,
+    mean_over_frames,
+    of_places_alone,
     question_of,
     standard_error,
     unpaired,
     value,
 )
-from semstab.statistics.sampling.paired import coverage, identical, mean_over_frames
-
-Mask = npt.NDArray[np.bool_]
+from semstab.statistics.sampling.influence import columns_of, functional
 
 LEVEL = 0.05
 """Corrected p-value below which a difference is claimed."""
@@ -106,11 +107,11 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
         sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
         yield from _row(quantity, sums[0], sums[number], common)
     if _same_ceiling(base, other):
-        yield from _row(REACHED, *_alike(base.sums, other.sums), common)
+        yield from _row(REACHED, base.sums.without_truth(), other.sums.without_truth(), common)
     if common.basis != "flights":
         yield _coverage(base.sums, other.sums)
     if base.flicker and other.flicker:
-        yield _flicker(base, other, paired=common.same_frames is not False)
+        yield _flicker(base.flicker, other.flicker, paired=common.same_frames is not False)
     done = {quantity.key for quantity in (*HEADLINES, *IN_SUMS)}
     for quantity in quantities():
         if isinstance(quantity, Measure) and quantity.key not in done and common.tables:
@@ -122,76 +123,91 @@ def _row(
 ) -> Iterator[Contrast]:
     """A number of the sums, where either run has it."""
     key = quantity.key
-    values = value(base, key, k), value(other, key, k)
-    if all(math.isnan(one) for one in values):
-        return
-    yield Contrast(key, of, *values, _difference(base, other, key, k, common), math.nan, "")
+    before, after = value(base, key, k), value(other, key, k)
+    if not (math.isnan(before) and math.isnan(after)):
+        yield Contrast(key, of, before, after, _difference(base, other, key, k, common), math.nan, "")
 
 
 def _difference(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None, common: Common) -> Interval:
-    question = _question(base, other)
-    if identical(base, other):
-        return dataclasses.replace(estimate(base, key, k, question), value=0.0, low=0.0, high=0.0, p_value=math.nan)
+    question, number = _question(key, k, base, other), functional(key, k)
+    if base.truth != other.truth:
+        base, other = base.without_truth(), other.without_truth()
     if common.basis == "flights":
-        return unpaired(*(estimate(sums, key, k, question) for sums in (other, base)))
-    return difference(other, base, key, k, question, same_frames=common.same_frames)
+        return unpaired(estimate(other, key, k, question), estimate(base, key, k, question))
+    if _same(base, other, key, k):
+        return _none(estimate(base, key, k, question))
+    found = difference(other, base, key, k, question, same_frames=common.same_frames)
+    most = number.high - number.low
+    return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
 
 
-def _question(*sums: InfluenceSums) -> Question:
-    return NEXT_FLIGHT if {question_of(own) for own in sums} == {NEXT_FLIGHT} else THIS_MAP
+def _question(key: str, k: int | None, *sums: InfluenceSums) -> Question:
+    all_tell = {question_of(own) for own in sums} == {NEXT_FLIGHT} and not of_places_alone(key, k)
+    return NEXT_FLIGHT if all_tell else THIS_MAP
 
 
-def _alike(*sums: InfluenceSums) -> Iterator[InfluenceSums]:
-    """Without the sums of ground truth, which not all may have."""
-    for own in sums:
-        yield own.without_truth()
+def _same(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None) -> bool:
+    """Whether all that a number is of is the same in both, place by place and frame by frame."""
+    one, two = (columns_of(own, key, k) for own in aligned(base, other))
+    return one.shape == two.shape and bool(np.array_equal(one, two, equal_nan=True))
+
+
+def _none(found: Interval) -> Interval:
+    """A difference that there is nowhere."""
+    return dataclasses.replace(found, value=0.0, low=0.0, high=0.0, p_value=math.nan)
 
 
 def _same_ceiling(base: Entry, other: Entry) -> bool:
     """Whether both judge against the same labels: those of the truth, or their own in finer cells."""
-    found = [entry.summary.statistics and entry.summary.statistics.reach for entry in (base, other)]
-    return all(found) and len({reach.by for reach in found if reach}) == 1
+    found = [entry.summary.statistics for entry in (base, other)]
+    return len({own.reach.by if own is not None and own.reach is not None else "" for own in found} - {""}) == 1
 
 
 def _coverage(base: InfluenceSums, other: InfluenceSums) -> Contrast:
     ratio = coverage(other, base)
-    shifted = dataclasses.replace(ratio, value=ratio.value - 1, low=ratio.low - 1, high=ratio.high - 1)
-    return Contrast(COVERAGE.key, "", 1.0, ratio.value, _with_p_value(shifted), math.nan, "")
+    change = dataclasses.replace(ratio, value=ratio.value - 1, low=ratio.low - 1, high=ratio.high - 1)
+    change = _none(change) if _same(base, other, "psa", None) or _as_many(base, other) else _with_p_value(change)
+    return Contrast(COVERAGE.key, "", 1.0, ratio.value, change, math.nan, "")
 
 
-def _flicker(base: Entry, other: Entry, *, paired: bool) -> Contrast:
-    values = macro_mean([*base.flicker.values()]), macro_mean([*other.flicker.values()])
-    frames = np.array(sorted(base.flicker.keys() & other.flicker.keys()), dtype=np.int64) if paired else np.zeros(0)
+def _as_many(base: InfluenceSums, other: InfluenceSums) -> bool:
+    """Whether both have as many voxels in every cube."""
+    one, two = (own.coarsened(max(base.edge, other.edge), 0) for own in (base, other))
+    return bool(np.array_equal(one.cell, two.cell) and np.allclose(one["voxels"], two["voxels"]))
+
+
+def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
+    frames = sorted(base.keys() & other.keys()) if paired else []
     if len(frames) > 1:
-        values = tuple(macro_mean([each.flicker[frame] for frame in frames]) for each in (base, other))
-        change = np.array([other.flicker[frame] - base.flicker[frame] for frame in frames])
-        found = mean_over_frames(frames, change)
+        before, after = (np.array([own[frame] for frame in frames]) for own in (base, other))
+        change = mean_over_frames(np.array(frames), after - before)
+        found = _none(change) if np.array_equal(before, after) else _with_p_value(change)
     else:
-        each = [mean_over_frames(np.array([*e.flicker]), np.array([*e.flicker.values()])) for e in (other, base)]
-        found = unpaired(*each)
-    return Contrast(FLICKER.key, "", *values, _with_p_value(found), math.nan, "")
+        before, after = (np.array([*own.values()]) for own in (base, other))
+        each = [mean_over_frames(np.array([*own]), np.array([*own.values()])) for own in (base, other)]
+        found = unpaired(each[1], each[0])
+    return Contrast(FLICKER.key, "", mean(before), mean(after), found, math.nan, "")
 
 
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
     """The mean of a measure over the voxels where it is defined, by its differences voxel by voxel."""
-    values = measure.of(base), measure.of(other)
-    known = ~np.isnan(values[0]) & ~np.isnan(values[1])
-    if not known.any():
+    before, after = measure.of(base), measure.of(other)
+    known = ~np.isnan(before) & ~np.isnan(after)
+    before, after = before[known], after[known]
+    if not len(before):
         return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
-    columns = np.stack([(values[1] - values[0])[known], np.ones(known.sum())], axis=1)
     places = Places(base.index[known], base.voxel_size, edge)
-    found = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
-    means = (mean(own[known]) for own in values)
-    return Contrast(measure.key, "", *means, _with_p_value(found), math.nan, "")
+    columns = np.stack([after - before, np.ones(len(before))], axis=1)
+    change = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
+    found = _none(change) if np.array_equal(before, after) else _with_p_value(change)
+    return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
 
 
 def _with_p_value(found: Interval) -> Interval:
-    """That the number is 0, by its interval; where nothing varies, nothing differs."""
+    """That the number is 0, by its interval."""
     from scipy import stats
 
     error = standard_error(found)
-    if found.value == 0 and found.low == found.high == 0:
-        return found
     if not error > 0:
         return found
     degrees = found.degrees if found.degrees > 0 else math.inf
@@ -201,18 +217,17 @@ def _with_p_value(found: Interval) -> Interval:
 # --- By class ---------------------------------------------------------------------------------------------------------
 
 
-def _against_all(
-    common: Common, base: Entry, other: Entry, names: Sequence[str], number: int
-) -> Iterator[Contrast]:
+def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str], number: int) -> Iterator[Contrast]:
     for quantity in ONE_AGAINST_ALL:
+        sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
+        before, after = sums[0], sums[number]
         if quantity is REACHED:
-            pair = tuple(_alike(base.sums, other.sums)) if _same_ceiling(base, other) else ()
-        else:
-            sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
-            pair = (sums[0], sums[number])
-        for k, name in enumerate(names) if pair else ():
-            if _enough(pair[0], k):
-                yield from _row(quantity, pair[0], pair[1], common, k, name)
+            before, after = base.sums.without_truth(), other.sums.without_truth()
+        if quantity is REACHED and not _same_ceiling(base, other):
+            continue
+        for k, name in enumerate(names):
+            if _enough(before, k):
+                yield from _row(quantity, before, after, common, k, name)
 
 
 def _enough(sums: InfluenceSums, k: int) -> bool:
@@ -246,6 +261,3 @@ def joint_class(tables: Iterable[VoxelTable]) -> npt.NDArray[np.int64]:
         beliefs = beliefs + other.evidence[:] / other.op[:, None]
     label: npt.NDArray[np.int64] = beliefs.round(9).argmax(axis=1)
     return label
-
-
-__all__ = ["DataError", "by_class", "class_of_places", "contrasts", "dominant", "joint_class", "over_scenes", "tested"]

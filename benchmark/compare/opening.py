@@ -178,7 +178,10 @@ def _sums(folder: Path, record: Record) -> InfluenceSums:
     file = record.influence_file
     if file is None or not file.is_file():
         raise DataError(f"{folder}: kept no sums by frame and place of {record.unit.slug}; run it again")
-    return InfluenceSums.load(file)
+    try:
+        return InfluenceSums.load(file)
+    except DataError as error:
+        raise DataError(f"{error}; run it again") from error
 
 
 def _flicker(file: Path | None) -> Flicker:

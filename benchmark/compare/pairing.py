@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.compare.opening import Entry
-from semstab.metrics.matching import rows_of
+from semstab.metrics.matching import observations, rows_of
 from semstab.model.comparison import CommonLooks, MapCoverage
 from semstab.model.contrast import Basis
 from semstab.model.measures import sbd
@@ -44,7 +44,7 @@ class Common:
     logs    of these tables, where looks are in common
     label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
     looks   what the common looks are
-    maps    the whole maps, where there are voxels
+    maps    the whole maps, and truth that of the ground truth, where there are voxels
     same_frames  whether frames are paired; None where the sums tell
     """
 
@@ -57,6 +57,7 @@ class Common:
     label: Int64 | None = None
     looks: CommonLooks | None = None
     maps: tuple[VoxelTable, ...] = ()
+    truth: VoxelTable | None = None
     coverage: tuple[MapCoverage, ...] = ()
     same_frames: bool | None = None
 
@@ -80,15 +81,16 @@ def pair(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     covered = coverage(maps)
     if not any(row.common_share for row in covered):
         return _apart(entries, "the maps have no voxel in common: other places, or other frames of reference")
-    found = _by_looks(records, maps) or _by_voxels(records, maps)
-    remarks = [*found.remarks, *_remarks(covered)]
-    return _replaced(found, remarks, tuple(maps.values()), covered)
+    truth = _truth(records)
+    found = _by_looks(records, maps, truth) or _by_voxels(maps, truth)
+    remarks = (*found.remarks, *_remarks(covered))
+    return replace(found, remarks=remarks, maps=tuple(maps.values()), truth=truth, coverage=covered)
 
 
 # --- What is in common ------------------------------------------------------------------------------------------------
 
 
-def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable]) -> Common | None:
+def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common | None:
     """The looks that all made; None where the looks of one were not kept, or are of other frames."""
     looks = [_looks_of(record) for record in records]
     there = [own for own in looks if own is not None]
@@ -98,7 +100,7 @@ def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable]) -> Common 
     tables = tuple(log.table() for log in shared.logs.values())
     if not any(table.op.max(initial=0) >= 2 for table in tables):
         return None
-    label = _true_label(records, tables[0])
+    label = None if truth is None else join_truth(tables[0], truth).label
     sums, whole = (
         tuple(_sums(log.table(), log, label) for log in logs.values()) for logs in (shared.logs, shared.whole)
     )
@@ -106,10 +108,10 @@ def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable]) -> Common 
     return Common("looks", (), sums, whole, tables, logs, label, shared.found)
 
 
-def _by_voxels(records: Sequence[Record], maps: dict[str, VoxelTable]) -> Common:
+def _by_voxels(maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common:
     """The voxels that all saw twice or more, whatever each saw of them."""
     tables = tuple(table.rows(rows) for table, rows in zip(maps.values(), repeated_rows(maps), strict=True))
-    label = _true_label(records, tables[0])
+    label = None if truth is None else join_truth(tables[0], truth).label
     sums = tuple(_sums(table, None, label) for table in tables)
     remark = "the runs made other looks, of other frames: they are paired on voxels alone, for this map"
     return Common("voxels", (remark,), sums, sums, tables, (), label, same_frames=False)
@@ -126,8 +128,6 @@ def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> Influen
 
 
 def _some(log: Events | None, where: npt.NDArray[np.bool_]) -> Events | None:
-    from semstab.metrics.matching import observations
-
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
 
 
@@ -148,21 +148,11 @@ def _same_frames(looks: Sequence[Looks]) -> bool:
     return True
 
 
-def _true_label(records: Sequence[Record], table: VoxelTable) -> Int64 | None:
-    """The true class of a table's voxels, by the first run that fused the ground truth."""
+def _truth(records: Sequence[Record]) -> VoxelTable | None:
+    """The map of the ground truth, of the first run that fused it."""
     files = [record.truth_file for record in records if record.truth_file is not None and record.truth_file.is_file()]
-    if not files:
-        return None
-    truth = VoxelTable.load(files[0])
-    return join_truth(table, truth).label if truth.classes == table.classes else None
-
-
-def _replaced(
-    found: Common, remarks: Sequence[str], maps: tuple[VoxelTable, ...], covered: tuple[MapCoverage, ...]
-) -> Common:
-    from dataclasses import replace
-
-    return replace(found, remarks=tuple(remarks), maps=maps, coverage=covered)
+    truth = VoxelTable.load(files[0]) if files else None
+    return truth if truth is not None and truth.classes == records[0].table().classes else None
 
 
 # --- What is not ------------------------------------------------------------------------------------------------------

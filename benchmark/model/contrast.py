@@ -10,8 +10,8 @@ from semstab.model.comparison import CommonLooks, MapCoverage
 from semstab.model.statistics import Interval
 
 Basis = Literal["looks", "voxels", "cubes", "flights"]
-"""What was paired: looks (a place in a frame) that all made; voxels that all saw twice or more; cubes of space, each map
-with all its voxels; nothing, each flight by itself."""
+"""What was paired: looks (a place in a frame) that all made; voxels that all saw twice or more; cubes of space, each
+map with all its voxels; nothing, each flight by itself."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """What a map's numbers would be elsewhere, or in the next flight: sums by frame and cube of space, and intervals."""
 
 from semstab.statistics.sampling.collect import influence_sums
-from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
+from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
 from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
     difference,
@@ -29,6 +29,7 @@ __all__ = [
     "mean_of",
     "mean_over_frames",
     "merged",
+    "of_places_alone",
     "question_of",
     "same_flight",
     "standard_error",
