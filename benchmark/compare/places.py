@@ -140,7 +140,8 @@ def _connected(
     ends = _touching(index[rows], label[rows])
     pairs = coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(len(rows), len(rows)))
     of = connected_components(pairs, directed=False)[1]
-    mass, count = np.bincount(of, weights=loss[rows]), np.bincount(of)
+    mass: Float64 = np.bincount(of, weights=loss[rows]).astype(np.float64)
+    count = np.bincount(of)
     order = np.lexsort((np.arange(len(mass)), -mass))
     kept = order[count[order] >= LEAST]
     rank = np.zeros(len(mass), dtype=np.int64)
