@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from semstab.compare.opening import Entry, Flicker
-from semstab.compare.pairing import Common
-from semstab.compare.quantities import (
+from semstab.comparison.opening import Entry, Flicker
+from semstab.comparison.pairing import Common
+from semstab.comparison.quantities import (
     BY_CLASS,
     COVERAGE,
     FLICKER,

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.compare.contrasts import joint_class
-from semstab.compare.pairing import Common
+from semstab.comparison.contrasts import joint_class
+from semstab.comparison.pairing import Common
 from semstab.metrics.matching import shared_rows, voxel_keys
 from semstab.model.contrast import Blame, Place
 from semstab.model.measures import dominant

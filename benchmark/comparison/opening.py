@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from semstab.compare.baseline import Baseline, Kept, load_baseline, save_baseline
+from semstab.comparison.baseline import Baseline, Kept, load_baseline, save_baseline
 from semstab.config import nearest
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from semstab.compare.opening import Entry
+from semstab.comparison.opening import Entry
 from semstab.metrics.matching import observations, rows_of
 from semstab.model.comparison import CommonLooks, MapCoverage
 from semstab.model.contrast import Basis
