@@ -73,7 +73,7 @@ class Open3DBlocks(FusionBackend):
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
-        """The attributes of a voxel; of a block about a quarter is seen, and the grid doubles as it grows. An empty map has blocks, too."""
+        """The attributes of a voxel; a quarter of a block is seen, the grid doubles, an empty one has blocks."""
         return max(10 * voxels, LEAST_BLOCKS * 4**3) * (8 * num_classes + 48)
 
     def integrate(self, frame: Frame) -> FrameReport:
