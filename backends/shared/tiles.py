@@ -84,7 +84,8 @@ class Tiles:
             find_words(
                 fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
                 corner, columns_of(self.within, origin), rays, margin, frame.ignore_id, room,
-                space.room("row_word", threads, W), space.room("row_keys", threads, BLOCK), space.room("row_changes", threads, W, dtype=np.uint8),
+                space.room("row_word", threads, W), space.room("row_keys", threads, BLOCK),
+                space.room("row_changes", threads, W, dtype=np.uint8),
                 space.room("run_word", threads, ROWS, W + 1),
                 space.room("run_end", threads, ROWS, W + 1, dtype=np.int32),
                 space.room("run", threads, 2, ROWS), tables, space.room("table_count", threads, TABLE, dtype=np.int32),

@@ -37,6 +37,9 @@ class Observer:
     def group_kept(self, task: Task, summaries: Sequence[UnitSummary]) -> None:
         """These base units of a backbone on a scene were found finished."""
 
+    def remarked(self, line: str) -> None:
+        """Something is done otherwise than usual: a map that would not fit is fused in tiles."""
+
     def group_started(self, task: Task, config: Config) -> None:
         """The task's frames are fused from now on, by those of its backends that are not kept; `config` is a unit's."""
 

@@ -84,7 +84,7 @@ class Record:
     summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
                 what `semstab.statistics` says of the map
     image_space of the 'base' units; all NaN elsewhere
-    voxels_file file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and without a folder
+    voxels_file file of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None elsewhere
     truth_file  file of the ground truth's voxels of the same frames, where the statistics fused it
     """
 
@@ -114,22 +114,25 @@ class Record:
     @property
     def series(self) -> Path | None:
         """File of its time series, beside that of its voxels."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / FRAMES / f"{self.unit.slug}.csv"
+        return self._beside(FRAMES, ".csv")
 
     @property
     def looks_file(self) -> Path | None:
         """File of its sampled looks, which is there where the statistics judged its map."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / LOOKS / self.voxels_file.name
+        return self._beside(LOOKS)
 
     @property
     def events_file(self) -> Path | None:
         """File of its log of observations, which is there where it was asked for and its backend keeps one."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
+        return self._beside(EVENTS)
 
     @property
     def influence_file(self) -> Path | None:
         """File of its sums by frame and cube of space, which is there where its map was judged."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / INFLUENCE / self.voxels_file.name
+        return self._beside(INFLUENCE)
+
+    def _beside(self, folder: str, suffix: str = ".parquet") -> Path | None:
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"
 
 
 class Tables:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from semstab.model import parquet
 from semstab.model.records import Record, Tables
 from semstab.model.results import Unit
 from semstab.model.voxels import VoxelTable
@@ -63,9 +64,6 @@ class Views:
 
 def column(record: Record, name: str) -> npt.NDArray[Any] | None:
     """A column that was written beside the voxels; None where it was not."""
-    import pyarrow.parquet as pq
-
-    if name not in pq.read_schema(record.voxels_file).names:
+    if record.voxels_file is None or name not in parquet.names_in(record.voxels_file):
         return None
-    values: npt.NDArray[Any] = pq.read_table(record.voxels_file, columns=[name]).column(name).to_numpy()
-    return values
+    return VoxelTable.columns(record.voxels_file, [name])[name]
