@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import yaml
 
@@ -132,7 +133,7 @@ class Folder:
         """What an earlier start left of a portion, if its files are there as they were."""
         try:
             found = Finished.load(self.path / PORTIONS / key / f"{name}.npz")
-        except (OSError, ValueError, LookupError, DataError):
+        except (OSError, ValueError, LookupError, EOFError, BadZipFile, DataError):
             return None
         return found if self._are_whole(found.about.files) else None
 
@@ -195,9 +196,7 @@ class Folder:
         if isinstance(planned, PlannedUnit):
             has = content.summary is not None and (content.image_space is not None or not planned.image_space)
             has = has and (
-                not planned.judged
-                or (content.summary is not None and content.summary.statistics is not None)
-                or bool(_in_tiles(planned.unit, content))
+                not planned.judged or (content.summary is not None and content.summary.statistics is not None)
             )
             has = has and (content.checked is not None or not planned.sampled)
             wanted = self._wanted(planned, content)
@@ -212,9 +211,8 @@ class Folder:
 
     def _wanted(self, planned: PlannedUnit, content: UnitContent) -> list[str]:
         unit: Unit = planned.unit
-        if tiles := _in_tiles(unit, content):
-            return [*tiles, *([f"{FRAMES}/{unit.slug}.csv"] if planned.kept else [])]
-        wanted = [f"{VOXELS}/{unit.slug}.parquet", f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
+        voxels = _in_tiles(unit, content) or [f"{VOXELS}/{unit.slug}.parquet"]
+        wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
         if planned.kept and planned.judged:
             wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and planned.logged:

@@ -73,7 +73,9 @@ def _size(config: Config, group: Sequence[PlannedUnit], folder: Path, width: int
     if (why := _cannot_be_tiled(config, group)) is not None:
         if forced:
             raise ConfigError(f"tile_size = {config.tile_size}: {why}")
-        found.refused |= {each.identity: too_large(task, settings, voxels, needed, f" ({why})") for each in group}
+        names = [each.unit.backend for each in group]
+        line = too_large(task, names, settings, voxels, needed, f" ({why})")
+        found.refused |= {each.identity: line for each in group}
         return
     budget = SHARE * limit(config) / width
     for each, kind in zip(group, kinds, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +67,15 @@ class TableSums:
                 own += _by_group(values, rows.op, of, own.shape[1])  # noqa: PLW2901 - in place
         total = [table.pixels.sum(), table.op.sum(dtype=np.int64), len(table)]
         return cls(np.array(total, dtype=np.float64), *sums)
+
+    def arrays(self) -> dict[str, Float64]:
+        """All of it by name, as `read` takes it."""
+        return {f"table {name}": value for name, value in vars(self).items()}
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, Float64]) -> TableSums:
+        """From its arrays, among others."""
+        return cls(**{field.name: arrays[f"table {field.name}"] for field in dataclasses.fields(cls)})
 
     def __add__(self, other: TableSums) -> TableSums:
         return TableSums(*(own + more for own, more in zip(vars(self).values(), vars(other).values(), strict=True)))

@@ -173,7 +173,7 @@ class VoxelTable:
         Raises DataError where one is not there.
         """
         files, sorting = parquet.files_of(path), tuple(_INDEX_TYPES)
-        wanted = [*names, *(sorting if len(files) > 1 else ())]
+        wanted = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
         parts = [parquet.columns(file, wanted) for file in files]
         found = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
         order = _sorted(found) if len(files) > 1 else slice(None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,6 @@ import numpy.typing as npt
 
 from semstab.engine.series import FrameRow
 from semstab.engine.tiling.partition import Part
-from semstab.metrics.summary import TableSums
 from semstab.model.records import ImageSpace
 from semstab.model.results import Agreement, FrameReport, SizeAlpha
 from semstab.runtime.files import atomic_path
@@ -76,33 +74,32 @@ class Finished:
     """What is left of a portion.
 
     series   (F, C) a row a frame: REPORT, then ROW
-    table    sums of the voxels
+    sums     over the voxels, by name: those of `TableSums`, or of `MapSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     poses    (F, 4, 4) of the frames, where it is of these
     """
 
     about: About
     series: Float64
-    table: TableSums | None = None
+    sums: Mapping[str, Any] = field(default_factory=dict)
     reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     poses: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
-        sums = {} if self.table is None else {f"table {name}": value for name, value in vars(self.table).items()}
-        arrays: dict[str, Any] = {"series": self.series, "reduced": self.reduced, "poses": self.poses, **sums}
+        arrays: dict[str, Any] = {"series": self.series, "reduced": self.reduced, "poses": self.poses}
+        arrays |= {f"sums {name}": value for name, value in self.sums.items()}
         text = json.dumps(to_json(self.about)).encode()
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, about=np.frombuffer(text, np.uint8), **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Finished:
-        """What `save` wrote. Raises OSError or ValueError where it is not there or damaged."""
-        with np.load(path) as content:
+        """What `save` wrote. Raises OSError, ValueError or BadZipFile where it is not there or damaged."""
+        with path.open("rb") as file, np.load(file) as content:
             about = from_json(About, json.loads(content["about"].tobytes()), path)
-            sums = {field.name: content.get(f"table {field.name}") for field in dataclasses.fields(TableSums)}
-            table = None if any(value is None for value in sums.values()) else TableSums(**sums)
-            return cls(about, content["series"], table, content["reduced"], content["poses"])
+            sums = {name[5:]: content[name] for name in content.files if name.startswith("sums ")}
+            return cls(about, content["series"], sums, content["reduced"], content["poses"])
 
 
 def series_array(rows: Sequence[FrameRow]) -> Float64:

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -77,9 +78,9 @@ class Sights:
     def load(cls, path: Path) -> Sights | None:
         """What `save` wrote; None where there is no such file, or it is damaged."""
         try:
-            with np.load(path) as content:
+            with path.open("rb") as file, np.load(file) as content:
                 values = {field.name: content[field.name] for field in dataclasses.fields(cls)}
-        except (OSError, ValueError, LookupError, EOFError):
+        except (OSError, ValueError, LookupError, EOFError, BadZipFile):
             return None
         return cls(**values | {name: int(values[name]) for name in ("size", "frames")})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,19 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import to_csv
 from semstab.engine.tiling.portion import Finished, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.finish import no_voxels, reduced_of, unit_summary
+from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
-from semstab.model.records import FRAMES, VOXELS, UnitContent
+from semstab.metrics.summary import TableSums
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
 from semstab.model.results import Agreement, Deviation
+from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import write_text
+from semstab.statistics import Looks
+from semstab.statistics.description import analyse_sums
+from semstab.statistics.map_sums import MapSums
+from semstab.statistics.sampling import InfluenceSums
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
@@ -32,25 +38,26 @@ UP_VOXELS = 1 << 20
 def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished], folder: Path) -> UnitContent:
     """The unit's content; its series is written. Raises DataError where no pixel was valid."""
     task, unit, config = planned.task, planned.unit, planned.config
-    found = [part.table for part in parts if part.table is not None]
-    if not sum(sums.total[2] for sums in found):
+    sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
+    if not sums.total[2]:
         raise no_voxels(task, config)
-    sums = functools.reduce(operator.add, found)
+    found = _statistics(planned, parts, folder, frames.about.files) if planned.judged else None
     rows = joined_series(frames.series, [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
         task,
         rows,
         sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
-        None,
+        None if found is None else found[0],
         reduced_of(np.sum(reduced, axis=0)) if reduced else None,
         frames.about.sizes,
     )
     files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
     if planned.kept:
-        series = folder / FRAMES / f"{unit.slug}.csv"
-        write_text(series, to_csv(rows))
-        files[f"{FRAMES}/{series.name}"] = file_digest(series).hex()
+        savers: Savers = {f"{FRAMES}/{unit.slug}.csv": lambda path: write_text(path, to_csv(rows))}
+        if found is not None:
+            savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
+        files |= {name: _saved(save, folder / name) for name, save in savers.items()}
     content = UnitContent(
         planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
     )
@@ -59,6 +66,29 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
     image_space = replace(frames.about.image_space, flicker_percent=summary.flicker_percent)
     tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
     return replace(content, image_space=image_space, up=_up(planned, tiles, int(sums.total[2]), frames.poses))
+
+
+def _saved(save: Callable[[Path], None], path: Path) -> str:
+    """The digest of a file that was written."""
+    save(path)
+    return file_digest(path).hex()
+
+
+def _statistics(
+    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Iterable[str]
+) -> tuple[MapStatistics, InfluenceSums]:
+    """What the statistics say of all parts together, with the looks that were sampled of the frames."""
+    classes, config = planned.task.mapping.target.classes, planned.config
+    looks = next(Looks.load(folder / name) for name in files if name.startswith(f"{LOOKS}/"))
+    return analyse_sums(
+        MapSums.merged([MapSums.read(part.sums, classes) for part in parts]),
+        voxel_size=config.voxel_size,
+        classes=classes,
+        sample=looks.sample(),
+        name=planned.task.backbone,
+        edges=config.strata,
+        critical=config.critical_classes,
+    )
 
 
 def _checked(found: Sequence[Agreement | None]) -> Agreement | None:

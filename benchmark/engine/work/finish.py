@@ -49,6 +49,7 @@ from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
+from semstab.statistics.map_sums import MapSums
 from semstab.task import Task, read
 
 WORST = 3
@@ -190,7 +191,7 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     assert portion is not None
     with watch("measure"):
         table = _table(one.backend, one.task) if one.request.fuses else None
-        sums = None if table is None else TableSums.of(table, one.request.config.strata)
+        sums = {} if table is None else _sums_of(table, one.request.config.strata, judged=portion.judged)
     with watch("reference"):
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
     with watch("write"):
@@ -205,6 +206,12 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
         )
         _, left = _written(job, {f"{PORTIONS}/{portion.key}/{portion.name}.npz": finished.save})
     return Outcome(one.request.identity, portion=portion.name, files=returned | left)
+
+
+def _sums_of(table: VoxelTable, edges: Sequence[int], *, judged: bool) -> dict[str, npt.NDArray[Any]]:
+    if not judged:
+        return TableSums.of(table, edges).arrays()
+    return MapSums.of(table, edges).arrays()
 
 
 def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, table: VoxelTable | None) -> Savers:

@@ -57,13 +57,13 @@ def most_voxels(task: Task, config: Config, first: Frame) -> int:
     return DOUBT * len(task.indices) * len(seen.key)
 
 
-def too_large(task: Task, config: Config, voxels: float, needed: float, why: str = "") -> str:
+def too_large(task: Task, backends: Iterable[str], config: Config, voxels: float, needed: float, why: str = "") -> str:
     """That a map does not fit, by how much, and which settings change it."""
     free = limit(config)
     room = f"{free / GB:.2g} GB " + ("are free" if config.memory_gb is None else "is memory_gb")
     return (
         f"{takes(task, config, voxels, needed)}, and {room}; use larger voxels (voxel_size), fewer frames (frames), a"
-        f" larger pixel_stride{_without(task.backends, config)}; or set memory_gb to try all the same{why}"
+        f" larger pixel_stride{_without(backends, config)}; or set memory_gb to try all the same{why}"
     )
 
 
