@@ -209,6 +209,8 @@ def _work_off(
                 ended = tiled.take(outcome)
             if ended is not None and ended.identity not in found.errors:
                 _keep(folder, found, each, ended)
+                if tiled is not None and ended.content is not None:
+                    _tell_assembled(tiled, ended.content, told)
                 _tell_done(each, ended.error, executor, told, counted=tiled is not None)
 
 
@@ -235,6 +237,12 @@ def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers)
         summaries = [summary for each in group if (summary := contents[each.identity].summary) is not None]
         if summaries:
             told.tell(lambda observer, task=task, summaries=summaries: observer.group_kept(task, summaries))  # type: ignore[misc]
+
+
+def _tell_assembled(tiled: TiledUnit, content: UnitContent, told: Observers) -> None:
+    summary, planned = content.summary, tiled.planned
+    if planned.kept and summary is not None:
+        told.tell(lambda observer: observer.unit_assembled(planned.task, summary))
 
 
 def _tell_done(each: Planned, error: str | None, executor: Executor, told: Observers, *, counted: bool = False) -> None:

@@ -52,6 +52,12 @@ class Observer:
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """A frame went into the maps of all units of the task."""
 
+    def frame_seen(self, task: Task, frame: Frame) -> None:
+        """A frame of a map in tiles was looked at; the tiles are fused by themselves."""
+
+    def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
+        """All tiles of a unit's map are in the folder, and measured."""
+
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """All frames went into a unit's map, which is measured and written next."""
 

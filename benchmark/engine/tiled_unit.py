@@ -17,7 +17,7 @@ class TiledUnit:
     """What an earlier start finished of it is kept, if the unit is still cut in the same way."""
 
     def __init__(self, planned: PlannedUnit, tiling: Tiling, folder: Folder) -> None:
-        self._planned, self._folder = planned, folder
+        self.planned, self._folder = planned, folder
         self._key = unit_key(planned.identity, planned.digest)
         self._requests = {
             request.portion.name: request
@@ -36,7 +36,7 @@ class TiledUnit:
     @property
     def name(self) -> str:
         """What the progress calls it."""
-        return f"{self._planned.unit.scene} · {self._planned.unit.backbone}"
+        return f"{self.planned.unit.scene} · {self.planned.unit.backbone}"
 
     def step(self) -> int:
         """The frames that the portion which is finished now stands for."""
@@ -56,7 +56,7 @@ class TiledUnit:
             if found is None:
                 return failed(
                     [self._requests[outcome.portion]],
-                    f"{self._planned.unit.slug}: part {outcome.portion} is not in the folder; start it again",
+                    f"{self.planned.unit.slug}: part {outcome.portion} is not in the folder; start it again",
                 )[0]
             self._there[outcome.portion] = found
         if len(self._there) < len(self._requests):
@@ -64,10 +64,10 @@ class TiledUnit:
         return self._assembled()
 
     def _assembled(self) -> Outcome:
-        identity = self._planned.identity
+        identity = self.planned.identity
         frames = self._there["frames"]
         parts = [found for name, found in self._there.items() if name != "frames"]
         try:
-            return Outcome(identity, assembled(self._planned, frames, parts, self._folder.path))
+            return Outcome(identity, assembled(self.planned, frames, parts, self._folder.path))
         except SemstabError as error:
             return failed([self._requests["frames"]], error)[0]

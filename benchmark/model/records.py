@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,6 +112,17 @@ class Record:
         return VoxelTable.load(self.voxels_file)
 
     @property
+    def in_tiles(self) -> bool:
+        """Whether its voxels are a folder of tiles."""
+        return self.voxels_file is not None and self.voxels_file.is_dir()
+
+    def tiles(self) -> Iterator[VoxelTable]:
+        """Its voxels, tile by tile; of a map in one file all of them."""
+        if self.voxels_file is None:
+            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
+        return VoxelTable.iter_tiles(self.voxels_file)
+
+    @property
     def series(self) -> Path | None:
         """File of its time series, beside that of its voxels."""
         return self._beside(FRAMES, ".csv")
@@ -133,6 +144,12 @@ class Record:
 
     def _beside(self, folder: str, suffix: str = ".parquet") -> Path | None:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"
+
+
+def voxels_of(folder: Path, unit: Unit) -> Path:
+    """Where a run's folder has the voxels of a unit: in a file, or in a folder of tiles."""
+    tiles = folder / VOXELS / unit.slug
+    return tiles if tiles.is_dir() else folder / VOXELS / f"{unit.slug}.parquet"
 
 
 class Tables:

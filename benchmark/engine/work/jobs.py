@@ -49,6 +49,11 @@ class Request:
         return self.portion is None or self.portion.part is not None
 
     @property
+    def shown(self) -> bool:
+        """Whether observers are shown its frames, though there is no map."""
+        return not self.fuses and self.portion is not None and self.portion.kept
+
+    @property
     def reduces(self) -> bool:
         """Whether soft scores are also fused as labels."""
         return self.image_space if self.portion is None else self.portion.reduces
@@ -57,7 +62,7 @@ class Request:
     def portions(cls, planned: PlannedUnit, key: str, tiling: Tiling) -> list[Request]:
         """Those of a unit in tiles: of its frames, and of each part of its map."""
         whole = replace(cls.of(planned), kept=False)
-        frames = replace(whole, sampled=False, portion=Portion(key))
+        frames = replace(whole, sampled=False, portion=Portion(key, kept=planned.kept))
         parts = []
         for part in tiling.parts:
             config = whole.config.model_copy(update={"frames": FrameSelection(list=part.frames)})

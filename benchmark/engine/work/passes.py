@@ -110,11 +110,11 @@ class Pass:
         """Fuse and measure; the outcome of every unit that was not put off."""
         order = sorted(frozenset[int]().union(*(stream.indices for stream in self._streams)))
         decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
-        watched = [one for stream in self._streams for one in stream.maps if one.request.kept]
+        watched = [one for stream in self._streams for one in stream.maps if one.request.kept or one.request.shown]
         if watched:
             task = dataclasses.replace(watched[0].task, backends=tuple(one.task.backends[0] for one in watched))
             self.observers.tell(lambda observer: observer.group_started(task, watched[0].request.config))
-        for one in watched:
+        for one in (one for one in watched if one.request.kept):
             self.observers.tell(lambda observer, one=one: observer.unit_started(one.task.units[0], one.backend))  # type: ignore[misc]
         with contextlib.closing(decode) as frames:
             for index, fetched in zip(order, frames, strict=True):
@@ -171,6 +171,8 @@ class Pass:
                     one.soft = one.soft or now.frame.scores is not None
             if watched:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
+            for one in (one for one in stream.maps if one.request.shown):
+                self.observers.tell(lambda observer, one=one: observer.frame_seen(one.task, now.frame))  # type: ignore[misc]
         lost = {outcome.identity for outcome in self._outcomes}
         stream.maps = [one for one in stream.maps if one.request.identity not in lost]
 
