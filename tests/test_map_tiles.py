@@ -137,7 +137,7 @@ def test_a_run_in_tiles_says_what_a_whole_one_says(scene, backend, tmp_path, req
             {key: float(value or "nan") for key, value in other.items()}, rel=1e-12, abs=1e-12, nan_ok=True
         )
     assert tiles.up == whole.up
-    assert not list((tmp_path / "tiles" / "parts").iterdir())
+    assert not (tmp_path / "tiles" / "parts").exists()
 
 
 def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
@@ -231,3 +231,23 @@ def test_parts_are_rectangles_within_the_budget_that_share_nothing() -> None:
     assert (covered == 1).all()
     assert tiling.decodes < 1.6 * 100
     assert tiled(sights, lambda voxels, observations: voxels, 1600).size == 128  # four parts a budget, at most
+
+
+def test_other_programs_read_the_tiles_as_one_table(wall, tmp_path) -> None:
+    """The queries of docs/large-scenes.md."""
+    from pyarrow import dataset
+
+    run = semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=8), out=tmp_path / "run")
+    table, folder = run.records[0].table(), tmp_path / "run" / "voxels" / "wall__a__numba"
+    expected = {
+        k: float(semstab.metrics.vss(table)[(table.op >= 3) & (semstab.metrics.dominant(table) == k)].mean())
+        for k in range(3)
+    }
+    read = dataset.dataset(folder).to_table(columns=["label", "vss", "op"])
+    assert read.num_rows == len(table)
+    query = f"SELECT label, avg(vss) FROM '{folder}/*.parquet' WHERE op >= 3 GROUP BY label"
+    duckdb = pytest.importorskip("duckdb")
+    assert dict(duckdb.sql(query).fetchall()) == pytest.approx(expected)
+    pl = pytest.importorskip("polars")
+    found = pl.scan_parquet(f"{folder}/*.parquet").filter(pl.col("op") >= 3).group_by("label").agg(pl.col("vss").mean())
+    assert dict(found.collect().iter_rows()) == pytest.approx(expected)

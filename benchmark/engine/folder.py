@@ -122,6 +122,8 @@ class Folder:
         key = unit_key(outcome.identity, outcome.content.input)
         write_json(self.path / UNITS / f"{key}.json", outcome.content)
         shutil.rmtree(self.path / PORTIONS / key, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            (self.path / PORTIONS).rmdir()  # where nothing of other units is left
 
     def save_portion(self, outcome: Outcome) -> None:
         """Keep a finished portion of a unit in tiles; its own file comes last, and says that the others are there."""

@@ -91,7 +91,11 @@ def _size(config: Config, group: Sequence[PlannedUnit], folder: Path, width: int
 def _surely_fits(config: Config, group: Sequence[PlannedUnit]) -> bool:
     task, settings = group[0].task, group[0].config
     voxels = most_voxels(task, settings, _first(task, settings))
-    return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=True)) <= limit(config)
+
+    def fits(*, soft: bool) -> bool:
+        return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft)) <= limit(config)
+
+    return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
 
 
 def _first(task: Task, settings: Config) -> Frame:

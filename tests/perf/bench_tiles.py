@@ -44,7 +44,8 @@ def write_flight(root: Path, count: int) -> Path:
         y = along if leg % 2 == 0 else LEG - 1 - along
         frames.append(flight.frame(index, WIDTH, HEIGHT, K, (BESIDE * leg, STEP * y)))
     classes = [f"class{k}" for k in range(K)]
-    return write_posed(root, [f"{index:05d}" for index in range(count)], {"a": frames}, classes=classes, up_axis="z")
+    names = [f"{index:05d}" for index in range(count)]
+    return write_posed(root, names, {"a": frames}, scale=None, classes=classes, up_axis="z")
 
 
 def run(scene: Path, out: Path, *options: str) -> dict[str, float]:

@@ -244,7 +244,7 @@ class Pass:
 
     def _require_room(self) -> None:
         """Fail the largest map where the memory left would not do for its end, before the system ends the process."""
-        maps = [one for stream in self._streams for one in stream.maps if one.rows]
+        maps = [one for stream in self._streams for one in stream.maps if one.rows and one.request.fuses]
         largest = self._room.lacking(maps) if maps else None
         if largest is None:
             return
