@@ -18,6 +18,7 @@ from semstab.cli.options import (
     DataFolder,
     DatasetName,
     DatasetOptions,
+    Filters,
     Frames,
     Jobs,
     Quiet,
@@ -114,6 +115,7 @@ def run(
         ),
     ] = None,
     classes: Classes = None,
+    filters: Filters = None,
     quiet: Quiet = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
@@ -132,7 +134,7 @@ def run(
     content = chosen(named, with_options(settings, options), dataset, data, frames, seed)
     if check in ("none", "off"):
         content["check"] = None
-    resolved = _load(config, content, predict or [], classes)
+    resolved = _load(config, content, predict or [], classes, filters or [])
     if device is not None:
         resolved = _on_device(resolved, device)
     _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)
@@ -263,19 +265,20 @@ def _executor(jobs: int, scheduler: str | None) -> Executor:
     return cluster
 
 
-def _load(path: Path | None, overrides: dict[str, Any], predict: list[str], classes: str | None) -> Config:
-    """The configuration; with models whose predictions take the place of the dataset's labels."""
-    if not predict:
-        if classes is not None:
-            raise ConfigError("--classes names what a model predicts; say which one with --predict")
-        from semstab.settings import load_config
+def _load(
+    path: Path | None, overrides: dict[str, Any], predict: list[str], classes: str | None, filters: list[str]
+) -> Config:
+    """The configuration; with models whose predictions take the place of the dataset's labels, or filters over them."""
+    from semstab.settings import filtered_config, load_config, predicted_config
 
-        return load_config(path, overrides)
-    from semstab.predict.predictor import parse_predictor
-    from semstab.settings import predicted_config
+    if predict:
+        from semstab.predict.predictor import parse_predictor
 
-    options = {} if classes is None else {"classes": classes}
-    return predicted_config([parse_predictor(text, options) for text in predict], path, overrides)
+        options = {} if classes is None else {"classes": classes}
+        return predicted_config([parse_predictor(text, options, filters) for text in predict], path, overrides)
+    if classes is not None:
+        raise ConfigError("--classes names what a model predicts; say which one with --predict")
+    return filtered_config(filters, path, overrides) if filters else load_config(path, overrides)
 
 
 def _on_device(config: Config, device: str) -> Config:

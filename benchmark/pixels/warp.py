@@ -56,7 +56,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
     rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
     pixel = np.empty((H, W), dtype=np.int32)
     look_up(
-        fixed(frame.depth), rays, _motion(frame, other), fixed(other.depth),
+        fixed(frame.depth), rays, motion(frame, other), fixed(other.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
     )  # fmt: skip
     return Correspondence(pixel)
@@ -73,7 +73,7 @@ def warp(
     return found.bring(values, fill), found.visible
 
 
-def _motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
+def motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
     """(3, 4) from the frame's camera axes to the other's; exact for large coordinates, which cancel first."""
     R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
     t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]
