@@ -8,10 +8,10 @@ from typing import Any, cast
 from pydantic import BaseModel
 
 from semstab.config import DatasetConfig, validated
-from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
 from semstab.runtime.registry import Entry, Registry
 
-__all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Scene", "open_dataset", "options_model", "resolved"]
+__all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Filtering", "Scene", "open_dataset", "options_model", "resolved"]
 
 REGISTRY = Registry(
     "dataset",

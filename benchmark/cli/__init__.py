@@ -16,6 +16,7 @@ from semstab.cli.exporting import export, relabel
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
+from semstab.cli.remedying import remedies
 from semstab.cli.running import run, study, view
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
@@ -95,6 +96,7 @@ for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (che
     app.command(name)(command)
 app.command("export")(export)
 app.command("relabel")(relabel)
+app.command("remedies")(remedies)
 app.command("conform")(conform)
 app.command("view")(view)
 app.command("list")(list_)

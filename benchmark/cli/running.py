@@ -44,6 +44,15 @@ if TYPE_CHECKING:
 
 DISAGREE = 3
 
+Models = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--predict",
+        metavar="NAME[,KEY=VALUE...]",
+        help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
+    ),
+]
+
 
 def run(
     backend: Annotated[
@@ -107,13 +116,7 @@ def run(
     report: Report = "on",
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
-    predict: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[,KEY=VALUE...]",
-            help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
-        ),
-    ] = None,
+    predict: Models = None,
     classes: Classes = None,
     filters: Filters = None,
     quiet: Quiet = False,
@@ -137,7 +140,7 @@ def run(
     resolved = _load(config, content, predict or [], classes, filters or [])
     if device is not None:
         resolved = _on_device(resolved, device)
-    _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)
+    execute(resolved, out or _default_out(), executor_of(jobs, scheduler), rerun, report, quiet)
 
 
 def study(
@@ -172,7 +175,7 @@ def study(
     )
     if only is not None:
         config = config.only(only)
-    _execute(config, out or Path("studies") / slug(config.name), _executor(jobs, scheduler), rerun, report, quiet)
+    execute(config, out or Path("studies") / slug(config.name), executor_of(jobs, scheduler), rerun, report, quiet)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
@@ -197,12 +200,14 @@ def _why_no_recording(run: Path) -> str:
     return f"{run}: was not recorded (a study is only where it is asked for); {shown}start it again with --rerun FILE"
 
 
-def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
+def execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
     """Run it, say what was found, and end with the exit code that this calls for."""
     from rich.console import Console
 
     from semstab.api import run_study
     from semstab.outputs.progress import ProgressBar, failure_lines
+    from semstab.outputs.remedies import remedies
+    from semstab.outputs.remedies_text import print_remedies
     from semstab.outputs.terminal import print_summary
 
     if report not in ("on", "off"):
@@ -217,7 +222,9 @@ def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, r
             say(f"error: {line}")
         if not quiet:
             console = Console()
-            if result.select():
+            if remedies(result):
+                print_remedies(result, console)
+            elif result.select():
                 print_summary(result, console)
             for line in _where(result, out, recording, report):
                 console.print(line, soft_wrap=True, markup=False, highlight=False)
@@ -251,7 +258,8 @@ def _where(result: Result, out: Path, recording: list[Recording], report: str) -
         yield f"recording: semstab-bench view {out if file == out / 'recording.rrd' else file}"
 
 
-def _executor(jobs: int, scheduler: str | None) -> Executor:
+def executor_of(jobs: int, scheduler: str | None) -> Executor:
+    """Where the work is done: here, in processes of this machine, on a cluster."""
     import logging
 
     from semstab.engine import DaskCluster, InProcess, LocalProcesses

@@ -330,7 +330,7 @@ def identity(config: Config, task: Task) -> str:
         "frames": task.indices,
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    return _hash(config, content)
+    return _hash(config, content | ({"frame_quality": True} if config.frame_quality else {}))
 
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:

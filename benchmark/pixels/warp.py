@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,13 +44,14 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 
     A pixel with valid depth is back-projected, moved into the other camera and projected; there the nearest pixel's
     depth must be valid and differ from the point's distance z along the optical axis by at most depth_tolerance * z,
-    else the point is occluded. Labels do not matter. The frames may differ in size and intrinsics.
+    else the point is occluded; of infinity, that is not looked at. Labels do not matter. The frames may differ in size
+    and intrinsics.
 
-    Raises ConfigError where the tolerance is not above 0 and below 1.
+    Raises ConfigError where the tolerance is not above 0 and below 1, and not infinity.
     """
     from semstab.pixels.warp_kernel import look_up
 
-    if not 0 < depth_tolerance < 1:
+    if not 0 < depth_tolerance < 1 and depth_tolerance != math.inf:
         raise ConfigError(f"depth_tolerance = {depth_tolerance:g}: use a share of the distance, above 0 and below 1")
     H, W = frame.shape
     K, camera = frame.intrinsics, other.intrinsics

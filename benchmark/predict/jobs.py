@@ -14,7 +14,6 @@ from semstab.errors import ConfigError
 from semstab.predict.images import ImageSequence
 from semstab.predict.sources import ImageFiles, chosen
 
-
 IMAGES: Mapping[str, Any] = {"color": True}
 """What of a frame must be there where a model looks at images."""
 

@@ -17,13 +17,14 @@ from pydantic import BaseModel, Field, field_validator
 
 from semstab.backbones import Backbone, Image, Prediction, ask, create
 from semstab.config import DatasetConfig, FrameSelection, Settings
-from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset, resolved
+from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Filtering, Scene, open_dataset, resolved
 from semstab.datasets.selection import select_frames
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
 from semstab.predict.filters import parse
+from semstab.predict.filters.filtered import Filtered
 from semstab.predict.images import ImageSequence, first_images, geometry_of
 from semstab.predict.in_order import InOrder, size_of
 from semstab.predict.predictor import PredictorConfig, completed, stored_labels
@@ -181,11 +182,15 @@ class PredictedScene(Scene):
         truth = [source for source in sources if source == GROUND_TRUTH]
         return self._inner.missing(index, [*stored, *truth], color=color or any(each["color"] for each in wanted))
 
-    def unfiltered(self, backbone: str) -> str | None:
-        """The label source that is the backbone without its filters, where it is among the dataset's."""
-        known, one = self._dataset.predictors, self._dataset.predictors[backbone].unfiltered
-        same = (name for name, other in known.items() if other.model_copy(update={"name": None}) == one)
-        return next(same, None)
+    def filtering(self, backbone: str) -> Filtering:
+        """What was done to a label source before it is read."""
+        if backbone == GROUND_TRUTH:
+            return Filtering(backbone)
+        known, one = self._dataset.predictors, self._dataset.predictors[backbone]
+        same = (name for name, other in known.items() if other.model_copy(update={"name": None}) == one.unfiltered)
+        model = self._fitted.get(backbone)
+        took = model.seconds if isinstance(model, Filtered) else []
+        return Filtering(next(same, backbone), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
 
     @property
     def settings(self) -> Mapping[str, Any]:

@@ -66,6 +66,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     if one.request.image_space and stream.image_space is not None:
         image_space = stream.image_space.result(summary.flicker_percent)
         content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
+    if stream.judge is not None and one.request.image_space:
+        made = task.scene.filtering(task.backbone)
+        quality = stream.judge.result(made.model, made.filters, made.milliseconds)
+        content = dataclasses.replace(content, quality=quality)
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_finished(unit, table, summary))

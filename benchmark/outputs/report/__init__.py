@@ -20,6 +20,7 @@ from semstab.outputs import plots
 from semstab.outputs.averages import describe
 from semstab.outputs.findings import Finding, findings
 from semstab.outputs.plots.style import COLUMN, DPI, Figure
+from semstab.outputs.remedies import advice, of_interest, remedies
 from semstab.outputs.report.reading import reading
 from semstab.outputs.tables import Table, tables, write_tables
 from semstab.outputs.tables.writers import ARROWS, relations, sections
@@ -114,14 +115,18 @@ def render(result: Result, folder: Path) -> str:
     environment = Environment(
         loader=FileSystemLoader(here), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    everything, result = result, of_interest(result)
     found = findings(result)
     return environment.get_template("report.html.j2").render(
         result=result,
         style=(here / "style.css").read_text(encoding="utf-8"),
         subtitle=_subtitle(result),
-        reading=[relations(sentence) for sentence in reading(result, found)],
+        reading=[
+            *(sentence for each in remedies(everything) for sentence in advice(each)),
+            *(relations(sentence) for sentence in reading(result, found)),
+        ],
         findings=[_finding(row) for row in found],
-        topics=list(_topics(result, folder)),
+        topics=list(_topics(everything, folder)),
         without_map=[scene for scene in result.scenes if scene not in result.up],
         failures=[_failure(row) for row in result.failures],
         facts=list(_facts(result.manifest)),
@@ -147,6 +152,13 @@ class Topic:
 
 
 TOPICS = (
+    Topic(
+        "remedies",
+        "What would steady it?",
+        "Filters over the same model and frames. Labels that do not change are not yet right: read flicker beside what"
+        " it costs.",
+        ("remedies",),
+    ),
     Topic("glance", "At a glance", "", ("glance", "verdicts", "overview")),
     Topic(
         "flicker",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,6 +38,8 @@ class Filtered(Wrapped):
         self.gives_scores = True
         self.sequential = inner.sequential or any(spec.kind.sequential for spec in filters)
         self.wants_geometry = inner.wants_geometry or any(spec.kind.wants_geometry for spec in filters)
+        self.seconds: list[float] = []
+        """That the filters took for each image so far."""
         self._begin(())
 
     def reset(self) -> None:
@@ -63,11 +66,14 @@ class Filtered(Wrapped):
     def _filtered(self, prediction: Prediction, image: Image, frame: Frame | None, scores: bool) -> Prediction:
         if image.shape != self._shape:
             self._begin(image.shape)
+        started = time.perf_counter()
         belief = belief_of(prediction, self.space)
         said = belief.any(axis=2, keepdims=True)
         for one in self._chain:
             belief = one(belief, Shown(image, frame)) * said
-        return Prediction(labels_of(belief, self.space, prediction.labels), belief if scores else None)
+        labels = labels_of(belief, self.space, prediction.labels)
+        self.seconds.append(time.perf_counter() - started)
+        return Prediction(labels, belief if scores else None)
 
 
 def belief_of(prediction: Prediction, space: LabelSpace) -> Belief:
