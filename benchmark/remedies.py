@@ -41,7 +41,9 @@ def remedies_config(
     predictors = [*models, *(PredictorConfig(backbone=STORED, options={"source": name}) for name in names)]
     config, _ = with_voxel_size(config)
     shipped = load_study(STUDY).dataset.options["remedies"]
-    grid = list(filters) or [f"map-prior:{config.voxel_size:g}" if "map-prior" in text else text for text in shipped]
+    grid = ["+".join(str(parse(text)) for text in chain.split("+")) for chain in filters] or [
+        f"map-prior:{config.voxel_size:g}" if "map-prior" in text else text for text in shipped
+    ]
     able, left_out = _able(grid, predictors, scene)
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "backbones": None})

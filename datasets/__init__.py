@@ -16,6 +16,10 @@ __all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Filtering", "Scene", "open_da
 REGISTRY = Registry(
     "dataset",
     {
+        "predicted": Entry(
+            "semstab.predict.live:PredictedDataset",
+            "another dataset with labels that models make while it is fused: `run --predict`",
+        ),
         "city": Entry(
             "semstab.datasets.city:City",
             "the built-in scene: a simulated UAV flight over a procedural city, with simulated backbones",

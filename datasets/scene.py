@@ -29,7 +29,7 @@ class Filtering:
 
     model         the label source without them; the source itself where that is not there
     filters       'ema:0.6+threshold:0.5'; '' where there are none
-    milliseconds  that they took for a frame so far, in the median
+    milliseconds  of CPU time that they took for a frame so far, in the median
     """
 
     model: str

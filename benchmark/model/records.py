@@ -88,7 +88,7 @@ class FrameQuality:
     stable_wrong  of the pixels seen again, those that keep a label that is wrong
     lag           frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
                   changes: the pixels that it was counted on
-    milliseconds  that the filters took for a frame, in the median
+    milliseconds  of CPU time that the filters took for a frame, in the median
     accuracy_by_frame, foresight_by_frame  the same of each frame, and of each pair
     """
 

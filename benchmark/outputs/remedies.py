@@ -67,10 +67,12 @@ class Remedies:
 
     def harmless(self, row: Remedy) -> bool:
         """Whether it costs nothing that must not be lost, whatever it does for stability."""
-        kept = self.worth(row) >= self.worth(self.unfiltered) and row.coverage >= LEAST_COVERAGE
+        base = self.unfiltered
+        if row.coverage < LEAST_COVERAGE:
+            return False
         if not self.has_truth:
-            return kept
-        return kept and row.miou >= self.unfiltered.miou and not row.lag > MOST_LAG
+            return row.foresight >= base.foresight - ALIKE
+        return row.accuracy >= base.accuracy and row.miou >= base.miou and not row.lag > MOST_LAG
 
     @property
     def best(self) -> Remedy | None:
@@ -78,7 +80,15 @@ class Remedies:
 
         Stability alone chooses nothing: a label that never changes is as steady as can be.
         """
-        able = [row for row in self.filtered if row.flicker < self.unfiltered.flicker and self.harmless(row)]
+        return self._best_of(self.filtered)
+
+    @property
+    def best_whole(self) -> Remedy | None:
+        """The same of the filters that leave every label."""
+        return self._best_of([row for row in self.filtered if row.coverage >= 1 - ALIKE])
+
+    def _best_of(self, rows: Sequence[Remedy]) -> Remedy | None:
+        able = [row for row in rows if row.flicker < self.unfiltered.flicker and self.harmless(row)]
         most = max(map(self.worth, able), default=math.nan)
         return min((row for row in able if self.worth(row) >= most - ALIKE), key=lambda row: row.flicker, default=None)
 
@@ -135,7 +145,9 @@ def advice(found: Remedies) -> Iterator[str]:
         least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "foresight or coverage"
         yield f"Use none of these filters over {found.model}: none steadies it without a loss of {least}."
     else:
-        yield f"Use --filter {best.filters.replace('+', ' --filter ')} over {found.model}: {_why(found, best)}."
+        yield f"Use --filter {typed(best)} over {found.model}: {_why(found, best)}."
+        if (whole := found.best_whole) is not None and whole != best:
+            yield f"Of those that leave every label, --filter {typed(whole)}: {_why(found, whole)}."
     if found.misleading:
         worst = found.misleading[0]
         names = ", ".join(row.filters for row in found.misleading[:4])
@@ -149,6 +161,11 @@ def advice(found: Remedies) -> Iterator[str]:
         )
     elif not math.isfinite(base.lag):
         yield "Nothing changes in what is seen here: how late labels follow is not known."
+
+
+def typed(remedy: Remedy) -> str:
+    """The filters as they are typed after the first --filter."""
+    return remedy.filters.replace("+", " --filter ")
 
 
 def _why(found: Remedies, best: Remedy) -> str:
@@ -166,6 +183,8 @@ def _why(found: Remedies, best: Remedy) -> str:
         )
     if found.has_truth and math.isfinite(best.lag):
         parts.append(f"labels follow a change {best.lag:.1f} frames late")
+    if best.coverage < 1 - ALIKE:
+        parts.append(f"{100 * best.coverage:.0f} % of the labels are left")
     return f"{', '.join(parts)}, for {best.milliseconds:.0f} ms a frame"
 
 

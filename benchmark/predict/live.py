@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, field_validator
 
 from semstab.backbones import Backbone, Image, Prediction, ask, create
 from semstab.config import DatasetConfig, FrameSelection, Settings
-from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Filtering, Scene, open_dataset, resolved
+from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
 from semstab.datasets.selection import select_frames
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
@@ -30,7 +30,6 @@ from semstab.predict.in_order import InOrder, size_of
 from semstab.predict.predictor import PredictorConfig, completed, stored_labels
 from semstab.predict.stored import NAME as STORED
 from semstab.predict.stored import StoredSequence
-from semstab.runtime.registry import Entry
 
 NAME = "predicted"
 
@@ -346,12 +345,3 @@ def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
     for array in (image, frame.depth, frame.T_wc):
         digest.update(np.ascontiguousarray(array).data)
     return digest.digest()
-
-
-REGISTRY.register(
-    NAME,
-    Entry(
-        "semstab.predict.live:PredictedDataset",
-        "another dataset with labels that models make while it is fused: `run --predict`",
-    ),
-)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from semstab.backbones import REGISTRY, Backbone, Image, Labels, Prediction, narrowed
+from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
 from semstab.config import Settings
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.views.resampling import Scores
@@ -17,9 +19,11 @@ from semstab.datasets.views.same_view import require_same_view
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import ignore_id
-from semstab.runtime.registry import Entry
 
 NAME = "stored"
+
+NEAR = 4
+"""Frames that are at hand: each is asked for its image, its geometry and its labels."""
 
 
 class StoredOptions(Settings):
@@ -77,6 +81,7 @@ class StoredSequence:
             known = ", ".join(scene.backbones) or "none"
             raise ConfigError(f"{scene.name}: there are no labels '{source}' for filters to take; there is {known}")
         self.scene, self.source, self.name, self._color = scene, source, scene.name, color
+        self._frame = functools.lru_cache(maxsize=NEAR)(partial(scene.frame, backbone=source, color=False))
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -119,9 +124,6 @@ class StoredSequence:
         """The frame, with its labels."""
         return self._frame(index)
 
-    def _frame(self, index: int) -> Frame:
-        return self.scene.frame(index, self.source, color=False)
-
 
 def shares(frame: Frame) -> Any:
     """Scores (H, W, K) float32 that sum to 1 where they can be used, else to 0; None of labels."""
@@ -130,8 +132,3 @@ def shares(frame: Frame) -> Any:
     said = (frame.predicted != ignore_id(frame.predicted))[..., None]
     scores = np.where(said, frame.scores, 0).astype(np.float32)
     return np.divide(scores, scores.sum(axis=2, keepdims=True), out=scores, where=said)
-
-
-REGISTRY.register(
-    NAME, Entry("semstab.predict.stored:Stored", "labels that a scene has already, for --filter: --set source=NAME")
-)

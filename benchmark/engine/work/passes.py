@@ -142,7 +142,7 @@ class Pass:
             made = UnitMap(request, task, _new_map(request.config, task), truth, sampler, of_truth)
             if request.sampled:
                 made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target))
-            if request.image_space and request.judged:
+            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
+FLICKERS_MORE = 1.1
+"""What makes labels flicker by so much more is no remedy, and would take the room of those that are."""
+
 Of = Callable[[Remedy], float]
 
 
@@ -23,8 +26,9 @@ def remedy_figure(found: Remedies, name: str) -> Figure:
         name,
         f"Stability and its price: {found.model}",
         f"Each point is a filter, joined in the order of their numbers; the star is {found.model} without one, the"
-        f" ring the filter to use. Steady is left, good is up; the grey line joins what none beats in both flicker and"
-        f" {worth}. A point left of the star and below it is steadier and worse.",
+        " ring the filter to use. Steady is left; the arrows say which way is good; the grey line joins what none beats"
+        f" in both flicker and {worth}. A point left of the star and below it in (a) is steadier and worse. Filters"
+        " that make labels flicker by a tenth more are not drawn.",
         f"Scatter plots of flicker against {worth} and what else it costs, one point a filter over {found.model}.",
         lambda: draw_remedies(found),
     )
@@ -32,20 +36,20 @@ def remedy_figure(found: Remedies, name: str) -> Figure:
 
 def draw_remedies(found: Remedies) -> Canvas:
     """Panels that share flicker as x: what labels are worth, how late they are, what is left of them."""
-    panels: list[tuple[str, Of]] = [("accuracy (%)", lambda row: 100 * row.accuracy)] if found.has_truth else []
-    panels.append(("foresight (%)", lambda row: 100 * row.foresight))
+    panels: list[tuple[str, Of]] = [("accuracy (%) ↑", lambda row: 100 * row.accuracy)] if found.has_truth else []
+    panels.append(("foresight (%) ↑", lambda row: 100 * row.foresight))
     if found.has_truth:
         panels += [
-            ("stable and wrong (%)", lambda row: 100 * row.stable_wrong),
-            ("lag (frames)", lambda row: row.lag),
+            ("stable and wrong (%) ↓", lambda row: 100 * row.stable_wrong),
+            ("lag (frames) ↓", lambda row: row.lag),
         ]
     else:
-        panels.append(("coverage (%)", lambda row: 100 * row.coverage))
+        panels.append(("coverage (%) ↑", lambda row: 100 * row.coverage))
     rows = len(panels) // 2
     figure = canvas(PAGE, 2.7 * rows + 0.5)
     axes = figure.subplots(rows, 2, squeeze=False).ravel()
     for k, (panel, (title, of)) in enumerate(zip(axes, panels, strict=True)):
-        _draw(panel, found, of)
+        _draw(panel, found, of, numbers=k == 0)
         mark_panel(panel, LETTERS[k], title)
         panel.set_xlabel("flicker (%)")
     front = found.front
@@ -62,15 +66,17 @@ def draw_remedies(found: Remedies) -> Canvas:
     return figure
 
 
-def _draw(axes: Axes, found: Remedies, of: Of) -> None:
+def _draw(axes: Axes, found: Remedies, of: Of, numbers: bool) -> None:
+    """A panel; only the first one says the numbers of filters, as all have one x axis."""
+    shown = [row for row in found.filtered if row.flicker <= FLICKERS_MORE * found.unfiltered.flicker]
     families = list(dict.fromkeys(row.family for row in found.filtered))
     for k, family in enumerate(families):
-        rows = [row for row in found.filtered if row.family == family and math.isfinite(of(row))]
+        rows = [row for row in shown if row.family == family and math.isfinite(of(row))]
         x, y = [100 * row.flicker for row in rows], [of(row) for row in rows]
         marker = "osD^vPX"[k // 8 % 7] if "+" not in family else "X"
         axes.plot(x, y, marker=marker, color=color(k), lw=0.8, label=family, zorder=2)
         for row, u, v in zip(rows, x, y, strict=True):
-            if "+" not in family:
+            if numbers and "+" not in family:
                 number = row.filters.partition(":")[2]
                 axes.annotate(number, (u, v), xytext=(3, 3), textcoords="offset points", fontsize=5.5, color=color(k))
     base = found.unfiltered

@@ -25,8 +25,8 @@ CAPTION = (
     " the next frame sees, those whose label the unfiltered model gives them there; no filter has seen that frame, so"
     " what it merely repeats does not count. Accuracy and mean IoU: of the labelled pixels of single frames. Stable,"
     " wrong: of the places seen again, those that keep a label that is wrong. Lag: frames by which labels follow a true"
-    " change of what is seen later than the model (at most 8). Coverage: labelled pixels for one of the model's. Means"
-    " over scenes."
+    " change of what is seen later than the model (at most 8). Coverage: labelled pixels for one of the model's. ms:"
+    " CPU time a frame. Means over scenes."
 )
 
 
