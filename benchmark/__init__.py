@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from semstab.outputs.loaded import load
     from semstab.outputs.relabel import Belief, relabel
     from semstab.settings import load_config, load_study
+    from semstab.statistics.commit import Commit
 
 __version__ = "0.3.0"
 
 __all__ = [
     "Belief",
+    "Commit",
     "Config",
     "ConfigError",
     "DataError",
@@ -51,6 +53,7 @@ __all__ = [
 
 _HOMES = {
     "Belief": "outputs.relabel",
+    "Commit": "statistics.commit",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",

@@ -13,6 +13,7 @@ from semstab import __version__
 from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
+from semstab.cli.gating import commit, gate
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
@@ -95,6 +96,8 @@ for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (che
     app.command(name)(command)
 app.command("export")(export)
 app.command("relabel")(relabel)
+app.command("gate")(gate)
+app.command("commit")(commit)
 app.command("conform")(conform)
 app.command("view")(view)
 app.command("list")(list_)

@@ -57,8 +57,10 @@ def coverage(new: InfluenceSums, base: InfluenceSums, level: float = LEVEL) -> I
 
 def same_flight(a: InfluenceSums, b: InfluenceSums) -> bool:
     """Whether both have the same groups of frames, so that they can be paired."""
-    a, b = (part.coarsened(part.edge, max(a.step, b.step)) for part in (a, b)) if a.step and b.step else (a, b)
-    one, other = (np.unique(part.frame[part.frame >= 0]) for part in (a, b))
+    step = max(a.step, b.step)
+    if not a.step or not b.step:
+        return False
+    one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step)) for part in (a, b))
     return len(one) > 0 and np.array_equal(one, other)
 
 
