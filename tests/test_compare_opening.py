@@ -15,7 +15,7 @@ from posed_config import configure
 from posed_scene import fails
 
 import semstab
-from semstab.compare.opening import open_contender, open_contenders, save_summary, shared_scenes
+from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.sampling import value
 

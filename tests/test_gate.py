@@ -12,19 +12,19 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import tiny_scene
-from command_line import cli
 from posed_config import configure
 from posed_scene import fails
 from simulated_events import grid, log_of
+from typer.testing import CliRunner
 
 import semstab
+from semstab.cli import app
 from semstab.errors import ConfigError, DataError
 from semstab.gate import gate, gate_config, judging, report
 from semstab.gate.results import GateResult, Judgement
 from semstab.gate.rules import parse
 from semstab.model.statistics import Interval
 from semstab.statistics.sampling import difference, influence_sums, value
-
 
 # --- Rules ------------------------------------------------------------------------------------------------------------
 
@@ -36,7 +36,15 @@ from semstab.statistics.sampling import difference, influence_sums, value
         ("alpha > 0.8", "alpha", None, False, 0.8, None, None),
         ("Accuracy drop<1%", "accuracy", "drop", True, 0.01, None, None),
         ("class human: recall > 0.6", "recall", None, False, 0.6, "human", None),
-        ("scene street 1: class traffic light: IoU drop <= .05", "iou", "drop", True, 0.05, "traffic light", "street 1"),
+        (
+            "scene street 1: class traffic light: IoU drop <= .05",
+            "iou",
+            "drop",
+            True,
+            0.05,
+            "traffic light",
+            "street 1",
+        ),
         ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
         ("stable-and-wrong rise < 1e-2", "wrong_of_stable", "rise", True, 0.01, None, None),
         ("alpha between drop < -0.01", "alpha_between", "drop", True, -0.01, None, None),
@@ -51,7 +59,7 @@ def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("alpha", "write [scene NAME:] [class NAME:] MEASURE [drop|rise] <|> NUMBER[%]"),
+        ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
         ("alpha drop 0.02", "not understood"),
         ("alpha < 1e999", "too large"),
         ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
@@ -128,9 +136,23 @@ def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
     assert outcome(sums(faulty, truth), base) == "fails"
     assert outcome(base, base) == "passes"
     assert outcome(base, base.without_truth()) == "passes"
-    assert outcome(sums(faulty, truth), base, parse("class b: recall drop < 0.02")) == "fails"
+    assert outcome(sums(faulty, truth), base, parse("class b: alpha drop < 0.02")) == "fails"
+    assert outcome(sums(faulty, truth), base, parse("look accuracy drop < 0.02")) == "fails"
+    one = rule.measure, None, 0.05
+    fixed = judging.change(sums(faulty, truth), base, *one, "fixed")
+    loose = judging.change(sums(faulty, truth), base, *one)
+    assert fixed.high - fixed.low < loose.high - loose.low
     assert outcome(sums(faulty[:, :3], truth), sums(labels[:, :3], truth)) == "undecided"
     assert outcome(sums(labels[:, :3], truth), sums(labels[:, :3], truth)) == "undecided"
+
+
+def test_a_rule_of_each_class_shares_the_level(run):
+    rules = gate_config(rules=["class *: alpha > 0.1", "class wall: alpha > 0.1"], level=0.06)
+    *each, alone = gate(f"{run}:a", None, rules).judgements
+    assert [row.rule.text for row in each] == [f"class {name}: alpha > 0.1" for name in ("wall", "door", "window")]
+    assert each[0].found.low < alone.found.low
+    closer = gate(f"{run}:a", None, gate_config(rules=["class wall: alpha > 0.1"], level=0.02)).judgements[0]
+    assert closer.found.low == pytest.approx(each[0].found.low)
 
 
 def test_ends_are_one_sided_and_of_the_sums_differences():
@@ -144,6 +166,10 @@ def test_ends_are_one_sided_and_of_the_sums_differences():
 
 
 # --- The command ------------------------------------------------------------------------------------------------------
+
+
+def cli(*words):
+    return CliRunner().invoke(app, words, env={"COLUMNS": "80", "NO_COLOR": "1"})
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +224,9 @@ def test_bad_input_is_one_line_and_exit_code_2(run, arguments, line):
 
 def test_reports_hold_whatever_names_are():
     rule = parse("class <a|b>&\x07: recall > 0.6")
-    result = GateResult("a|b`c", "", ("s|t",), 0.05, "fail", (Judgement(rule, "undecided", Interval(0.5, 0.4, 0.7), 0.5, math.nan),))
+    result = GateResult(
+        "a|b`c", "", ("s|t",), 0.05, "fail", (Judgement(rule, "undecided", Interval(0.5, 0.4, 0.7), 0.5, math.nan),)
+    )
     assert result.failed
     case = ElementTree.fromstring(report.junit(result)).find("testcase")
     assert case.get("name") == "class <a|b>&?: recall > 0.6"
@@ -221,4 +249,6 @@ def test_the_documented_workflow_is_yaml():
 def test_runs_of_other_voxel_sizes_are_not_compared(run, tmp_path):
     data = run.parent / "wall"
     semstab.run(configure(data, check=None, voxel_size=0.4, backbones=["a"]), out=tmp_path / "large", report=False)
-    fails(DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"]))
+    fails(
+        DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
+    )

@@ -21,12 +21,18 @@ def gate(
         list[str] | None,
         typer.Option("--rule", "-r", metavar="RULE", help="E.g. 'alpha drop < 0.02', 'class car: recall > 0.6'."),
     ] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="YAML file: rules, level, undecided.")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="YAML file: rules, level, undecided, frames.")
+    ] = None,
     level: Annotated[
         float | None, typer.Option(help="How often a rule may err on each side.", show_default="0.05")
     ] = None,
     undecided: Annotated[
         str | None, typer.Option(metavar="pass|fail", help="What becomes of rules that stay open.", show_default="pass")
+    ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="random|fixed", help="For frames like these, or these alone.", show_default="random"),
     ] = None,
     out: Annotated[
         list[Path] | None,
@@ -40,18 +46,18 @@ def gate(
     """Fail where a new model is shown to be worse: exit code 4 where a rule fails."""
     from rich.console import Console
 
-    from semstab.compare.opening import open_contender, save_summary
+    from semstab.comparison.opening import open_contender, save_summary
     from semstab.gate import gate as judge
     from semstab.gate import gate_config, report
 
     report.require_formats(out or ())
     console = Console(quiet=quiet)
     if save_baseline is None or rule or config:
-        result = judge(new, against, gate_config(config, rule or (), level, undecided))
+        result = judge(new, against, gate_config(config, rule or (), level, undecided, frames))
         for file in out or ():
             report.write(result, file)
-        for line in report.lines(result):
-            console.print(line, markup=False, highlight=False)
+        for line in report.lines(result, console.width):
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
         if result.failed:
             raise typer.Exit(FAILED)
     if save_baseline is not None:
@@ -74,4 +80,4 @@ def commit(
     found = calibrated(run, precision=precision, confidence=confidence)
     found.save(out)
     for line in lines(found):
-        Console(quiet=quiet).print(line, markup=False, highlight=False)
+        Console(quiet=quiet).print(line, markup=False, highlight=False, soft_wrap=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.compare.opening import Contender, Entry, open_contender, shared_scenes
+from semstab.comparison.opening import Contender, Entry, open_contender, shared_scenes
 from semstab.config import nearest
 from semstab.errors import ConfigError, DataError
 from semstab.gate import judging
@@ -31,17 +31,29 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
 
     Raises ConfigError and DataError, each with the rule or the folder, and what to do.
     """
-    rules = [parse(text) for text in config.rules]
+    parsed = [parse(text) for text in config.rules]
     own = open_contender(new)
     base = None if against is None else open_contender(against)
     scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
-    for rule in rules:
-        _check(rule, own, base, scenes)
-    judged = tuple(_judged(rule, own, base, scenes, config.level) for rule in rules)
+    judged: list[Judgement] = []
+    for given in parsed:
+        rules = given.of_each(own.scenes[scenes[0]].classes)
+        for rule in rules:
+            _check(rule, own, base, scenes)
+        ways = _Ways(config.level / len(rules), config.frames)
+        judged += [_judged(rule, own, base, scenes, ways) for rule in rules]
     return GateResult(
-        _named(own), "" if base is None else _named(base), scenes, config.level, config.undecided, judged,
+        _named(own), "" if base is None else _named(base), scenes, config.level, config.undecided, tuple(judged),
         tuple(_remarks(own, base, scenes)),
     )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ways:
+    """How a rule is judged: with what error on either side, for which frames."""
+
+    level: float
+    frames: judging.Frames
 
 
 def _named(run: Contender) -> str:
@@ -98,14 +110,14 @@ def _k(rule: Rule, entry: Entry) -> int | None:
 # --- Rules ------------------------------------------------------------------------------------------------------------
 
 
-def _judged(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[str], level: float) -> Judgement:
+def _judged(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[str], ways: _Ways) -> Judgement:
     """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
     pairs = [
         (own.scenes[scene], None if base is None else base.scenes[scene])
         for scene in ([rule.scene] if rule.scene else scenes)
     ]
-    each = [_found(rule, new, old, level) for new, old in pairs]
-    found = mean_of(each, 1 - 2 * level)
+    each = [_found(rule, new, old, ways) for new, old in pairs]
+    found = mean_of(each, 1 - 2 * ways.level)
     return Judgement(
         rule,
         judging.verdict(rule, found),
@@ -123,25 +135,25 @@ def _value(rule: Rule, entry: Entry) -> float:
     return value(entry.sums, SUMS.get(rule.measure.key, rule.measure.key), _k(rule, entry))
 
 
-def _found(rule: Rule, new: Entry, base: Entry | None, level: float) -> Interval:
+def _found(rule: Rule, new: Entry, base: Entry | None, ways: _Ways) -> Interval:
     """What a rule bounds, in one scene."""
     if rule.change is None:
-        return _own(rule, new, level)
+        return _own(rule, new, ways)
     assert base is not None
     if rule.measure.quantity is FLICKER:
-        found = _flicker(new, base, level)
+        found = _flicker(new, base, ways.level)
     else:
-        found = judging.change(new.sums, base.sums, rule.measure, _k(rule, new), level)
+        found = judging.change(new.sums, base.sums, rule.measure, _k(rule, new), ways.level, ways.frames)
     if rule.measure.key in OF_EVIDENCE and (new.summary.reduced is None) != (base.summary.reduced is None):
         found = dataclasses.replace(found, undecided=SCORES)
     return found if rule.change == "rise" else judging.negative(found)
 
 
-def _own(rule: Rule, entry: Entry, level: float) -> Interval:
+def _own(rule: Rule, entry: Entry, ways: _Ways) -> Interval:
     if rule.measure.quantity is not FLICKER:
-        return judging.value(entry.sums, rule.measure, _k(rule, entry), level)
+        return judging.value(entry.sums, rule.measure, _k(rule, entry), ways.level, ways.frames)
     frames, percent = np.array(list(entry.flicker)), np.array(list(entry.flicker.values()))
-    return judging.of_frames(mean_over_frames(frames, percent, 1 - 2 * level), len(frames))
+    return judging.of_frames(mean_over_frames(frames, percent, 1 - 2 * ways.level), len(frames))
 
 
 def _flicker(new: Entry, base: Entry, level: float) -> Interval:

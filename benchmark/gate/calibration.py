@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from semstab.compare.opening import open_contender
+from semstab.comparison.opening import open_contender
 from semstab.errors import ConfigError, DataError
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.commit import Commit, calibrate
@@ -41,14 +41,15 @@ def lines(commit: Commit) -> Iterator[str]:
         f"labels that are right with a probability of {commit.precision:g} or more, class by class at a confidence of"
         f" {commit.confidence:g}; calibrated on {commit.calibrated_on}"
     )
-    width = max((len(name) for name in commit.classes), default=0)
-    width = min(width, 24)
+    width = min(max(map(len, commit.classes), default=0), 20)
     for name, own in commit.classes.items():
-        if own.by is None:
-            yield f"  {name[:width]:<{width}}  never: no threshold is shown to reach it"
+        right = f"{own.by:<6} >= {own.at_least:<5.3g} right in {own.precision:.3f}, at least {own.low:.3f}"
+        if not own.voxels:
+            yield f"  {name[:width]:<{width}}  never: no label of it has a known truth"
+        elif own.never:
+            yield f"  {name[:width]:<{width}}  never; best {right} ({own.voxels:,} voxels)"
         else:
-            yield (
-                f"  {name[:width]:<{width}}  {own.by:<6} >= {own.at_least:<6.3g} right {own.precision:.3f} (at least"
-                f" {own.low:.3f}), {own.left:.0%} left"
-            )
+            yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
     yield f"{commit.left:.1%} of the voxels are left"
+    if any(own.never for own in commit.classes.values()):
+        yield "more places, in other scenes, show more: errors near each other count as few"

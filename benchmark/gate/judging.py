@@ -8,7 +8,7 @@ from typing import Literal
 
 from semstab.gate.measures import SUMS, GateMeasure
 from semstab.gate.rules import Rule
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
 from semstab.statistics.sampling import (
     LEAST_FRAMES,
     InfluenceSums,
@@ -19,13 +19,15 @@ from semstab.statistics.sampling import (
     of_places_alone,
     same_flight,
 )
-from semstab.statistics.sampling.intervals import TOO_FEW
+from semstab.statistics.sampling.intervals import LEAST_DEGREES, TOO_FEW
 
 Verdict = Literal["passes", "fails", "undecided"]
+Frames = Literal["random", "fixed"]
 
 LEAST = 8
 """Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
 
+AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
 FEW = "{frames} frames are too few: fly {least} or more"
 
 
@@ -43,8 +45,15 @@ def verdict(rule: Rule, found: Interval) -> Verdict:
     return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
 
 
-def change(new: InfluenceSums, base: InfluenceSums, measure: GateMeasure, k: int | None, level: float) -> Interval:
-    """New less base, each end of its interval passed with probability `level`."""
+def change(
+    new: InfluenceSums,
+    base: InfluenceSums,
+    measure: GateMeasure,
+    k: int | None,
+    level: float,
+    frames: Frames = "random",
+) -> Interval:
+    """New less base, each end of its interval missed with probability `level`."""
     key, both = SUMS.get(measure.key, measure.key), 1 - 2 * level
     new, base = comparable(new, base)
     if identical(new, base):
@@ -53,18 +62,20 @@ def change(new: InfluenceSums, base: InfluenceSums, measure: GateMeasure, k: int
     if key == "coverage":
         found = coverage(new, base, both)
         found = dataclasses.replace(found, value=found.value - 1, low=found.low - 1, high=found.high - 1)
-    elif of_places_alone(key, k):
-        found = difference(new, base, key, k, THIS_MAP, same_frames=True, level=both)
     else:
-        found = difference(new, base, key, k, NEXT_FLIGHT, same_frames=same_flight(new, base), level=both)
+        paired = frames == "fixed" or same_flight(new, base)
+        found = difference(new, base, key, k, _question(key, k, frames), same_frames=paired, level=both)
     return of_frames(found, _frames(new, base))
 
 
-def value(new: InfluenceSums, measure: GateMeasure, k: int | None, level: float) -> Interval:
-    """The number itself, each end of its interval passed with probability `level`."""
+def value(new: InfluenceSums, measure: GateMeasure, k: int | None, level: float, frames: Frames = "random") -> Interval:
+    """The number itself, each end of its interval missed with probability `level`."""
     key = SUMS.get(measure.key, measure.key)
-    question = THIS_MAP if of_places_alone(key, k) else NEXT_FLIGHT
-    return of_frames(estimate(new, key, k, question, 1 - 2 * level), _frames(new))
+    return of_frames(estimate(new, key, k, _question(key, k, frames), 1 - 2 * level), _frames(new))
+
+
+def _question(key: str, k: int | None, frames: Frames) -> Question:
+    return THIS_MAP if frames == "fixed" or of_places_alone(key, k) else NEXT_FLIGHT
 
 
 def comparable(new: InfluenceSums, base: InfluenceSums) -> tuple[InfluenceSums, InfluenceSums]:
@@ -76,13 +87,15 @@ def comparable(new: InfluenceSums, base: InfluenceSums) -> tuple[InfluenceSums, 
 
 def negative(found: Interval) -> Interval:
     """Of the opposite number."""
-    return dataclasses.replace(found, value=-found.value, low=-found.high, high=-found.low)
+    return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
 
 
 def of_frames(found: Interval, frames: int) -> Interval:
     """With this gate's own least number of frames: a rule is judged for frames like these."""
     few = TOO_FEW.format(least=LEAST_FRAMES)
     reasons = [reason for reason in found.undecided.split("; ") if reason and reason != few]
+    if not reasons and found.question == NEXT_FLIGHT and found.degrees < LEAST_DEGREES:
+        reasons.append(AS_LONG)
     if frames < LEAST:
         reasons.append(FEW.format(frames=frames, least=LEAST))
     return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))

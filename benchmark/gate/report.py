@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,6 +16,7 @@ from semstab.runtime.files import write_text
 from semstab.runtime.json_form import to_json
 
 SCHEMA = 1
+INDENT = 10
 SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "❔"}
 
 
@@ -31,17 +33,25 @@ def _plural(verdict: str, n: int) -> str:
     return verdict if n == 1 or verdict == "undecided" else {"fails": "fail", "passes": "pass"}[verdict]
 
 
-def lines(result: GateResult) -> Iterator[str]:
+def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     """For the terminal."""
-    yield f"gate: {result.new}" + (f" against {result.against}" if result.against else "")
-    yield f"  {_scenes(result)}; each end of an interval is passed in {100 * result.level:g} % of cases"
+    yield from _wrapped(f"gate: {result.new}" + (f" against {result.against}" if result.against else ""), width, 2)
+    yield from _wrapped(f"  {_scenes(result)}; {_ends(result)}", width, 2)
     for remark in result.remarks:
-        yield f"  {remark}"
+        yield from _wrapped(f"  {remark}", width, 2)
     for each in result.judgements:
-        yield f"{each.verdict.upper():<9} {each.rule.text}"
-        yield f"          {each.values}"
-        yield f"          {each.reason}; {each.about}"
+        yield from _wrapped(f"{each.verdict.upper():<9} {each.rule.text}", width, INDENT)
+        yield from _wrapped(f"{'':{INDENT}}{each.values}", width, INDENT)
+        yield from _wrapped(f"{'':{INDENT}}{each.reason} ({each.about})", width, INDENT)
     yield headline(result)
+
+
+def _wrapped(line: str, width: int, indent: int) -> list[str]:
+    return textwrap.wrap(line, max(width, 40), subsequent_indent=" " * indent, break_on_hyphens=False)
+
+
+def _ends(result: GateResult) -> str:
+    return f"either end of an interval is missed in {100 * result.level:g} % of cases"
 
 
 def _scenes(result: GateResult) -> str:
@@ -56,18 +66,17 @@ def markdown(result: GateResult) -> str:
     """A summary for a pull request."""
     against = f" against {_code(result.against)}" if result.against else ""
     rows = [
-        f"| {SIGNS[each.verdict]} {each.verdict} | {_code(each.rule.text)} | {each.values} | {_cell(each.reason)};"
-        f" {each.about} |"
+        f"| {SIGNS[each.verdict]} {each.verdict} | {_code(each.rule.text)} | {each.values} | {_cell(each.reason)}"
+        f" ({each.about}) |"
         for each in result.judgements
     ]
     text = [
         f"### {SIGNS['fails' if result.failed else 'passes']} semstab gate: {headline(result)}",
         "",
-        f"{_code(result.new)}{against}, {_cell(_scenes(result))}. Each end of an interval is passed in"
-        f" {100 * result.level:g} % of cases.",
+        f"{_code(result.new)}{against}, {_cell(_scenes(result))}; {_ends(result)}.",
         *(f"\n{_cell(remark)}" for remark in result.remarks),
         "",
-        "| | rule | found | why; for which data |",
+        "| | rule | found | why (for which data) |",
         "|---|---|---|---|",
         *rows,
     ]
@@ -123,7 +132,7 @@ def junit(result: GateResult) -> str:
 
 
 def _story(each: Judgement) -> str:
-    return f"{each.values}; {each.reason}; {each.about}"
+    return f"{each.values}; {each.reason} ({each.about})"
 
 
 def _xml(text: str) -> str:

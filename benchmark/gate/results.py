@@ -48,7 +48,7 @@ class Judgement:
     def digits(self, value: float) -> str:
         """A number of the rule's measure."""
         measure: GateMeasure = self.rule.measure
-        return "-" if math.isnan(value) else f"{value:.{measure.quantity.digits[0]}f}"
+        return "-" if math.isnan(value) else f"{value:z.{measure.quantity.digits[0]}f}"
 
     @property
     def values(self) -> str:

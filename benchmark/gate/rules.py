@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +14,10 @@ from semstab.gate.measures import GateMeasure, measure_named
 
 Change = Literal["drop", "rise"]
 
-GRAMMAR = "[scene NAME:] [class NAME:] MEASURE [drop|rise] <|> NUMBER[%]"
+ALL = "*"
+"""Instead of a class' name: a rule of each class."""
+
+GRAMMAR = "[scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"
 
 RULE = re.compile(
     r"\s*(?:scene\s+(?P<scene>[^:]+?)\s*:\s*)?(?:class\s+(?P<class>.+?)\s*:\s*)?"
@@ -40,18 +45,19 @@ class Rule:
     scene: str | None = None
     class_name: str | None = None
 
+    def of_each(self, classes: Sequence[str]) -> tuple[Rule, ...]:
+        """The rules that it stands for: itself, or with 'class *' one for each class."""
+        if self.class_name != ALL:
+            return (self,)
+        return tuple(
+            dataclasses.replace(self, text=self.text.replace(ALL, name, 1), class_name=name) for name in classes
+        )
+
     @property
     def bounds_a_loss(self) -> bool:
         """Whether it says how much worse the measure may become."""
         loss = "drop" if self.measure.quantity.better == "higher" else "rise"
         return self.below and self.change == loss
-
-    @property
-    def of(self) -> str:
-        """What its numbers are of: 'recall of human, drop'."""
-        whose = f" of {self.class_name}" if self.class_name else ""
-        where = f" in {self.scene}" if self.scene else ""
-        return f"{self.measure.quantity.word}{whose}{where}" + (f", {self.change}" if self.change else "")
 
 
 def parse(text: str) -> Rule:

@@ -20,7 +20,7 @@ from semstab.runtime.files import write_text
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth
 from semstab.statistics.sampling.collect import cell_edge, cells_of
-from semstab.statistics.sampling.intervals import LEAST_DEGREES, of_places
+from semstab.statistics.sampling.intervals import of_places
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -37,8 +37,8 @@ EVIDENCE: Mapping[Evidence, Callable[[Beliefs], npt.NDArray[np.generic]]] = {
 STEPS = 8
 """Thresholds that are tried of each, at equal shares of a class' voxels."""
 
-CUBES = 100
-"""Of space, at most, in which labels are counted: those near each other err together."""
+FEW_CUBES = 3
+"""In no more cubes with an error it is not seen how far errors reach."""
 
 NEVER = -1
 """Instead of a class: the label is not acted on."""
@@ -47,17 +47,19 @@ NEVER = -1
 class Threshold(BaseModel):
     """From where on the labels of a class are acted on, and what the calibration showed of them.
 
-    by, at_least  the evidence that is asked for; none where no threshold reaches the precision, so that it never is
+    by, at_least  the evidence that is asked for
+    never         that no threshold is shown to reach the precision: labels are not acted on; the rest is of the best
     precision, low  share of such labels that are right, and the lower end of its one-sided interval
     voxels, left    labels of the class with a known truth that were counted; share of all its labels that is left
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    by: Evidence | None = None
+    by: Evidence = "op"
     at_least: float = 0.0
-    precision: float | None = None
-    low: float | None = None
+    never: bool = False
+    precision: float = 0.0
+    low: float = 0.0
     voxels: int = 0
     left: float = 0.0
 
@@ -90,7 +92,7 @@ class Commit(BaseModel):
 
     def save(self, path: str | Path) -> None:
         """Write YAML, atomically."""
-        content = self.model_dump(by_alias=True, exclude_none=True)
+        content = self.model_dump(by_alias=True)
         write_text(Path(path), yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
     def decide(self, table: VoxelTable) -> Int64:
@@ -103,7 +105,8 @@ class Commit(BaseModel):
         least = np.full((len(EVIDENCE), table.K), np.inf)
         for k, name in enumerate(table.classes):
             chosen = self.classes[name]
-            least[[by == chosen.by for by in EVIDENCE], k] = chosen.at_least
+            if not chosen.never:
+                least[list(EVIDENCE).index(chosen.by), k] = chosen.at_least
         enough = np.zeros(len(table), np.bool_)
         for of, at_least in zip(EVIDENCE.values(), least, strict=True):
             enough |= np.asarray(of(table)) >= at_least[label]
@@ -133,7 +136,8 @@ def calibrate(
     STEPS thresholds of each evidence are tried. One is taken where the lower end of the share of right labels is at
     least the precision, at the error 1 - confidence divided by all that are tried (Bonferroni; as in Angelopoulos et
     al. 2021, Learn then Test). The end is Clopper and Pearson's, for as many labels as these are worth (Korn and
-    Graubard 1998): the variance is that of cubes of space, with errors that reach as far as the data show.
+    Graubard 1998): the variance is that of cubes of space, with errors that reach as far as the data show. Where errors
+    are too few for that, cubes are counted instead of labels.
     """
     tables = [table for table, _ in maps]
     if not 0 < precision < 1 or not 0.5 <= confidence < 1:
@@ -173,20 +177,30 @@ class _Labels:
     ) -> None:
         self._right, self._evidence = right, evidence
         if len(index):
-            edge = cell_edge(index, size)
-            while len((cubes := cells_of(index, size, edge))[0]) > CUBES:
-                edge *= 2
-            self._cell, self._of, self._edge = *cubes, edge
+            self._edge = cell_edge(index, size)
+            self._cell, self._of = cells_of(index, size, self._edge)
 
     def least(self, precision: float, error: float) -> Threshold:
         """The threshold that leaves most of them."""
-        tried = [(by, at) for by in self._evidence for at in self._steps(by)]
-        kept = {pair: int((self._evidence[pair[0]] >= pair[1]).sum()) for pair in tried}
+        tried, kept = self._tried()
+        best = Threshold(never=True)
         for by, at in sorted(tried, key=lambda pair: -kept[pair]):
             share, low = self._share(by, at, error / len(tried))
+            found = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=kept[by, at])
             if low >= precision:
-                return Threshold(by=by, at_least=at, precision=share, low=low, voxels=kept[by, at])
-        return Threshold()
+                return found
+            best = max(best, found, key=lambda each: each.low)
+        return best
+
+    def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
+        """Thresholds that leave different labels, and how many each leaves."""
+        tried: dict[bytes, tuple[Evidence, float]] = {}
+        kept = {}
+        for by in self._evidence:
+            for at in self._steps(by):
+                some = self._evidence[by] >= at
+                kept[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
+        return list(tried.values()), kept
 
     def _steps(self, by: Evidence) -> list[float]:
         """Thresholds that are tried, chosen without a look at what is right."""
@@ -200,9 +214,28 @@ class _Labels:
         some = self._evidence[by] >= at
         of, cells = self._of[some], len(self._cell)
         right, every = self._right[some].astype(np.float64), np.ones(len(of))
-        sums = np.stack([np.bincount(of, weights=each, minlength=cells) for each in (right, every)], axis=1)
-        found = of_places(self._cell, self._edge, sums.astype(np.float64), ratio_of, "share", (0.0, 1.0), 1 - 2 * error)
-        return found.value, found.low if found.decided and found.places >= LEAST_DEGREES else -math.inf
+        sums: Float64 = np.stack(
+            [np.bincount(of, weights=each, minlength=cells) for each in (right, every)], axis=1
+        ).astype(float)
+        sums = sums[sums[:, 1] > 0]
+        if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
+            return _of_few(sums, error)
+        found = of_places(self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error)
+        return found.value, found.low if found.decided else 0.0
+
+
+def _of_few(sums: Float64, error: float) -> tuple[float, float]:
+    """The share that is right and its lower end, where too few cubes (m, 2) hold an error to tell how far these reach.
+
+    Cubes, of one size, count as right or wrong as a whole (Clopper and Pearson 1934).
+    """
+    from scipy import stats
+
+    right, size = sums.sum(axis=0)
+    cubes = size**2 / float((sums[:, 1] ** 2).sum())
+    wrong = max(np.count_nonzero(sums[:, 0] < sums[:, 1]), cubes * (1 - right / size))
+    low = float(stats.beta.ppf(error, cubes - wrong, wrong + 1)) if cubes > wrong else 0.0
+    return float(right / size), low
 
 
 def _few(names: Sequence[str] | Mapping[str, Threshold]) -> str:

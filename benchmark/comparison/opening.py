@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from semstab.compare.baseline import Baseline, Kept, load_baseline, save_baseline
+from semstab.comparison.baseline import Baseline, Kept, load_baseline, save_baseline
 from semstab.config import nearest
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
@@ -178,7 +178,10 @@ def _sums(folder: Path, record: Record) -> InfluenceSums:
     file = record.influence_file
     if file is None or not file.is_file():
         raise DataError(f"{folder}: kept no sums by frame and place of {record.unit.slug}; run it again")
-    return InfluenceSums.load(file)
+    try:
+        return InfluenceSums.load(file)
+    except DataError as error:
+        raise DataError(f"{error}; run it again") from error
 
 
 def _flicker(file: Path | None) -> Flicker:
