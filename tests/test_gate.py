@@ -158,7 +158,7 @@ def test_a_rule_of_each_class_shares_the_level(run):
 def test_ends_are_one_sided_and_of_the_sums_differences():
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
-    for key in ("alpha", "miou"):
+    for key in ("alpha", "look_accuracy"):
         found = judging.change(new, base, parse(f"{key} drop < 1").measure, None, 0.05)
         both = difference(new, base, key, same_frames=True, level=0.9)
         assert (found.value, found.low, found.high) == (both.value, both.low, both.high)

@@ -56,12 +56,14 @@ def change(
     """New less base, each end of its interval missed with probability `level`."""
     key, both = SUMS.get(measure.key, measure.key), 1 - 2 * level
     new, base = comparable(new, base)
-    if identical(new, base):
-        same = estimate(new, key, k, THIS_MAP) if key != "coverage" else coverage(new, base)
-        return of_frames(dataclasses.replace(same, value=0.0, low=0.0, high=0.0, undecided=""), _frames(new, base))
     if key == "coverage":
         found = coverage(new, base, both)
+        if identical(new, base, "psa"):
+            found = dataclasses.replace(found, value=1.0, low=1.0, high=1.0, undecided="")
         found = dataclasses.replace(found, value=found.value - 1, low=found.low - 1, high=found.high - 1)
+    elif identical(new, base, key, k):
+        same = estimate(new, key, k, _question(key, k, frames))
+        found = dataclasses.replace(same, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="")
     else:
         paired = frames == "fixed" or same_flight(new, base)
         found = difference(new, base, key, k, _question(key, k, frames), same_frames=paired, level=both)

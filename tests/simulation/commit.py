@@ -29,7 +29,7 @@ CLASSES = ("a", "b")
 def conditions() -> list[tuple[str, Flight]]:
     """Errors that reach half a voxel to six, on floors of 1,024 and 4,096 voxels."""
     return [
-        (f"{side} x {side}, errors reach {reach:g} voxels", Flight(side, reach, 1.6, 6, 6, "uneven"))
+        (f"{side} x {side}, errors reach {reach:g} voxels", Flight(side, reach, 0.6, 6, 6, "uneven"))
         for side in (32, 64)
         for reach in (0.5, 2.0, 6.0)
     ]
