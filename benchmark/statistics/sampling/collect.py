@@ -14,7 +14,7 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
-from semstab.statistics.sampling.influence import MOST_CELLS, MOST_GROUPS, InfluenceSums
+from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
 
@@ -72,7 +72,8 @@ def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float
     again = np.flatnonzero(op >= 2)
     index = np.stack([events.ix, events.iy, events.iz], axis=1)
     at, of = cells_of(index[again], events.voxel_size, edge)
-    step, K = _step(events.frame), int(events.evidence.shape[1])
+    K = int(events.evidence.shape[1])
+    step = _step(events.frame, K)
     frames, group = np.unique(events.frame // step, return_inverse=True)
     sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
@@ -160,9 +161,9 @@ def cell_edge(index: npt.NDArray[np.int32], voxel_size: float) -> float:
     return edge
 
 
-def _step(frame: npt.NDArray[np.int32]) -> int:
+def _step(frame: npt.NDArray[np.int32], K: int) -> int:
     step, distinct = 1, np.unique(frame)
-    while len(distinct) > MOST_GROUPS:
+    while len(distinct) > most_groups(K):
         step, distinct = 2 * step, np.unique(distinct // 2)
     return step
 
