@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
+    from semstab.gating import GateConfig, gate
     from semstab.model.frames import Frame, Intrinsics
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
@@ -30,6 +31,7 @@ __all__ = [
     "DataError",
     "Events",
     "Frame",
+    "GateConfig",
     "Intrinsics",
     "LabelSpace",
     "MissingDependencyError",
@@ -40,6 +42,7 @@ __all__ = [
     "datasets",
     "engine",
     "export",
+    "gate",
     "load",
     "load_config",
     "load_result",
@@ -59,12 +62,14 @@ _HOMES = {
     "DataError": "errors",
     "Events": "model.voxels",
     "Frame": "model.frames",
+    "GateConfig": "gating",
     "Intrinsics": "model.frames",
     "LabelSpace": "model.labels",
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
     "export": "outputs.export",
+    "gate": "gating",
     "load": "outputs.loaded",
     "load_config": "settings",
     "load_result": "engine.folder",

@@ -20,9 +20,9 @@ from typer.testing import CliRunner
 import semstab
 from semstab.cli import app
 from semstab.errors import ConfigError, DataError
-from semstab.gate import gate, gate_config, judging, report
-from semstab.gate.results import GateResult, Judgement
-from semstab.gate.rules import parse
+from semstab.gating import gate, gate_config, judging, report
+from semstab.gating.results import GateResult, Judgement
+from semstab.gating.rules import parse
 from semstab.model.statistics import Interval
 from semstab.statistics.sampling import difference, influence_sums, value
 
@@ -46,13 +46,13 @@ from semstab.statistics.sampling import difference, influence_sums, value
             "street 1",
         ),
         ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
-        ("stable-and-wrong rise < 1e-2", "wrong_of_stable", "rise", True, 0.01, None, None),
-        ("alpha between drop < -0.01", "alpha_between", "drop", True, -0.01, None, None),
+        ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
+        ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
     ],
 )
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     rule = parse(text)
-    found = (rule.measure.key, rule.change, rule.below, rule.limit, rule.class_name, rule.scene)
+    found = (rule.measure.name, rule.change, rule.below, rule.limit, rule.class_name, rule.scene)
     assert found == (key, change, below, pytest.approx(limit), class_name, scene)
 
 
@@ -159,7 +159,7 @@ def test_ends_are_one_sided_and_of_the_sums_differences():
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
     for key in ("alpha", "look_accuracy"):
-        found = judging.change(new, base, parse(f"{key} drop < 1").measure, None, 0.05)
+        found = judging.change(new, base, parse(f"{key.replace('_', ' ')} drop < 1").measure, None, 0.05)
         both = difference(new, base, key, same_frames=True, level=0.9)
         assert (found.value, found.low, found.high) == (both.value, both.low, both.high)
         assert found.value == pytest.approx(value(new, key) - value(base, key))

@@ -47,8 +47,8 @@ def gate(
     from rich.console import Console
 
     from semstab.comparison.opening import open_contender, save_summary
-    from semstab.gate import gate as judge
-    from semstab.gate import gate_config, report
+    from semstab.gating import gate as judge
+    from semstab.gating import gate_config, report
 
     report.require_formats(out or ())
     console = Console(quiet=quiet)
@@ -75,7 +75,7 @@ def commit(
     """For each class the least evidence at which its labels are right often enough to be acted on."""
     from rich.console import Console
 
-    from semstab.gate.calibration import calibrated, lines
+    from semstab.gating.calibration import calibrated, lines
 
     found = calibrated(run, precision=precision, confidence=confidence)
     found.save(out)

@@ -16,8 +16,8 @@ from collections.abc import Iterator
 import numpy as np
 from flights import Flight, World, fly, sums_of, world
 
-from semstab.gate.judging import change, negative, verdict
-from semstab.gate.rules import parse
+from semstab.gating.judging import change, negative, verdict
+from semstab.gating.rules import parse
 from semstab.model.statistics import Interval
 from semstab.statistics.sampling import InfluenceSums
 from semstab.statistics.sampling.influence import FUNCTIONALS

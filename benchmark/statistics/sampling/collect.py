@@ -240,5 +240,5 @@ def _sums_of_table(
     columns = np.zeros((len(T), width(table.K, truth=true_label is not None)))
     for name, own in layout(table.K, truth=true_label is not None).items():
         if name not in OF_PLACES:
-            columns[:, own] = np.asarray(values[name], float).reshape(len(T), -1)
+            columns[:, own] = np.asarray(values[name], float).reshape(len(T), own.stop - own.start)
     return np.stack([np.bincount(of, weights=column, minlength=cells) for column in columns.T], axis=1)

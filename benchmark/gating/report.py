@@ -10,8 +10,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from semstab.errors import ConfigError
-from semstab.gate.judging import Verdict
-from semstab.gate.results import GateResult, Judgement
+from semstab.gating.judging import Verdict
+from semstab.gating.results import GateResult, Judgement
 from semstab.runtime.files import write_text
 from semstab.runtime.json_form import to_json
 
@@ -96,7 +96,7 @@ def as_json(result: GateResult) -> str:
     """For programs."""
     rows = [
         {
-            "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.key,
+            "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.name,
             "class": each.rule.class_name, "scene": each.rule.scene, "change": each.rule.change,
             "limit": each.rule.limit, "new": each.new, "base": each.base, "found": each.found, "reason": each.reason,
             "about": each.about,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semstab.errors import ConfigError
-from semstab.gate.measures import GateMeasure, measure_named
+from semstab.gating.measures import GateMeasure, measure_named
 
 Change = Literal["drop", "rise"]
 
@@ -78,7 +78,7 @@ def parse(text: str) -> Rule:
 
 
 def _check(rule: Rule) -> None:
-    name = rule.measure.key.replace("_", " ")
+    name = rule.measure.name
     if not math.isfinite(rule.limit):
         raise ConfigError(f"rule '{rule.text}': its number is too large")
     if rule.class_name is None and not rule.measure.of_all:

@@ -6,8 +6,8 @@ import dataclasses
 import math
 from typing import Literal
 
-from semstab.gate.measures import SUMS, GateMeasure
-from semstab.gate.rules import Rule
+from semstab.gating.measures import GateMeasure
+from semstab.gating.rules import Rule
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
 from semstab.statistics.sampling import (
     LEAST_FRAMES,
@@ -54,7 +54,7 @@ def change(
     frames: Frames = "random",
 ) -> Interval:
     """New less base, each end of its interval missed with probability `level`."""
-    key, both = SUMS.get(measure.key, measure.key), 1 - 2 * level
+    key, both = measure.key, 1 - 2 * level
     new, base = comparable(new, base)
     if key == "coverage":
         found = coverage(new, base, both)
@@ -72,7 +72,7 @@ def change(
 
 def value(new: InfluenceSums, measure: GateMeasure, k: int | None, level: float, frames: Frames = "random") -> Interval:
     """The number itself, each end of its interval missed with probability `level`."""
-    key = SUMS.get(measure.key, measure.key)
+    key = measure.key
     return of_frames(estimate(new, key, k, _question(key, k, frames), 1 - 2 * level), _frames(new))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from semstab.gate.judging import Verdict
-from semstab.gate.measures import GateMeasure
-from semstab.gate.rules import Rule
+from semstab.gating.judging import Verdict
+from semstab.gating.measures import GateMeasure
+from semstab.gating.rules import Rule
 from semstab.model.statistics import NEXT_FLIGHT, Interval
 from semstab.statistics.sampling import LEAST_FRAMES
 

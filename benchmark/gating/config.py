@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.config import read_yaml, validated
 from semstab.errors import ConfigError
-from semstab.gate.judging import Frames
+from semstab.gating.judging import Frames
 
 
 class GateConfig(BaseModel):

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from semstab.comparison.opening import Contender, Entry, open_contender, shared_scenes
+from semstab.comparison.quantities import COVERAGE, FLICKER, SBD_EXCESS
 from semstab.config import nearest
 from semstab.errors import ConfigError, DataError
-from semstab.gate import judging
-from semstab.gate.config import GateConfig, gate_config
-from semstab.gate.measures import COVERAGE, FLICKER, OF_EVIDENCE, SUMS
-from semstab.gate.results import GateResult, Judgement
-from semstab.gate.rules import Rule, parse
+from semstab.gating import judging
+from semstab.gating.config import GateConfig, gate_config
+from semstab.gating.measures import OF_EVIDENCE
+from semstab.gating.results import GateResult, Judgement
+from semstab.gating.rules import Rule, parse
 from semstab.model.statistics import NEXT_FLIGHT, Interval
 from semstab.statistics.sampling import mean_of, mean_over_frames, value
 from semstab.statistics.sampling.influence import columns_of
@@ -83,7 +84,7 @@ def _check(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[
             )
         for entry in entries:
             if not _has(rule, entry):
-                name = rule.measure.key.replace("_", " ")
+                name = rule.measure.name
                 raise ConfigError(f"rule '{rule.text}': {entry.where} has no {name} of {scene}; {rule.measure.lacking}")
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
@@ -99,8 +100,8 @@ def _has(rule: Rule, entry: Entry) -> bool:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
         return True
-    columns = columns_of(entry.sums, SUMS.get(rule.measure.key, rule.measure.key), _k(rule, entry))
-    return bool(columns.size) and (rule.measure.key != "sbd_excess" or bool(columns[:, 1].any()))
+    columns = columns_of(entry.sums, rule.measure.key, _k(rule, entry))
+    return bool(columns.size) and (rule.measure.quantity is not SBD_EXCESS or bool(columns[:, 1].any()))
 
 
 def _k(rule: Rule, entry: Entry) -> int | None:
@@ -132,7 +133,7 @@ def _value(rule: Rule, entry: Entry) -> float:
         return float(np.mean(list(entry.flicker.values())))
     if rule.measure.quantity is COVERAGE:
         return math.nan
-    return value(entry.sums, SUMS.get(rule.measure.key, rule.measure.key), _k(rule, entry))
+    return value(entry.sums, rule.measure.key, _k(rule, entry))
 
 
 def _found(rule: Rule, new: Entry, base: Entry | None, ways: _Ways) -> Interval:
@@ -144,7 +145,7 @@ def _found(rule: Rule, new: Entry, base: Entry | None, ways: _Ways) -> Interval:
         found = _flicker(new, base, ways.level)
     else:
         found = judging.change(new.sums, base.sums, rule.measure, _k(rule, new), ways.level, ways.frames)
-    if rule.measure.key in OF_EVIDENCE and (new.summary.reduced is None) != (base.summary.reduced is None):
+    if rule.measure.quantity in OF_EVIDENCE and (new.summary.reduced is None) != (base.summary.reduced is None):
         found = dataclasses.replace(found, undecided=SCORES)
     return found if rule.change == "rise" else judging.negative(found)
 
