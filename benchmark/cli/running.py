@@ -92,14 +92,10 @@ def run(
     ] = None,
     options: DatasetOptions = None,
     trust_geometry: TrustGeometry = False,
-    events: Annotated[
-        bool | None, typer.Option("--events", metavar="", help="Also write the log of observations.")
-    ] = None,
+    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
     statistics: Annotated[
         bool | None,
-        typer.Option(
-            "--statistics", metavar="", help="Also test drift, judge by ground truth, compare backbones; takes longer."
-        ),
+        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: Rerun = None,

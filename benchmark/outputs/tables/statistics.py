@@ -71,7 +71,7 @@ def class_agreement(result: Result) -> list[Table]:
         Column("alpha_between", "found", 2, "higher", over="Alpha between frames"),
         Column("ceiling", "ceiling", 2, over="Alpha between frames"),
         Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
-        Column("matters", "matters", over="Alpha between frames"),
+        Column("matters", "Matters"),
         *map(Column.of, (KAPPA, ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
