@@ -24,6 +24,9 @@ NOTHING = "-"
 HARDLY_ANY = 0.1
 """A share of voxels seen once below which they need no remark."""
 
+FUSION_STAGES = ("association", "update")
+"""Parts of fusion; frames are decoded beside it, and waited for where that takes longer."""
+
 RARE = 100
 """Voxels below which a class is too rare to be called the worst."""
 
@@ -48,9 +51,9 @@ def print_summary(result: Result, console: Console) -> None:
         console.print(_agreement_table(told))
     if drawn:
         console.print(f"{_drawn(drawn)}\n", highlight=False, markup=False)
-    console.print(_stages_line(shown))
+    console.print(_stages_line(shown), highlight=False)
     for text in _statistics(result):
-        console.print(text, highlight=False, markup=False)
+        console.print(text, highlight=False, markup=False, soft_wrap="\n" in text.rstrip())  # tables keep their lines
     for text in remarks(result):
         console.print(f"- {text}", highlight=False, markup=False)
     console.print()
@@ -164,12 +167,13 @@ def _headers() -> list[str]:
 
 
 def _stages_line(runs: Sequence[UnitSummary]) -> str:
-    """Mean milliseconds a frame by stage, of those that are known; decoding goes on beside them in worker threads."""
+    """Mean milliseconds a frame: of fusion, with its parts where they are known, and of what is done beside it."""
     means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
-    decode = means.pop("decode")
-    known = [f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)]
+    known = {stage: f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)}
+    parts = ", ".join(known.pop(stage) for stage in FUSION_STAGES if stage in known)
     fusion = _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1)
-    return f"ms a frame: fusion {fusion} ({', '.join(known)}); beside them decode {_number(decode, 1)}\n"
+    beside = "".join(f", {text}" for text in known.values())
+    return f"ms a frame: fusion {fusion}{f' ({parts})' if parts else ''}{beside}\n"
 
 
 def _class_table(result: Result) -> Table:
