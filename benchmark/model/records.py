@@ -295,15 +295,16 @@ class Result:
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
-        """The summary table, in a notebook."""
+        """The summary table and the verdicts, in a notebook."""
         rows: list[list[tabular.Cell]] = []
         for run in self.runs:
             table, unit = run.table, run.unit
             means = (tabular.number(table[measure], measure.digits[0]) for measure in measures())
             seen = tabular.number(table.mean_op, 2), *means, tabular.number(100 * table.recurrent.share, 2)
-            rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen])
+            verdict = "" if run.statistics is None else run.statistics.verdict.level
+            rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen, verdict])
         titles = [measure.title for measure in measures()]
-        headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %"]
+        headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
         return tabular.as_html(self.name, headers, rows)
 
     @property

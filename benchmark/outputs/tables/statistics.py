@@ -32,8 +32,8 @@ def temporal_agreement(result: Result) -> list[Table]:
         *map(Column.of, (VSS, PSA, KAPPA, ALPHA)),
         Column("within", "within a frame", 3, "lower", over="Disagreement"),
         Column("between", "between frames", 3, "lower", over="Disagreement"),
-        Column("alpha_between", "found", 2, "higher", over="Alpha between frames"),
-        Column("ceiling", "ceiling", 2, over="Alpha between frames"),
+        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
         Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
         Column.of(FLIP_RATE),
     )
@@ -68,8 +68,8 @@ def class_agreement(result: Result) -> list[Table]:
         return []
     columns = (
         Column("observations", "Observations", 0),
-        Column("alpha_between", "found", 2, "higher", over="Alpha between frames"),
-        Column("ceiling", "ceiling", 2, over="Alpha between frames"),
+        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
         Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
         Column("matters", "Matters"),
         *map(Column.of, (KAPPA, ALPHA)),
