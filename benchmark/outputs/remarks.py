@@ -57,6 +57,8 @@ def _size(scene: str, found: VoxelAdvice, scenes: int) -> str:
     text += " when another frame sees them"
     if found.voxel_size < found.suggested:
         return f"{text}, so that noise tears places apart; check suggests {found.suggested:g} m"
+    if found.voxel_size == found.suggested:
+        return f"{text}, as check suggests"
     if found.voxel_size > COARSE * found.suggested:
         return f"{text}; {found.suggested:g} m would do, and tell apart what these blur"
     return f"{text}; check suggests {found.suggested:g} m"

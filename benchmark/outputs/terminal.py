@@ -178,13 +178,16 @@ def _stages_line(runs: Sequence[UnitSummary]) -> str:
 
 def _class_table(result: Result) -> Table:
     """Classes that there are, by how well frames agree on them, the worst first; rare ones at the end."""
-    title = "by class, the least steady first" + (", all scenes pooled" if len(result.scenes) > 1 else "")
+    maps = {backbone: result.select(backbone=backbone) for backbone in result.backbones}
+    seen = {name: [row for row in pooled(records).classes if row.voxels] for name, records in maps.items()}
+    title = "by class, the least steady first"
+    if any(row.voxels < RARE for there in seen.values() for row in there):
+        title += f", those of fewer than {RARE} voxels last"
+    title += ", all scenes pooled" if len(result.scenes) > 1 else ""
     known = any(_class_alphas(result.select()).values())
     table = _table(title, ("class",), ("voxels", "%", *_headers(), *(["alpha\n↑"] if known else [])))
-    for backbone in result.backbones:
-        records = result.select(backbone=backbone)
-        alphas = _class_alphas(records)
-        there = [row for row in pooled(records).classes if row.voxels]
+    for backbone, there in seen.items():
+        alphas = _class_alphas(maps[backbone])
         there.sort(key=lambda row: (row.voxels < RARE, alphas.get(row.name, 1.0), row[VSS]))
         table.add_row(escape(backbone), style="bold")
         for row in there[:MOST_CLASSES]:

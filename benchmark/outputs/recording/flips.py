@@ -28,7 +28,7 @@ MOVED_BITS = 0.05
 """Drift from which on a frame is to blame, also where the dominant class stays: that of a drifting voxel."""
 
 NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
-"""Of an image's longer side, what a number takes up left and above its point, and right of it and below, where it is."""
+"""Of an image's longer side, what a number takes up left of its point and above, and right of it and below."""
 
 MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
