@@ -75,6 +75,14 @@ Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.
 Scheduler = Annotated[
     str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none")
 ]
+TileSize = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N|off",
+        help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse what does not fit in memory.",
+        show_default="where a map would not fit",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 
 

@@ -25,6 +25,7 @@ from semstab.cli.options import (
     Rerun,
     Scenes,
     Scheduler,
+    TileSize,
     TrustGeometry,
     VoxelSize,
     chosen,
@@ -102,6 +103,7 @@ def run(
     report: Report = "on",
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
+    tile_size: TileSize = None,
     predict: Annotated[
         list[str] | None,
         typer.Option(
@@ -124,6 +126,7 @@ def run(
         "events": events,
         "statistics": statistics,
         "check_geometry": False if trust_geometry else None,
+        "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
     }
     content = chosen(named, with_options(settings, options), dataset, data, frames, seed)
     if check in ("none", "off"):

@@ -25,7 +25,7 @@ from semstab.errors import ConfigError, one_line
 from semstab.metrics import dominant
 from semstab.model.frames import Frame
 from semstab.model.measures import measures
-from semstab.model.records import RECORDING_PARTS, Result, Variation
+from semstab.model.records import RECORDING_PARTS, Result, Variation, voxels_of
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import drift_colors, series
@@ -41,7 +41,7 @@ from semstab.outputs.recording.layout import Known, Scenery, blueprint
 from semstab.outputs.recording.legend import Legend
 from semstab.outputs.recording.parts import Parts
 from semstab.outputs.recording.target import DEFAULT_URL, Target, is_whole
-from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of
+from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of, thinned_map
 from semstab.task import Task
 
 FIRST_CHUNKS = 8
@@ -126,6 +126,22 @@ class Recording(Observer):
         if not self.pictures_only and chunks_of(group.grown) > self._known.chunks[scene]:
             show = functools.partial(self._show_chunks, stream, scene, group.grown)
             background.submit(frame.index, frame.timestamp, show)
+
+    def frame_seen(self, task: Task, frame: Frame) -> None:
+        """Log what the camera shows; the map follows when its tiles are there."""
+        (stream, background), scene = self._opened(), task.scene.name
+        self._clock.set(stream, frame.index, frame.timestamp)
+        self._origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
+        self._cameras[scene].log(stream, frame, background)
+
+    def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
+        """Log the unit's series and voxels from the folder."""
+        if self._parts is not None:  # all that is in the folder is logged at the end
+            return
+        stream, background = self._opened()
+        background.drain()
+        self._kept.append((self._tasks[task.scene.name, task.backbone], [summary]))
+        self._log_kept(stream)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """Log the unit's voxels, while they are measured; the time is that of its last frame."""
@@ -297,16 +313,16 @@ class Recording(Observer):
                     stream.log(path(task.scene.name, "log"), rr.TextLog(text))
                     continue
                 unit = summary.unit
-                table = VoxelTable.load(self._run / "voxels" / f"{unit.slug}.parquet")
                 if group is None:
                     at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
-                    group = GroupLog(task, table.voxel_size, self._origin(stream, task, at))
+                    group = GroupLog(task, summary.table.voxel_size, self._origin(stream, task, at))
+                factor, table = thinned_map(voxels_of(self._run, unit), group.origin)
                 for values in series.send_rows(
                     stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
                 ):
                     group.span(values)
                 self._clock.set(stream, task.indices[-1])
-                group.log_map(stream, unit, table, self._plan.config.tolerance)
+                group.log_map(stream, unit, table, self._plan.config.tolerance, factor)
                 self._log_numbers(stream, group, summary)
             if group is not None:
                 self._lay_out(stream, group, table)
