@@ -113,22 +113,12 @@ def root(
     """Options that stand before the command."""
 
 
-<<<<<<< HEAD
-for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
-    app.command(name)(command)
-app.command("export")(export)
-app.command("relabel")(relabel)
-app.command("remedies")(remedies)
-app.command("conform")(conform)
-app.command("view")(view)
-app.command("list")(list_)
-=======
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (export, "export"),
-    (relabel, "relabel"), (gate, "gate"), (commit, "commit"), (conform, "conform"), (view, "view"), (list_, "list"),
+    (relabel, "relabel"), (remedies, "remedies"), (gate, "gate"), (commit, "commit"), (conform, "conform"),
+    (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)
->>>>>>> main
 
 
 def main() -> None:

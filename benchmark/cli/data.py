@@ -67,12 +67,8 @@ def predict(
     mapping: Annotated[
         str | None, typer.Option(help="strict, or lenient: near classes count as well.", show_default="strict")
     ] = None,
-<<<<<<< HEAD
     filters: Filters = None,
-    scores: Annotated[bool, typer.Option("--scores", metavar="", help="Also keep soft scores.")] = False,
-=======
     scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
->>>>>>> main
     top_k: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
     ] = None,

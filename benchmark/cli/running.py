@@ -113,18 +113,8 @@ def run(
     report: Report = "on",
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
-<<<<<<< HEAD
-    predict: Models = None,
-=======
     tile_size: TileSize = None,
-    predict: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[,KEY=VALUE...]",
-            help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
-        ),
-    ] = None,
->>>>>>> main
+    predict: Models = None,
     classes: Classes = None,
     filters: Filters = None,
     quiet: Quiet = False,

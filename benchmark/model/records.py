@@ -114,12 +114,8 @@ class Record:
     summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
                 what `semstab.statistics` says of the map
     image_space of the 'base' units; all NaN elsewhere
-<<<<<<< HEAD
     quality     of the labels of single frames, where `frame_quality` asked for it
-    voxels_file file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and without a folder
-=======
     voxels_file file of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None elsewhere
->>>>>>> main
     truth_file  file of the ground truth's voxels of the same frames, where the statistics fused it
     """
 

@@ -142,13 +142,8 @@ class Pass:
             fused = _new_map(request.config, task, request.within) if request.fuses else NoMap()
             made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
-<<<<<<< HEAD
-                made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target))
-            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
-=======
                 made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target), request.within)
-            if request.image_space and request.judged:
->>>>>>> main
+            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []

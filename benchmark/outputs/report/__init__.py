@@ -125,19 +125,13 @@ def render(result: Result, folder: Path) -> str:
         title=_title(result),
         style=(here / "style.css").read_text(encoding="utf-8"),
         subtitle=_subtitle(result),
-<<<<<<< HEAD
         reading=[
             *(sentence for each in remedies(everything) for sentence in advice(each)),
             *(relations(sentence) for sentence in reading(result, found)),
         ],
-        findings=[_finding(row) for row in found],
-        topics=list(_topics(everything, folder)),
-=======
-        reading=[relations(sentence) for sentence in reading(result, found)],
         findings=[_finding(row) for row in found if row.verdict is not Answer.UNTESTED],
         untested=[_finding(row) for row in found if row.verdict is Answer.UNTESTED],
-        topics=list(_topics(result, folder)),
->>>>>>> main
+        topics=list(_topics(everything, folder)),
         without_map=[scene for scene in result.scenes if scene not in result.up],
         failures=[_failure(row) for row in result.failures],
         facts=list(_facts(result.manifest)),
