@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from semstab import __version__
+from semstab.cli.comparing import compare
 from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
@@ -93,6 +94,7 @@ def root(
 
 for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
     app.command(name)(command)
+app.command("compare")(compare)
 app.command("export")(export)
 app.command("relabel")(relabel)
 app.command("conform")(conform)
