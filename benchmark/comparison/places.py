@@ -94,9 +94,7 @@ class Worse:
 
 def worse_places(common: Common, truth: VoxelTable | None, number: int) -> Worse:
     """Of a run against the base; the frames to blame are known where the looks were kept."""
-    decided = common.looks is not None and common.looks.decided  # labels beside scores: their maps do not compare
-    own = common.tables if decided else common.maps
-    maps = (own[0], own[number])
+    maps = (common.maps[0], common.maps[number])
     rows = shared_rows(*maps)
     again = (maps[0].op[rows[0]] >= 2) & (maps[1].op[rows[1]] >= 2)
     base, other = (table.rows(kept[again]) for table, kept in zip(maps, rows, strict=True))

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from semstab.comparison.places import MOST
 from semstab.comparison.quantities import BY_CLASS, HEADLINES, VERDICT, by_key
 from semstab.comparison.tables import blamed
 from semstab.model.contrast import Against, Basis, Contrast, Place, RunComparison, SceneComparison
 from semstab.model.measures import Quantity
 from semstab.model.statistics import NEXT_FLIGHT
+
+MOST_CLASSES = 4
+"""Classes that are told of in a sentence."""
 
 BASES: dict[Basis, str] = {
     "looks": "paired on the looks (a place in a frame) that all runs made, each with the same weight",
@@ -33,8 +37,9 @@ def _of_run(found: RunComparison, own: Against) -> Iterator[str]:
         name: [row for row in own.by_class if row.of == name] for name in dict.fromkeys(r.of for r in own.by_class)
     }
     told = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
-    if any(told.values()):
-        yield f"{own.other} by class: {'; '.join(f'{name} {text}' for name, text in told.items() if text)}."
+    if listed := [f"{name} {text}" for name, text in told.items() if text]:
+        more = f"; and {len(listed) - MOST_CLASSES} more classes" if len(listed) > MOST_CLASSES else ""
+        yield f"{own.other} by class: {'. '.join(listed[:MOST_CLASSES])}{more}."
     for scene in found.scenes:
         mine = next(each for each in scene.against if each.other == own.other)
         for what in ("agreement", "truth"):
@@ -53,7 +58,7 @@ def _steadiness(found: RunComparison, own: Against) -> str:
     numbers = f"{quantity.word} {row.base:.3f} and {row.other:.3f}{where}"
     if row.difference.value == row.difference.low == row.difference.high == 0:
         return f"{own.other} is as steady as {found.base}: {numbers}, the same in every place."
-    interval = f"{row.difference.value:+.3f} ({row.difference.low:+.3f} to {row.difference.high:+.3f})"
+    interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
     whose = "the next flight" if row.difference.question == NEXT_FLIGHT else "these frames"
     said = {"better": "is steadier than", "worse": "is less steady than"}
@@ -78,13 +83,13 @@ def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
 def _of_places(places: Sequence[Place]) -> str:
     first = places[0]
     lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
-    one = len(places) == 1
+    count = f"{MOST} or more places" if len(places) == MOST else f"{len(places)} place{'s' if len(places) > 1 else ''}"
     rivals = f"{first.rivals or 'none'} improved by as much as the largest"
     instead = f", {first.instead} instead" if first.instead else ""
     x, y, z = first.centre
     frames = f"; to blame are the frames {blamed(first.frames)}" if first.frames else ""
     return (
-        f"{len(places)} place{'' if one else 's'} {lost} ({rivals}); the largest is {first.voxels} voxels of"
+        f"{count} {lost} ({rivals}); the largest is {first.voxels} voxels of"
         f" {first.of}{instead}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
     )
 
@@ -93,8 +98,3 @@ def _what(scene: SceneComparison) -> Iterator[str]:
     if scene.basis in ("looks", "voxels"):
         yield f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}."
     yield from (f"{scene.scene}: {remark}." for remark in scene.remarks)
-    if scene.looks is not None and scene.looks.decided:
-        yield (
-            f"{scene.scene}: labels stand beside scores; each look was reduced to its largest class, but for alpha"
-            " between frames and what is of whole maps."
-        )

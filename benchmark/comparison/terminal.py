@@ -19,6 +19,9 @@ from semstab.outputs.terminal import narrow_table
 MOST_PLACES = 8
 """Places of a run in a scene that are shown; the others are in the tables."""
 
+FAR = 10.0
+"""Metres from which on coordinates are rounded to decimetres."""
+
 LOST = {"agreement": "agrees less from frame to frame", "truth": "is wrong now"}
 COLORS = {"worse": "[red]worse[/]", "better": "[green]better[/]", "": ""}
 
@@ -103,10 +106,11 @@ def _colored(quantity: Quantity, row: Contrast | None) -> str:
 def _places(title: str, places: Sequence[Place]) -> Table:
     numbers = ("voxels", "loss", "x", "y", "z (m)", "rivals")
     table = narrow_table(escape(title), ("class", "instead"), numbers)
-    table.add_column("frames to blame", vertical="bottom", no_wrap=True)
+    table.add_column("frames\nto blame", vertical="bottom", no_wrap=True)
+    digits = 1 if any(abs(value) >= FAR for place in places for value in place.centre) else 2
     for place in places[:MOST_PLACES]:
-        centre = (f"{value:z.2f}" for value in place.centre)
-        frames = ", ".join(str(own.frame) for own in place.frames[:4]) + (", ..." if len(place.frames) > 4 else "")
+        centre = (f"{value:z.{digits}f}" for value in place.centre)
+        frames = ", ".join(str(own.frame) for own in place.frames[:3]) + (", ..." if len(place.frames) > 3 else "")
         table.add_row(
             escape(place.of), escape(place.instead), f"{place.voxels:,}", f"{place.loss:.2f}", *centre,
             str(place.rivals), frames,
