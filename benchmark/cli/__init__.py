@@ -14,6 +14,7 @@ from semstab.cli.comparing import compare
 from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
+from semstab.cli.gating import commit, gate
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
@@ -114,7 +115,8 @@ def root(
 
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
-    (export, "export"), (relabel, "relabel"), (conform, "conform"), (view, "view"), (list_, "list"),
+    (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"), (conform, "conform"), (view, "view"),
+    (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)
 
