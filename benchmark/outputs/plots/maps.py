@@ -62,10 +62,8 @@ def draw_stability(above: FromAbove) -> Figure:
     for axes, measure in zip(panels, shown, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
         _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
-    titles = (
-        "stability" if above.view == "from above" else above.view,
-        *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown),
-    )
+    where = "" if above.view == "from above" else f", {above.view}"
+    titles = (f"stability{where}", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         _frame(axes)
