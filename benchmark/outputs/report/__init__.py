@@ -17,7 +17,7 @@ from semstab.outputs.averages import describe
 from semstab.outputs.findings import Answer, Finding, findings
 from semstab.outputs.plots.style import Figure
 from semstab.outputs.report.page import blocks, figure_block, filled
-from semstab.outputs.report.reading import reading
+from semstab.outputs.report.reading import reading, verdicts
 from semstab.outputs.tables import tables, write_tables
 from semstab.outputs.tables.writers import relations
 from semstab.runtime.files import write_text
@@ -104,7 +104,8 @@ def render(result: Result, folder: Path) -> str:
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
         title=_title(result),
         subtitle=_subtitle(result),
-        reading=[relations(sentence) for sentence in reading(result, found)],
+        verdicts=[relations(sentence) for sentence in verdicts(result)],
+        reading=[relations(sentence) for sentence in reading(result, found) if sentence not in verdicts(result)],
         findings=[_finding(row) for row in found if row.verdict is not Answer.UNTESTED],
         untested=[_finding(row) for row in found if row.verdict is Answer.UNTESTED],
         topics=list(_topics(result, folder)),

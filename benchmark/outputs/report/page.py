@@ -39,20 +39,18 @@ def filled(template: str, **content: Any) -> str:
 
 
 def blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
-    """Tables, each with the figure of its name beneath it, then the other figures; a caption is not said twice."""
+    """Tables, each with the figure of its name beneath it, then the other figures."""
     beside = {figure.name: figure for figure in shown}
     ordered: list[Table | Figure] = []
     for table in own:
         ordered.append(table)
         if table.name in beside:
             ordered.append(beside.pop(table.name))
-    said: set[str] = set()
     for item in (*ordered, *beside.values()):
-        block = table_block(item) if isinstance(item, Table) else figure_block(item, folder)
-        if block["caption"] in said:
-            block["caption"] = ""
-        said.add(block["caption"])
-        yield {"kind": "table" if isinstance(item, Table) else "figure", "content": block}
+        if isinstance(item, Table):
+            yield {"kind": "table", "content": table_block(item)}
+        else:
+            yield {"kind": "figure", "content": figure_block(item, folder)}
 
 
 def table_block(table: Table) -> dict[str, Any]:
