@@ -31,6 +31,37 @@ class Observed:
     bounds: Int64
 
 
+@dataclass(frozen=True, eq=False)
+class ObservedScores:
+    """The observations of a frame as dense rows, grouped by partition; valid until the next frame is observed.
+
+    key     (n,) int64 packed voxel index, relative to the origin
+    pixels  (n,) int64 pixels in the voxel
+    row     (n,) int64 place of each voxel's first sum in `sums`
+    sums    float64, the sums of the voxels' normalised scores, K in a row; s_bar = sums / pixels
+    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
+    K       number of classes
+    """
+
+    key: Int64
+    pixels: Int64
+    row: Int64
+    sums: npt.NDArray[np.float64]
+    bounds: Int64
+    K: int
+
+    def rows(self, some: slice = np.s_[:]) -> npt.NDArray[np.float64]:
+        """The sums (n, K) of some voxels."""
+        return self.sums[self.row[some, None] + np.arange(self.K)]
+
+    def sparse(self) -> Observed:
+        """The same by entries, of which there are none for classes without evidence."""
+        sums = self.rows()
+        voxel, label = np.nonzero(sums)
+        start = np.searchsorted(voxel, np.arange(len(self.key) + 1))
+        return Observed(self.key, self.pixels, start, label.astype(np.uint16), sums[voxel, label], self.bounds)
+
+
 class WorkSpace:
     """Arrays that are kept from frame to frame, by name."""
 
