@@ -5,8 +5,8 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from semstab.backends.numba_parts.loops import ALONE, DENSE, begin
-from semstab.backends.shared.beliefs import observe_row
+from semstab.backends.numba_parts.loops import ALONE, DENSE, begin, observe_dense
+from semstab.backends.shared.beliefs import plogp
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.prefetch import AHEAD, touch
 from semstab.model.results import RECURRENT
@@ -35,7 +35,7 @@ def update_dense(
     """
     stride = dense.shape[1]
     for p in nb.prange(PARTITIONS):
-        out = np.zeros(7)
+        out = np.zeros(8)
         vss = entropy = drift = 0.0
         reached = 0
         free = dense_base[p]
@@ -53,7 +53,7 @@ def update_dense(
                 record.next = DENSE - free
                 free += 1
             op = record.op
-            observe_row(dense[DENSE - record.next], seen_sums[seen[v] : seen[v] + stride], pixels[v], op, out)
+            observe_dense(record, dense[DENSE - record.next], seen_sums[seen[v] : seen[v] + stride], pixels[v], out)
             vss += out[0]
             entropy += out[1]
             drift += out[2]
@@ -86,9 +86,15 @@ def _touch_ahead(v, last, row, records, dense, seen, seen_sums):
 def _unroll(record, nodes, evidence):
     """The evidence of a voxel without a dense row into an unused one; its nodes are not used again."""
     evidence[:] = 0.0
-    if record.op > 0:
-        evidence[record.label] = record.value
+    if record.op == 0:
+        return
+    evidence[record.label] = record.value
     at = np.int64(record.next)
     while at > ALONE:
         evidence[nodes[at].label] = nodes[at].value
         at = np.int64(nodes[at].next)
+    record.label = np.argmax(evidence)
+    total = 0.0
+    for k in range(evidence.shape[0]):
+        total += plogp(evidence[k] / record.op)
+    record.value = total

@@ -1,7 +1,8 @@
 """Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time.
 
 Where a voxel's evidence is says `next` of its record: `ALONE`, of one class, in the record itself; from 0 on, more of
-it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row `DENSE - next`.
+it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row `DENSE - next`. Then the
+record holds the dominant class as its label, and the sum of p log2 p as its value.
 """
 
 from __future__ import annotations
@@ -82,11 +83,17 @@ def begin(record, key, label, frame):
 
 
 @serial
-def _observe_dense(evidence, s, label, weight, first, last, pixels, op, out):
-    """Add one observation to a dense row; s as in `_observe_voxel`, out as in `observe_row`."""
+def observe_dense(record, evidence, sums, pixels, out):
+    """Add one observation to a voxel with a dense row; see `observe_row`."""
+    observe_row(evidence, sums, pixels, record.op, record.label, np.float64(record.value), out)
+    record.label, record.value = np.uint16(out[4]), out[7]
+
+
+@serial
+def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out):
     for e in range(first, last):
         s[label[e]] = weight[e]
-    observe_row(evidence, s, pixels, op, out)
+    observe_dense(record, evidence, s, pixels, out)
     for e in range(first, last):
         s[label[e]] = 0.0
 
@@ -170,7 +177,7 @@ def update(
     """
     for p in nb.prange(PARTITIONS):
         s = np.zeros(dense.shape[1])
-        out = np.zeros(7)
+        out = np.zeros(8)
         own = ranges[p]
         vss = entropy = drift = 0.0
         reached = 0
@@ -198,7 +205,7 @@ def update(
                 dominant_before[v] = dominant_after[v] = record.label
             else:
                 if record.next <= DENSE:
-                    _observe_dense(dense[DENSE - record.next], s, label, weight, first, last, pixels[v], op, out)
+                    _observe_dense(record, dense[DENSE - record.next], s, label, weight, first, last, pixels[v], out)
                 else:
                     _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
                 vss += out[0]

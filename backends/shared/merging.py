@@ -10,6 +10,7 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import PARTITIONS, mix, partition_of
+from semstab.backends.shared.prefetch import AHEAD, touch
 from semstab.runtime.compiled import parallel
 
 
@@ -35,6 +36,9 @@ def group(key, count, order, edges, voxel, out_key, out_pixels, out_size, found)
         slot = np.full(mask + 1, -1, dtype=np.int32)
         n = 0
         for i in range(low, high):
+            soon = order[min(i + AHEAD, high - 1)]
+            touch(key, soon)
+            touch(count, soon)
             k = key[order[i]]
             at = np.int64(mix(k) & np.uint64(mask))
             while slot[at] >= 0 and out_key[low + slot[at]] != k:

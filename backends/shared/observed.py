@@ -62,6 +62,10 @@ class ObservedScores:
         return Observed(self.key, self.pixels, start, label.astype(np.uint16), sums[voxel, label], self.bounds)
 
 
+LINE = 64
+"""Bytes of a line of the cache: a vector that lies across two of them takes twice the time."""
+
+
 class WorkSpace:
     """Arrays that are kept from frame to frame, by name."""
 
@@ -72,5 +76,12 @@ class WorkSpace:
         """An array of that shape with whatever is in it."""
         size = int(np.prod(shape))
         if name not in self._arrays or len(self._arrays[name]) < size:
-            self._arrays[name] = np.empty(max(size, 1), dtype=dtype)
+            self._arrays[name] = _aligned(max(size, 1), np.dtype(dtype))
         return self._arrays[name][:size].reshape(shape)
+
+
+def _aligned(size: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """An array that begins with a line of the cache."""
+    room = np.empty(size * dtype.itemsize + LINE, dtype=np.uint8)
+    start = -room.ctypes.data % LINE
+    return room[start : start + size * dtype.itemsize].view(dtype)

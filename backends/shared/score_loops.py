@@ -27,10 +27,14 @@ AHEAD = 512
 """Scores that are asked for before their turn comes."""
 
 
+SOON = 8
+"""Rows of sums likewise."""
+
+
 @parallel
 def sum_scores(
     depth, labels, scores, K, ray_x, ray_y, T, size, origin, rays, margin, columns, room, row_keys, tables, table_rows,
-    key, count, sums, entries, lost, spread,
+    scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
 
@@ -64,7 +68,7 @@ def sum_scores(
                 if n >= 0:
                     n = _add_stretch(
                         scores, v * W, keys[v - first], start, stop, K, stride, table, table_rows[thread],
-                        own_key, own_count, own_sums, n,
+                        scales[thread], own_key, own_count, own_sums, n,
                     )  # fmt: skip
         entries[band] = n
         for e in range(n):
@@ -72,34 +76,33 @@ def sum_scores(
 
 
 @serial
-def _add_stretch(scores, row, keys, start, stop, K, stride, table, table_row, key, count, sums, n):
+def _add_stretch(scores, row, keys, start, stop, K, stride, table, table_row, scale, key, count, sums, n):
     """Add pixels `start` to before `stop` of a row to their voxels, of which there are n; how many then, or -1.
 
     row  the number of the row's first pixel in the image
     """
-    e = np.int64(0)
-    k = np.int64(-1)
     for u in range(start, stop):
-        if keys[u] < 0:
+        if keys[u] >= 0:
+            at = (row + u) * K
+            touch(scores, min(at + AHEAD, scores.shape[0] - 1))
+            total = total_of(scores, at, K)
+            scale[u] = 1.0 / total
+            keys[u] = keys[u] if 0.0 < total < np.inf else -1  # no prediction
+    for u in range(start, stop):  # runs of equal keys are short: to look for their ends would take longer
+        k = keys[u]
+        if k < 0:
             continue
-        at = (row + u) * K
-        touch(scores, min(at + AHEAD, scores.shape[0] - 1))
-        total = total_of(scores, at, K)
-        if not 0.0 < total < np.inf:  # no prediction
-            continue
-        if keys[u] != k:
-            k = keys[u]
-            slot = np.int64((np.uint64(k) * GOLDEN) >> SHIFT)
-            if table[slot] != k:
-                if n == key.shape[0]:
-                    return np.int64(-1)
-                table[slot], table_row[slot] = k, n
-                key[n], count[n] = k, 0
-                sums[n * stride : (n + 1) * stride] = 0.0
-                n += 1
-            e = np.int64(table_row[slot])
+        slot = np.int64((np.uint64(k) * GOLDEN) >> SHIFT)
+        if table[slot] != k:
+            if n == key.shape[0]:
+                return np.int64(-1)
+            table[slot], table_row[slot] = k, n
+            key[n], count[n] = k, 0
+            sums[n * stride : (n + 1) * stride] = 0.0
+            n += 1
+        e = np.int64(table_row[slot])
         count[e] += 1
-        add_scaled(scores, at, K, 1.0 / total, sums, e * stride)
+        add_scaled(scores, (row + u) * K, K, scale[u], sums, e * stride)
     return n
 
 
@@ -111,6 +114,7 @@ def merge_sums(order, edges, voxel, bounds, key, pixels, sums, K, stride, out_ke
         for v in range(bounds[p + 1] - first):
             out_key[first + v], out_pixels[first + v], out_row[first + v] = key[low + v], pixels[low + v], -1
         for i in range(low, edges[p + 1]):
+            touch(sums, order[min(i + SOON, edges[p + 1] - 1)] * stride)
             v, there = first + voxel[i], order[i] * stride
             if out_row[v] < 0:
                 out_row[v] = there

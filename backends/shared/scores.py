@@ -22,9 +22,8 @@ Int64 = npt.NDArray[np.int64]
 FIRST_ROOM = 1 << 12
 """Voxels that a band has room for at first."""
 
-TILE_SCORES = 1 << 14
-"""Scores in a row of a tile, about; and pixels are no fewer than `TILE_COLUMNS`."""
-TILE_COLUMNS = 64
+COLUMNS = 128
+"""Pixels of a tile along a row."""
 
 SAMPLE = 1 << 10
 """Voxels, about, that are looked at to tell whether a frame's voxels have most classes."""
@@ -59,10 +58,10 @@ class Scores:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             sum_scores(
                 fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, K, ray_x, ray_y, fixed(frame.T_wc),
-                self.voxel_size, origin, rays, margin, max(TILE_COLUMNS, TILE_SCORES // K), room,
+                self.voxel_size, origin, rays, margin, COLUMNS, room,
                 space.room("keys", threads, ROWS, W), space.room("table", threads, 1 << TABLE_BITS),
-                space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32), key, count, sums, entries, lost,
-                spread,
+                space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32),
+                space.room("scale", threads, W, dtype=np.float64), key, count, sums, entries, lost, spread,
             )  # fmt: skip
             if lost.any():
                 return None
