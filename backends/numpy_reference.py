@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections import defaultdict
 
 import numpy as np
 
@@ -17,8 +19,10 @@ from semstab.backends.shared.association import (
     observe,
     voxel_index,
 )
+from semstab.backends.shared.restricted import falling_into
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.model.evidence import Evidence
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable, index_columns
@@ -35,11 +39,12 @@ class NumpyReference:
 
     keeps_log = True
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         check_settings(voxel_size, num_classes)
         self.voxel_size = voxel_size
         self.num_classes = num_classes
-        self._row: dict[tuple[int, int, int], int] = {}  # voxel q -> its row
+        self.within = within
+        self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
         self._history: list[tuple[Int64, int, Observations]] = []  # (rows, frame, observations), frame after frame
         self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
         self._op = np.zeros(0, dtype=np.int64)
@@ -71,7 +76,7 @@ class NumpyReference:
 
     def events(self) -> Events:
         """The history: every observation of every voxel."""
-        voxels = np.array(list(self._row), dtype=np.int64).reshape(-1, 3)
+        voxels = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
         order = np.lexsort(voxels.T[::-1])
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
@@ -90,13 +95,14 @@ class NumpyReference:
         )
 
     def _pixels(self, frame: Frame) -> Mask:
-        """Those of the frame that are observed: the valid ones."""
-        return frame.valid
+        """Those of the frame that are observed: the valid ones that fall into the extent."""
+        valid = frame.valid
+        return valid if self.within is None else valid & falling_into(self.within, frame, self.voxel_size)
 
     def _rows(self, seen: Observations) -> Int64:
         """The rows of the frame's voxels, new ones added."""
-        voxels = map(tuple, seen.index.tolist())
-        rows = np.array([self._row.setdefault(q, len(self._row)) for q in voxels], dtype=np.int64)
+        voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
+        rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         if len(self._row) > len(self._op):
             room = 2 * len(self._row) - len(self._op)
             self._evidence = np.pad(self._evidence, ((0, room), (0, 0)))
@@ -108,8 +114,8 @@ class NumpySample(NumpyReference):
     """The reference on one in `ONE_IN` of the voxels, drawn at random by their index, through all frames."""
 
     def _pixels(self, frame: Frame) -> Mask:
-        chosen = frame.valid.copy()
-        chosen[chosen] = in_sample(voxel_index(back_project(frame), self.voxel_size, frame))
+        chosen = super()._pixels(frame).copy()
+        chosen[chosen] = in_sample(voxel_index(back_project(frame, chosen), self.voxel_size, frame))
         return chosen
 
 

@@ -24,12 +24,16 @@ from semstab.backends.shared.observed import Observed, ObservedScores
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
 
 INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""
+
+LEAST_BLOCKS = 4
+"""Of a new map, however many classes there are."""
 
 COPIED_BLOCKS = 1024
 """Blocks that move at a time when a map grows, so that the copy needs no second map's worth of memory."""
@@ -42,9 +46,17 @@ class Open3DBlocks(FusionBackend):
 
     device            'CPU:0', or 'CUDA:0' where Open3D sees such a device
     block_resolution  voxels along an edge of a block; a block takes memory for all of its voxels
+    within            the voxels that the map is restricted to
     """
 
-    def __init__(self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4) -> None:
+    def __init__(
+        self,
+        voxel_size: float,
+        num_classes: int,
+        device: str = "CPU:0",
+        block_resolution: int = 4,
+        within: Extent | None = None,
+    ) -> None:
         check_settings(voxel_size, num_classes)
         if not 1 <= block_resolution <= 64:
             raise ConfigError(f"block_resolution = {block_resolution}: use 1 to 64 (4 suits surfaces)")
@@ -53,7 +65,7 @@ class Open3DBlocks(FusionBackend):
         self.block_resolution = block_resolution
         self.device = _device(device)
         self.in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
-        self._pixels = Aggregator(voxel_size, num_classes)
+        self._pixels = Aggregator(voxel_size, num_classes, within)
         self._total = MapTotal(num_classes)
         self.attributes = {
             "op": (o3c.int32, 1),
@@ -66,12 +78,12 @@ class Open3DBlocks(FusionBackend):
             "frame_entropy_sum": (o3c.float64, 1),
         }
         voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self.attributes.values())
-        self.grid = self._new_grid(max(64, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
+        self.grid = self._new_grid(max(LEAST_BLOCKS, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
-        """The attributes of a voxel; of a block about a quarter is seen, and the grid doubles as it grows."""
-        return 10 * voxels * (8 * num_classes + 48)
+        """The attributes of a voxel; a quarter of a block is seen, the grid doubles, an empty one has blocks."""
+        return max(10 * voxels, LEAST_BLOCKS * 4**3) * (8 * num_classes + 48)
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""

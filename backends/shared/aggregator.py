@@ -15,9 +15,10 @@ from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.merging import compact, group, scatter, sort_labels
 from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.pixel_keys import columns_of, frame_terms
 from semstab.backends.shared.scores import Scores
 from semstab.backends.shared.tiles import Tiles
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 
@@ -49,16 +50,17 @@ class _Found:
 
 
 class Aggregator:
-    """Turns frames into observations; keeps its work space from frame to frame."""
+    """Turns frames into observations, of the voxels of an extent where one is given; keeps its work space."""
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
+        self.within = within
         self.origin: Int64 | None = None
         self._band_room = FIRST_ROOM
         self._space = WorkSpace()
-        self._tiles = Tiles(voxel_size, num_classes)
-        self._scores = Scores(voxel_size, num_classes)
+        self._tiles = Tiles(voxel_size, num_classes, within)
+        self._scores = Scores(voxel_size, num_classes, within)
 
     def observe(self, frame: Frame) -> Observed | ObservedScores:
         """The frame's observations; the first frame's camera sets the origin.
@@ -105,8 +107,8 @@ class Aggregator:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             find_entries(
                 fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-                rays, margin, frame.ignore_id, rows, room, row_keys, row_changes, row_runs, slots, key, label, count,
-                entries, lost, highest, spread,
+                columns_of(self.within, origin), rays, margin, frame.ignore_id, rows, room, row_keys, row_changes,
+                row_runs, slots, key, label, count, entries, lost, highest, spread,
             )  # fmt: skip
             if highest.max() >= self.num_classes:
                 check_frame(frame, self.num_classes)

@@ -30,10 +30,10 @@ def js_term(p, q):
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """Add one observation to a voxel's dense evidence (K,), seen `op` times before; its loop is vectorised.
 
-    sums (K,) are those of the normalised scores of its pixels; `dominant` and `plogp_before` what the observation before
-    left in out[4] and out[7], which spares looking for them. Leaves in `out` the change of VSS, that of the entropy in
-    bits, the drift in bits, the dominant class before and after, the squared length of s_bar, its entropy in bits, and
-    the sum of p log2 p over the classes.
+    sums (K,) are those of the normalised scores of its pixels; `dominant` and `plogp_before` what the observation
+    before left in out[4] and out[7], which spares looking for them. Leaves in `out` the change of VSS, that of the
+    entropy in bits, the drift in bits, the dominant class before and after, the squared length of s_bar, its entropy in
+    bits, and the sum of p log2 p over the classes.
     """
     before, after, share = 1.0 / max(op, 1), 1.0 / (op + 1), 1.0 / pixels
     plogp_after = plogp_between = squares = plogp_seen = 0.0

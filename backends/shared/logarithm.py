@@ -35,9 +35,9 @@ def plogp_fast(p):
 
     p = 2^e m, m in [1/sqrt 2, sqrt 2), and log m = 2 artanh((m - 1) / (m + 1)): odd powers, whose 11th adds 2^-56.
     """
-    bits = bits_of(p)
+    bits: Any = bits_of(p)
     e = (bits - ROOT_HALF) >> MANTISSA_BITS
-    m = number_of(bits - (e << MANTISSA_BITS))
+    m: Any = number_of(bits - (e << MANTISSA_BITS))
     s = (m - 1.0) / (m + 1.0)
     t = s * s
     series = 1.0 / 21.0

@@ -52,7 +52,8 @@ class ObservedScores:
 
     def rows(self, some: slice = np.s_[:]) -> npt.NDArray[np.float64]:
         """The sums (n, K) of some voxels."""
-        return self.sums[self.row[some, None] + np.arange(self.K)]
+        sums: npt.NDArray[np.float64] = self.sums[self.row[some, None] + np.arange(self.K)]
+        return sums
 
     def sparse(self) -> Observed:
         """The same by entries, of which there are none for classes without evidence."""

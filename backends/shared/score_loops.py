@@ -11,13 +11,13 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import PARTITIONS, partition_of
-from semstab.backends.shared.pixel_keys import keys_of_row
+from semstab.backends.shared.pixel_keys import keep_columns, keys_of_row
 from semstab.backends.shared.prefetch import touch
 from semstab.backends.shared.score_vectors import LANES, add_scaled, total_of
 from semstab.runtime.compiled import parallel, serial
 
-ROWS = 16
-"""Rows of pixels in a band."""
+ROWS, COLUMNS = 16, 128
+"""Pixels of a tile; its rows are those of a band."""
 
 TABLE_BITS = 11
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -33,7 +33,7 @@ SOON = 8
 
 @parallel
 def sum_scores(
-    depth, labels, scores, K, ray_x, ray_y, T, size, origin, rays, margin, columns, room, row_keys, tables, table_rows,
+    depth, labels, scores, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys, tables, table_rows,
     scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
@@ -42,7 +42,7 @@ def sum_scores(
 
     labels   (W,) 0 wherever there is depth: scores have no ignore id
     scores   (H * W * K,), see `score_vectors`
-    columns  of a tile
+    within   see `keep_columns`
     key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
     lost     (bands,) whether a pixel with depth is out of reach
     spread   (bands, PARTITIONS) of the voxels by partition
@@ -58,12 +58,14 @@ def sum_scores(
             lost[band] |= keys_of_row(
                 depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, rays, margin, keys[v - first]
             )
+            if within.shape[0]:
+                keep_columns(keys[v - first], within)
         table[:] = -1
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]
         n = np.int64(0)
-        for start in range(0, W, columns):
-            stop = min(W, start + columns)
+        for start in range(0, W, COLUMNS):
+            stop = min(W, start + COLUMNS)
             for v in range(first, last):
                 if n >= 0:
                     n = _add_stretch(

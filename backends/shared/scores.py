@@ -11,9 +11,10 @@ import numpy.typing as npt
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.merging import group, scatter
 from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.pixel_keys import columns_of, frame_terms
 from semstab.backends.shared.score_loops import ROWS, TABLE_BITS, merge_sums, sum_scores
 from semstab.backends.shared.score_vectors import LANES
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 
@@ -22,9 +23,6 @@ Int64 = npt.NDArray[np.int64]
 FIRST_ROOM = 1 << 12
 """Voxels that a band has room for at first."""
 
-COLUMNS = 128
-"""Pixels of a tile along a row."""
-
 SAMPLE = 1 << 10
 """Voxels, about, that are looked at to tell whether a frame's voxels have most classes."""
 
@@ -32,9 +30,10 @@ SAMPLE = 1 << 10
 class Scores:
     """Observes soft scores; keeps its work space from frame to frame."""
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
+        self.within = within
         self._band_room = FIRST_ROOM
         self._space = WorkSpace()
 
@@ -58,7 +57,7 @@ class Scores:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             sum_scores(
                 fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, K, ray_x, ray_y, fixed(frame.T_wc),
-                self.voxel_size, origin, rays, margin, COLUMNS, room,
+                self.voxel_size, origin, columns_of(self.within, origin), rays, margin, room,
                 space.room("keys", threads, ROWS, W), space.room("table", threads, 1 << TABLE_BITS),
                 space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32),
                 space.room("scale", threads, W, dtype=np.float64), key, count, sums, entries, lost, spread,

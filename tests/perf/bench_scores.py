@@ -1,20 +1,20 @@
 """CPU time of one frame of soft scores, beside one read of its scores and the finding of its pixels' voxels.
 
     python tests/perf/bench_scores.py [--sizes 1280x720 3840x2160] [--classes 7 20 150] [--types float32 float16]
-                                      [--noise 0] [--top-k N] [--rounds 3] [--json FILE]
+                                      [--noise 0] [--rounds 5] [--json FILE]
 
-The frames fly along the street of bench_fusion.py: a third of the image is sky, whose scores nobody needs. 'read' is one
-pass over all scores of the frame, 'keys' the voxel of each pixel, each alone and by compiled code on all cores; 'floor'
-is their sum, 'frame' a whole frame whose voxels are known, association and update. 'rows' reads and writes as many dense
-rows of evidence as the frame sees voxels, in the order in which it sees them: what the map itself costs. User and system
-time of all threads; the steps take turns.
+The frames fly along the street of bench_fusion.py: a third of the image is sky, whose scores nobody needs. 'read' is
+one pass over all scores of the frame, 'keys' the voxel of each pixel, each alone and by compiled code on all cores;
+'floor' is their sum, 'frame' a whole frame whose voxels are known, association and update. 'rows' reads and writes as
+many dense rows of evidence as the frame sees voxels, in random order: what any map costs beside. User and system time
+of all threads; the steps take turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import gc
+import itertools
 import time
 from collections.abc import Callable
 from statistics import median
@@ -80,9 +80,8 @@ def soft(frame: semstab.Frame, K: int, kind: str) -> semstab.Frame:
     return dataclasses.replace(frame, labels=None, scores=scores)
 
 
-def steps(frames: list[semstab.Frame], K: int, options: dict[str, Any]) -> dict[str, Callable[[], object]]:
-    """What is measured, of the first frame, in a map that has seen all of them."""
-    frame = frames[0]
+def steps(frame: semstab.Frame, K: int) -> dict[str, Callable[[], object]]:
+    """What is measured, in a map that has seen the frame."""
     assert frame.scores is not None
     H, W = frame.shape
     flat: npt.NDArray[Any] = frame.scores.reshape(-1)
@@ -93,9 +92,8 @@ def steps(frames: list[semstab.Frame], K: int, options: dict[str, Any]) -> dict[
     depth, T = np.array(frame.depth), np.array(frame.T_wc)
     origin = np.floor(T[:3, 3] / VOXEL).astype(np.int64)
     keys, labels, totals = np.empty((64, W), dtype=np.int64), np.zeros(W, dtype=np.uint8), np.empty(64)
-    map_ = backends.create("numba", voxel_size=VOXEL, num_classes=K, **options)
-    for seen in frames:
-        report = map_.integrate(seen)
+    map_ = backends.create("numba", voxel_size=VOXEL, num_classes=K)
+    report = map_.integrate(frame)
     order = np.random.default_rng(0).permutation(report.voxels)
     evidence = np.zeros((report.voxels, K))
     return {
@@ -113,6 +111,22 @@ def cpu_milliseconds(work: Callable[[], object]) -> float:
     return 1e3 * (time.process_time() - started)
 
 
+def measured(size: str, K: int, kind: str, noise: float, rounds: int) -> dict[str, Any]:
+    """Milliseconds of each step, medians."""
+    width, height = map(int, size.split("x"))
+    frame = soft(flight.street(0, width, height, K, noise=noise), K, kind)
+    work = steps(frame, K)
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(rounds + 1):
+        for name, step in work.items():
+            times[name].append(cpu_milliseconds(step))
+    ms = {name: median(values[1:]) for name, values in times.items()}
+    floor = ms["read"] + ms["keys"]
+    seen: Any = work["frame"]()
+    ratios = {"of_floor": ms["frame"] / floor, "with_rows": ms["frame"] / (floor + ms["rows"])}
+    return {"voxels": seen.voxels, **ms, **ratios}
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -120,38 +134,23 @@ def main() -> None:
     parser.add_argument("--classes", nargs="+", type=int, default=[7, 20, 150])
     parser.add_argument("--types", nargs="+", default=["float32", "float16"])
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0], help="of the depth, as a share of it")
-    parser.add_argument("--options", nargs="*", default=[], help="of the backend, NAME=NUMBER")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--json", help="also write the figures there")
     arguments = parser.parse_args()
-    options = {name: int(value) for name, _, value in (option.partition("=") for option in arguments.options)}
-    print(f"{'size':>9} {'K':>3} {'type':<7} {'noise':>6} {'voxels':>7} {'read':>7} {'keys':>6} {'rows':>6} {'frame':>7}"
-          f" {'of floor':>8} {'with rows':>9}")  # fmt: skip
+    print(
+        f"{'size':>9} {'K':>3} {'type':<7} {'noise':>6} {'voxels':>7} {'read':>7} {'keys':>6} {'rows':>6} {'frame':>7}"
+        f" {'of floor':>8} {'with rows':>9}"
+    )
     results = []
-    for size in arguments.sizes:
-        width, height = map(int, size.split("x"))
-        for K in arguments.classes:
-            for kind in arguments.types:
-                for noise in arguments.noise:
-                    frames = [soft(flight.street(i, width, height, K, noise=noise), K, kind) for i in range(1)]
-                    work = steps(frames, K, options)
-                    times: dict[str, list[float]] = {name: [] for name in work}
-                    for _ in range(arguments.rounds + 1):
-                        for name, step in work.items():
-                            times[name].append(cpu_milliseconds(step))
-                    ms = {name: median(values[1:]) for name, values in times.items()}
-                    floor = ms["read"] + ms["keys"]
-                    voxels = work["frame"]().voxels  # type: ignore[attr-defined]
-                    row = {"size": size, "K": K, "type": kind, "noise": noise, "voxels": voxels, **ms,
-                           "of_floor": ms["frame"] / floor, "with_rows": ms["frame"] / (floor + ms["rows"])}  # fmt: skip
-                    results.append(row)
-                    print(
-                        f"{size:>9} {K:>3} {kind:<7} {noise:6.2%} {voxels:7d} {ms['read']:7.1f} {ms['keys']:6.1f}"
-                        f" {ms['rows']:6.1f} {ms['frame']:7.1f} {row['of_floor']:7.2f}x {row['with_rows']:8.2f}x",
-                        flush=True,
-                    )
-                    del frames, work
-                    gc.collect()
+    every = itertools.product(arguments.sizes, arguments.classes, arguments.types, arguments.noise)
+    for size, K, kind, noise in every:
+        row = {"size": size, "K": K, "type": kind, "noise": noise, **measured(size, K, kind, noise, arguments.rounds)}
+        results.append(row)
+        print(
+            f"{size:>9} {K:>3} {kind:<7} {noise:6.2%} {row['voxels']:7d} {row['read']:7.1f} {row['keys']:6.1f}"
+            f" {row['rows']:6.1f} {row['frame']:7.1f} {row['of_floor']:7.2f}x {row['with_rows']:8.2f}x",
+            flush=True,
+        )
     if arguments.json:
         write_json(arguments.json, {"rows": results})
 

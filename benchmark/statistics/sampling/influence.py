@@ -30,6 +30,14 @@ SCHEMA = 2
 MOST_CELLS, MOST_GROUPS = 256, 64
 """Cubes of space and groups of frames that are kept apart, at most."""
 
+MOST_SUMS = 2**24
+"""Numbers in the sums, at most: of thousands of classes fewer groups of frames are kept apart."""
+
+
+def most_groups(K: int) -> int:
+    """Of frames that are kept apart with K classes."""
+    return max(1, min(MOST_GROUPS, MOST_SUMS // (MOST_CELLS * K)))
+
 
 @dataclass(frozen=True, eq=False)
 class InfluenceSums:
@@ -103,11 +111,11 @@ class InfluenceSums:
         return dataclasses.replace(self, columns=columns, truth=False)
 
     def bounded(self) -> InfluenceSums:
-        """With at most MOST_CELLS cubes and MOST_GROUPS groups."""
+        """With at most MOST_CELLS cubes and `most_groups`."""
         edge, step = self.edge, self.step
         while len(np.unique(self.cell // round(edge / self.edge), axis=0)) > MOST_CELLS:
             edge *= 2
-        while step and len(np.unique(self.frame // (step // self.step))) > MOST_GROUPS:
+        while step and len(np.unique(self.frame // (step // self.step))) > most_groups(self.K):
             step *= 2
         return self if (edge, step) == (self.edge, self.step) else self.coarsened(edge, step)
 
