@@ -114,7 +114,7 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool
     covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
     if np.mean(covered_columns) <= LIDDED or high - low < 4 * table.voxel_size:
         return every, up_axis, "from above"
-    return heights <= cut, up_axis, f"from above, cut open at {cut:.3g} m"
+    return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
 
 
 def _area(table: VoxelTable, axis: Float64) -> int:

@@ -20,7 +20,7 @@ from semstab.outputs import plots
 from semstab.outputs.averages import describe
 from semstab.outputs.findings import Answer, Finding, findings
 from semstab.outputs.plots.style import COLUMN, DPI, Figure
-from semstab.outputs.report.reading import reading
+from semstab.outputs.report.reading import reading, verdicts
 from semstab.outputs.tables import Table, tables, write_tables
 from semstab.outputs.tables.writers import ARROWS, relations, sections
 from semstab.runtime.files import write_text
@@ -123,7 +123,8 @@ def render(result: Result, folder: Path) -> str:
         title=_title(result),
         style=(here / "style.css").read_text(encoding="utf-8"),
         subtitle=_subtitle(result),
-        reading=[relations(sentence) for sentence in reading(result, found)],
+        verdicts=[relations(sentence) for sentence in verdicts(result)],
+        reading=[relations(sentence) for sentence in reading(result, found) if sentence not in verdicts(result)],
         findings=[_finding(row) for row in found if row.verdict is not Answer.UNTESTED],
         untested=[_finding(row) for row in found if row.verdict is Answer.UNTESTED],
         topics=list(_topics(result, folder)),
@@ -282,20 +283,18 @@ def _unfolded(shown: Sequence[Figure], result: Result) -> tuple[list[Figure], li
 
 
 def _blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
-    """Tables, each with the figure of its name beneath it, then the other figures; a caption is not said twice."""
+    """Tables, each with the figure of its name beneath it, then the other figures."""
     beside = {figure.name: figure for figure in shown}
     ordered: list[Table | Figure] = []
     for table in own:
         ordered.append(table)
         if table.name in beside:
             ordered.append(beside.pop(table.name))
-    said: set[str] = set()
     for item in (*ordered, *beside.values()):
-        block = _table(item) if isinstance(item, Table) else _figure(item, folder)
-        if block["caption"] in said:
-            block["caption"] = ""
-        said.add(block["caption"])
-        yield {"kind": "table" if isinstance(item, Table) else "figure", "content": block}
+        if isinstance(item, Table):
+            yield {"kind": "table", "content": _table(item)}
+        else:
+            yield {"kind": "figure", "content": _figure(item, folder)}
 
 
 def _table(table: Table) -> dict[str, Any]:
