@@ -1,4 +1,4 @@
-"""Soft scores by tiles of the image and dense rows: what the reference has, whatever the type, and mixed with labels."""
+"""Soft scores by tiles of the image and dense rows: as the reference has them, of any type, and mixed with labels."""
 
 from __future__ import annotations
 
