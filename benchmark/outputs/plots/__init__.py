@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from semstab.model.measures import measures
 from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
 from semstab.outputs.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
@@ -135,6 +136,7 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
 
 
 def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
+    panels = " and ".join(measure.title for measure in measures() if measure.panel)
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
         if scene in result.up:
@@ -142,9 +144,9 @@ def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
                 slug("stability_map", scene, backbone),
                 f"Stability from above: {scene}, {backbone}",
                 "The topmost voxel of each column along the up axis, beneath a ceiling where there is one, or of a wall"
-                " the foremost: its stability category and every measure; grey:"
-                " seen once, which says nothing. Values beyond a scale look like its end.",
-                f"Maps of {scene} from above with the stability category and each measure of {backbone}'s voxels.",
+                f" the foremost: (a) its stability category, then {panels}; grey: seen once, which says nothing. Values"
+                " beyond a scale, which has an arrow there, look like its end.",
+                f"Maps of {scene} from above with the stability category, {panels} of {backbone}'s voxels.",
                 partial(_draw_map, record, result.up[scene], views),
                 unit=record.unit.slug,
             )

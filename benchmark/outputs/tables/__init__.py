@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from semstab.model.records import Result
@@ -25,6 +26,7 @@ __all__ = [
     "Column",
     "Group",
     "Table",
+    "save_tables",
     "tables",
     "to_csv",
     "to_json",
@@ -48,8 +50,13 @@ def tables(result: Result) -> list[Table]:
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:
     """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, in place of all others there; return the paths."""
+    return save_tables(tables(result), folder)
+
+
+def save_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
+    """The same of tables that are made already."""
     written = []
-    for table in tables(result):
+    for table in made:
         stem = Path(folder) / "tables" / table.name
         for suffix, write in TEXT_WRITERS.items():
             written.append(stem.with_suffix(f".{suffix}"))
