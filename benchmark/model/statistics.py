@@ -417,7 +417,7 @@ class MapStatistics:
 
     @property
     def order_known(self) -> bool:
-        """Whether a quarter of the places seen twice or more, or more of them, say what a random order of their observations gives.
+        """Whether a quarter of the places seen twice say what a random order of their observations gives.
 
         Of soft scores without a log only a few do, and not just any.
         """
