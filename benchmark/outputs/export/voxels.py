@@ -25,6 +25,7 @@ from semstab.model.results import slug
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.maps import Overview
 from semstab.statistics import psa
+from semstab.statistics.commit import Commit
 
 Float64 = npt.NDArray[np.float64]
 
@@ -82,8 +83,11 @@ def voxels_of(
     columns: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
+    commit: Commit | None = None,
 ) -> Voxels:
     """Those of a unit with OP >= min_op and one of these dominant classes, all where none is named.
+
+    With thresholds, of those the ones whose label has enough evidence.
 
     `columns` names measures, op, category, psa, or columns of the unit's Parquet file; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
@@ -91,9 +95,9 @@ def voxels_of(
     if record.voxels_file is None:
         raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
     table = record.table()
-    found = _chosen(result, record, table, record.voxels_file, columns, min_op, classes)
+    found = _chosen(result, record, table, record.voxels_file, columns, min_op, classes, commit)
     if not len(found.table):
-        raise _none_left(record, min_op, classes, int(table.op.max(initial=0)))
+        raise _none_left(record, min_op, classes, commit, int(table.op.max(initial=0)))
     return found
 
 
@@ -104,25 +108,27 @@ def iter_voxels(
     columns: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
+    commit: Commit | None = None,
 ) -> Iterator[Voxels]:
     """Those of `voxels_of` tile by tile, where the map is in tiles; a tile without any is left out."""
     if not record.in_tiles or record.voxels_file is None:
-        yield voxels_of(result, record, columns=columns, min_op=min_op, classes=classes)
+        yield voxels_of(result, record, columns=columns, min_op=min_op, classes=classes, commit=commit)
         return
     left, highest = False, 0
     for file in parquet.files_of(record.voxels_file):
         table = VoxelTable.load(file)
         highest = max(highest, int(table.op.max(initial=0)))
-        found = _chosen(result, record, table, file, columns, min_op, classes)
+        found = _chosen(result, record, table, file, columns, min_op, classes, commit)
         left = left or len(found.table) > 0
         if len(found.table):
             yield found
     if not left:
-        raise _none_left(record, min_op, classes, highest)
+        raise _none_left(record, min_op, classes, commit, highest)
 
 
-def _none_left(record: Record, min_op: int, classes: Sequence[str], highest: int) -> ConfigError:
+def _none_left(record: Record, min_op: int, classes: Sequence[str], commit: Commit | None, highest: int) -> ConfigError:
     limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
+    limits += " and the evidence that --commit asks for" if commit is not None else ""
     return ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {highest}")
 
 
@@ -134,6 +140,7 @@ def _chosen(
     columns: Sequence[str] | None,
     min_op: int,
     classes: Sequence[str],
+    commit: Commit | None,
 ) -> Voxels:
     """Of a table, which is in a file."""
     assert record.voxels_file is not None
@@ -141,6 +148,8 @@ def _chosen(
     keep = table.op >= min_op
     if classes:
         keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
+    if commit is not None:
+        keep &= commit.decide(table) >= 0
     chosen = {name: _column(name, table, file) for name in columns or usual()}
     scene, backbone = record.unit.scene, record.unit.backbone
     georeference = result.georeference.get(scene)
