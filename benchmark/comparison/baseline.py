@@ -24,7 +24,7 @@ from semstab.statistics.sampling import InfluenceSums
 SCHEMA, KIND = 1, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
-"""Bytes of a file that is looked into."""
+"""Bytes of a file that is looked into, and of all that is packed in it."""
 
 MANY_GROUPS = 32
 """Groups of frames down to which these are joined, before cubes are."""
@@ -95,6 +95,8 @@ def load_baseline(path: str | Path) -> Baseline:
     """Read what `save_baseline` wrote. Raises DataError where it is damaged, or something else."""
     try:
         with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:
+            if sum(member.file_size for member in archive.infolist()) > LARGEST:
+                raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
             text = json.loads(archive.read(CONTENT))
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("of another kind or version")

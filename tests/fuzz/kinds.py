@@ -26,6 +26,9 @@ from rich.console import Console
 import semstab
 from semstab.backbones.sam.heuristic import read_rules
 from semstab.backbones.segearth.prompts import read_prompts
+from semstab.comparison.contrasts import contrasts
+from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
+from semstab.comparison.pairing import pair
 from semstab.convert import convert
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.codecs import reads_exr
@@ -58,7 +61,7 @@ CAMERA = Intrinsics(12, 12, 7.5, 5.5)
 SWEEPS = {"voxel_size": [0.1, 0.2], "depth_noise": {"values": [0, 0.1], "repeats": 2}}
 RGB = np.random.default_rng(1).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
 BY_SUFFIX: dict[str, Damage] = {
-    ".png": damages.of_png, ".npz": damages.of_npz, ".json": damages.of_json, ".geojson": damages.of_json,
+    ".png": damages.of_png, ".npz": damages.of_npz, ".semstab": damages.of_npz, ".json": damages.of_json, ".geojson": damages.of_json,
     ".yaml": damages.of_yaml, ".txt": damages.of_words, ".csv": damages.of_words, ".tsv": damages.of_words,
     ".obj": damages.of_words, ".parquet": damages.of_parquet,
 }  # fmt: skip
@@ -234,6 +237,9 @@ def of_results(folder: Path) -> Iterator[Kind]:
     for pattern, read in first.items():
         if found := sorted(run.glob(pattern)):
             yield Kind(f"run {pattern}", (found[0],), read)
+    small = folder / "small.semstab"
+    save_summary(open_contender(f"{run}:a"), small)
+    yield Kind("small summary", (small,), lambda file: compared(file, f"{run}:b"))
     conversion = folder / "converted/wall/conversion.json"
     yield Kind("conversion.json", (conversion,), lambda _: list(convert(config, folder / "converted")))
     yield Kind("predictions.json", (folder / "labels/net/predictions.json",), lambda _: predict(folder))
@@ -253,6 +259,13 @@ def read_result(folder: Path) -> None:
     tables(result)
     if result.select():
         print_summary(result, Console(file=StringIO()))
+
+
+def compared(*named: Path | str) -> None:
+    contenders = open_contenders(named)
+    for scene in shared_scenes(contenders):
+        entries = [each.scenes[scene] for each in contenders]
+        contrasts(pair(entries, [each.name for each in contenders]), *entries, 1)
 
 
 def predict(folder: Path) -> None:
