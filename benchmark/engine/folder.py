@@ -219,6 +219,10 @@ def _contradiction(result: Result) -> str | None:
     """What in a result refers to something that is not in it; None where nothing does."""
     if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
         return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
+    for record in result.records:
+        table = record.summary.table
+        if not table.strata or (table.voxels and not table.classes):
+            return f"{record.unit} has no {'classes' if table.strata else 'strata'}"
     quantities = {"op", "evidence", *(measure.key for measure in measures())}
     for row in result.agreement:
         if lost := quantities - row.differences.keys():

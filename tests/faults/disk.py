@@ -101,5 +101,7 @@ def main(step: int, wanted: str) -> int:
 
 if __name__ == "__main__":
     if MARK not in os.environ:
-        os.execvpe("unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {MARK: "1"})
+        os.execvpe(
+            "unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {MARK: "1", "RUST_LOG": "off"}
+        )  # as `settle` has it
     sys.exit(main(int((sys.argv[1:] or ["1"])[0]), (sys.argv[2:] or [""])[0]))

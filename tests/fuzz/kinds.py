@@ -61,9 +61,9 @@ CAMERA = Intrinsics(12, 12, 7.5, 5.5)
 SWEEPS = {"voxel_size": [0.1, 0.2], "depth_noise": {"values": [0, 0.1], "repeats": 2}}
 RGB = np.random.default_rng(1).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
 BY_SUFFIX: dict[str, Damage] = {
-    ".png": damages.of_png, ".npz": damages.of_npz, ".semstab": damages.of_npz, ".json": damages.of_json, ".geojson": damages.of_json,
-    ".yaml": damages.of_yaml, ".txt": damages.of_words, ".csv": damages.of_words, ".tsv": damages.of_words,
-    ".obj": damages.of_words, ".parquet": damages.of_parquet,
+    ".png": damages.of_png, ".npz": damages.of_npz, ".semstab": damages.of_npz, ".json": damages.of_json,
+    ".geojson": damages.of_json, ".yaml": damages.of_yaml, ".txt": damages.of_words, ".csv": damages.of_words,
+    ".tsv": damages.of_words, ".obj": damages.of_words, ".parquet": damages.of_parquet,
 }  # fmt: skip
 
 
