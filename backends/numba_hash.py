@@ -35,6 +35,7 @@ from semstab.backends.shared.observed import Observed
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
@@ -54,6 +55,7 @@ class NumbaHash:
     evidence  'float64', or 'float32' for half the memory of the evidence
     threads   how many to use; all of numba's where not given
     history   keep every observation, for `events`; memory then grows with each
+    within    the voxels that the map is restricted to
     """
 
     _loaded: ClassVar[bool] = False
@@ -65,6 +67,7 @@ class NumbaHash:
         evidence: str = "float64",
         threads: int | None = None,
         history: bool = False,
+        within: Extent | None = None,
     ) -> None:
         check_settings(voxel_size, num_classes)
         if evidence not in ("float64", "float32"):
@@ -77,7 +80,7 @@ class NumbaHash:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.threads = threads
-        self._pixels = Aggregator(voxel_size, num_classes)
+        self._pixels = Aggregator(voxel_size, num_classes, within)
         self._history = History(voxel_size, num_classes) if history else None
         record, node = record_types(np.dtype(evidence))
         self._total = MapTotal(num_classes)

@@ -15,8 +15,9 @@ from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.merging import HALVES, compact, group, merge_scores, scatter, sort_labels, sum_scores
 from semstab.backends.shared.observed import Observed, WorkSpace
-from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.pixel_keys import columns_of, frame_terms
 from semstab.backends.shared.tiles import Tiles
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, fixed
 
@@ -50,15 +51,16 @@ class _Found:
 
 
 class Aggregator:
-    """Turns frames into observations; keeps its work space from frame to frame."""
+    """Turns frames into observations, of the voxels of an extent where one is given; keeps its work space."""
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
+        self.within = within
         self.origin: Int64 | None = None
         self._band_room = FIRST_ROOM
         self._space = WorkSpace()
-        self._tiles = Tiles(voxel_size, num_classes)
+        self._tiles = Tiles(voxel_size, num_classes, within)
 
     def observe(self, frame: Frame) -> Observed:
         """The frame's observations; the first frame's camera sets the origin.
@@ -98,8 +100,8 @@ class Aggregator:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             find_entries(
                 fixed(frame.depth), fixed(labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-                rays, margin, IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes,
-                row_runs, slots, key, label, count, where, entries, lost, highest, spread,
+                columns_of(self.within, origin), rays, margin, IGNORE_8BIT if soft else frame.ignore_id, soft, rows,
+                room, row_keys, row_changes, row_runs, slots, key, label, count, where, entries, lost, highest, spread,
             )  # fmt: skip
             if highest.max() >= self.num_classes:
                 check_frame(frame, self.num_classes)

@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import mix, partition_of
-from semstab.backends.shared.pixel_keys import keys_of_row
+from semstab.backends.shared.pixel_keys import keep_columns, keys_of_row
 from semstab.runtime.compiled import parallel, serial
 
 
@@ -33,7 +33,7 @@ def _runs(keys, labels, soft, changes, starts):
 
 @parallel
 def find_entries(
-    depth, labels, ray_x, ray_y, T, size, origin, rays, margin, ignore, soft, rows, room, row_keys,
+    depth, labels, ray_x, ray_y, T, size, origin, columns, rays, margin, ignore, soft, rows, room, row_keys,
     row_changes, row_runs, slots, key, label, count, where, entries, lost, highest, spread,
 ):  # fmt: skip
     """Distinct (voxel, label) pairs of each band with their pixel counts, in order of appearance.
@@ -58,6 +58,8 @@ def find_entries(
             lost[band] += keys_of_row(
                 depth[v], labels[v], ray_x, ray_y[v], T, size, ox, oy, oz, ignore, rays, margin, keys
             )
+            if columns.shape[0]:
+                keep_columns(keys, columns)
             runs = _runs(keys, labels[v], soft, changes, starts)
             n, mask = _enter_row(
                 labels[v], labels[v - 1], soft, keys, keys_above, runs, starts, runs_above, above, found, found_above,

@@ -66,7 +66,7 @@ def predict(
     mapping: Annotated[
         str | None, typer.Option(help="strict, or lenient: near classes count as well.", show_default="strict")
     ] = None,
-    scores: Annotated[bool, typer.Option("--scores", metavar="", help="Also keep soft scores.")] = False,
+    scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
     top_k: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
     ] = None,
@@ -75,9 +75,7 @@ def predict(
         typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.options.KEY=VALUE."),
     ] = None,
     options: DatasetOptions = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", metavar="", help="Replace predictions of other settings.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""

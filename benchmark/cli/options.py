@@ -60,7 +60,7 @@ Frames = Annotated[
     str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.", show_default="all")
 ]
 TrustGeometry = Annotated[
-    bool, typer.Option("--trust-geometry", metavar="", help="Fuse also where depth and poses contradict each other.")
+    bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
 ]
 Rerun = Annotated[
     str | None,
@@ -75,7 +75,15 @@ Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.
 Scheduler = Annotated[
     str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar="", help="Print nothing but errors.")]
+TileSize = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N|off",
+        help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse what does not fit in memory.",
+        show_default="where a map would not fit",
+    ),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 
 
 def selection(

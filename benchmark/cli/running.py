@@ -25,6 +25,7 @@ from semstab.cli.options import (
     Rerun,
     Scenes,
     Scheduler,
+    TileSize,
     TrustGeometry,
     VoxelSize,
     chosen,
@@ -92,20 +93,17 @@ def run(
     ] = None,
     options: DatasetOptions = None,
     trust_geometry: TrustGeometry = False,
-    events: Annotated[
-        bool | None, typer.Option("--events", metavar="", help="Also write the log of observations.")
-    ] = None,
+    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
     statistics: Annotated[
         bool | None,
-        typer.Option(
-            "--statistics", metavar="", help="Also test drift, judge by ground truth, compare backbones; takes longer."
-        ),
+        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: Rerun = None,
     report: Report = "on",
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
+    tile_size: TileSize = None,
     predict: Annotated[
         list[str] | None,
         typer.Option(
@@ -128,6 +126,7 @@ def run(
         "events": events,
         "statistics": statistics,
         "check_geometry": False if trust_geometry else None,
+        "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
     }
     content = chosen(named, with_options(settings, options), dataset, data, frames, seed)
     if check in ("none", "off"):

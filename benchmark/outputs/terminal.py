@@ -24,6 +24,9 @@ NOTHING = "-"
 HARDLY_ANY = 0.1
 """A share of voxels seen once below which they need no remark."""
 
+FUSION_STAGES = ("association", "update")
+"""Parts of fusion; frames are decoded beside it, and waited for where that takes longer."""
+
 RARE = 100
 """Voxels below which a class is too rare to be called the worst."""
 
@@ -48,9 +51,9 @@ def print_summary(result: Result, console: Console) -> None:
         console.print(_agreement_table(told))
     if drawn:
         console.print(f"{_drawn(drawn)}\n", highlight=False, markup=False)
-    console.print(_stages_line(shown))
+    console.print(_stages_line(shown), highlight=False)
     for text in _statistics(result):
-        console.print(text, highlight=False, markup=False)
+        console.print(text, highlight=False, markup=False, soft_wrap="\n" in text.rstrip())  # tables keep their lines
     for text in remarks(result):
         console.print(f"- {text}", highlight=False, markup=False)
     console.print()
@@ -164,23 +167,27 @@ def _headers() -> list[str]:
 
 
 def _stages_line(runs: Sequence[UnitSummary]) -> str:
-    """Mean milliseconds a frame by stage, of those that are known; decoding goes on beside them in worker threads."""
+    """Mean milliseconds a frame: of fusion, with its parts where they are known, and of what is done beside it."""
     means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
-    decode = means.pop("decode")
-    known = [f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)]
+    known = {stage: f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)}
+    parts = ", ".join(known.pop(stage) for stage in FUSION_STAGES if stage in known)
     fusion = _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1)
-    return f"ms a frame: fusion {fusion} ({', '.join(known)}); beside them decode {_number(decode, 1)}\n"
+    beside = "".join(f", {text}" for text in known.values())
+    return f"ms a frame: fusion {fusion}{f' ({parts})' if parts else ''}{beside}\n"
 
 
 def _class_table(result: Result) -> Table:
     """Classes that there are, by how well frames agree on them, the worst first; rare ones at the end."""
-    title = "by class, the least steady first" + (", all scenes pooled" if len(result.scenes) > 1 else "")
+    maps = {backbone: result.select(backbone=backbone) for backbone in result.backbones}
+    seen = {name: [row for row in pooled(records).classes if row.voxels] for name, records in maps.items()}
+    title = "by class, the least steady first"
+    if any(row.voxels < RARE for there in seen.values() for row in there):
+        title += f", those of fewer than {RARE} voxels last"
+    title += ", all scenes pooled" if len(result.scenes) > 1 else ""
     known = any(_class_alphas(result.select()).values())
     table = _table(title, ("class",), ("voxels", "%", *_headers(), *(["alpha\n↑"] if known else [])))
-    for backbone in result.backbones:
-        records = result.select(backbone=backbone)
-        alphas = _class_alphas(records)
-        there = [row for row in pooled(records).classes if row.voxels]
+    for backbone, there in seen.items():
+        alphas = _class_alphas(maps[backbone])
         there.sort(key=lambda row: (row.voxels < RARE, alphas.get(row.name, 1.0), row[VSS]))
         table.add_row(escape(backbone), style="bold")
         for row in there[:MOST_CLASSES]:

@@ -19,12 +19,30 @@ from semstab.engine.work.jobs import Request
 from semstab.engine.work.sizes import SizeMaps
 from semstab.metrics import flicker_percent
 from semstab.model.frames import Frame
+from semstab.model.results import FrameReport
+from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Sampler
 from semstab.task import Task, prepare
 
 SHOWN_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
+
+
+class NoMap:
+    """Stands for a map where frames are only looked at."""
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Nothing is fused."""
+        return FrameReport(frame.index, points=0, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
+
+    def table(self) -> VoxelTable:
+        """There is none."""
+        raise NotImplementedError
+
+    def events(self) -> Events | None:
+        """There are none."""
+        return None
 
 
 @dataclass(eq=False)
@@ -84,6 +102,7 @@ class Stream:
         self.task = dataclasses.replace(
             maps[0].task, backends=tuple(one.task.backends[0] for one in maps if one.request.kept)
         )
+        self.whole = any(one.request.within is None for one in maps)
         self.pixel_stride = maps[0].request.config.pixel_stride
         self.indices = frozenset(self.task.indices)
         self.previous: Frame | None = None
@@ -101,7 +120,7 @@ class Stream:
         assert decoded.frame is not None
         frame = prepare(self.task, decoded.frame, self.pixel_stride)
         with watch("flicker") as lap:
-            flicker = _flicker_between(self.previous, frame)
+            flicker = _flicker_between(self.previous, frame) if self.whole else math.nan
         truth = self._truth(decoded)
         if self.image_space is not None:
             with watch("image space"):

@@ -16,6 +16,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import categories
 from semstab.metrics.matching import rows_of
 from semstab.model import palette as colors
+from semstab.model import parquet
 from semstab.model.georeference import Georeference
 from semstab.model.labels import name_key
 from semstab.model.measures import dominant, measures
@@ -148,14 +149,11 @@ def _column(name: str, table: VoxelTable, file: Path) -> Column:
 
 def _kept_column(name: str, file: Path, known: Iterable[str]) -> Column:
     """A column that the run wrote beside those that every map has."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    kept = [field.name for field in pq.read_schema(file) if not pa.types.is_nested(field.type)]
+    kept = parquet.names_in(file)
     if name not in kept:
         there = sorted({*known, "op", "category", "psa", *kept} - {"ix", "iy", "iz", "label"})
         raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, there)}")
-    return Column(pq.read_table(file, columns=[name]).column(name).to_numpy())
+    return Column(VoxelTable.columns(file, [name])[name])
 
 
 def _colors(overview: Path, K: int) -> npt.NDArray[np.uint8]:

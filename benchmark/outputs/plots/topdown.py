@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,9 @@ Int64 = npt.NDArray[np.int64]
 EMPTY = -1
 LARGEST = 2000
 """Cells of a map's longer side; a larger map gets cells of several voxels."""
+
+MOST = LARGEST**2
+"""Voxels that are kept of a map that is looked at tile by tile."""
 
 LID, LIDDED = 0.4, 0.2
 """A map is cut open where more than the second share of its columns are covered by voxels of the upper part, the first
@@ -71,6 +75,26 @@ def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tupl
     corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
     cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
     return cells, np.tile(np.arange(len(plane)), len(corners))
+
+
+def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
+    """Of a map that comes tile by tile the voxels that can be seen from above: a table that does not grow with it."""
+    factor, parts = 1, list[VoxelTable]()
+    for tile in tiles:
+        parts.append(_tops(tile, up, factor))
+        while sum(map(len, parts)) > MOST:
+            factor *= 2
+            parts = [_tops(part, up, factor) for part in parts]
+    return VoxelTable.joined(parts)
+
+
+def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
+    """The topmost voxel of each cell of so many voxels' width."""
+    right, ahead, up_axis = level_axes(up)
+    cells = np.floor(table.centers @ np.stack([right, ahead], axis=1) / (factor * table.voxel_size)).astype(np.int64)
+    order = np.lexsort([-(table.centers @ up_axis), cells[:, 1], cells[:, 0]])
+    first = (np.diff(cells[order], axis=0, prepend=cells[order][:1] - 1) != 0).any(axis=1)
+    return table.rows(np.sort(order[first]))
 
 
 def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], Float64, str]:

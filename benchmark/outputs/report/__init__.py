@@ -18,7 +18,7 @@ from semstab.model.records import Failure, Result
 from semstab.model.results import slug
 from semstab.outputs import plots
 from semstab.outputs.averages import describe
-from semstab.outputs.findings import Finding, findings
+from semstab.outputs.findings import Answer, Finding, findings
 from semstab.outputs.plots.style import COLUMN, DPI, Figure
 from semstab.outputs.report.reading import reading
 from semstab.outputs.tables import Table, tables, write_tables
@@ -46,6 +46,9 @@ CSS_INCH = 122
 
 ABSENT = "absent"
 """What a table notes of a class that covers no voxel: the page names such classes in a line."""
+
+MOST_NAMED = 3
+"""Scenes that are named in the title."""
 
 WORTH_A_PROCESS = 5.0
 """Seconds of work from which on figures are drawn by two processes."""
@@ -116,11 +119,13 @@ def render(result: Result, folder: Path) -> str:
     )
     found = findings(result)
     return environment.get_template("report.html.j2").render(
-        result=result,
+        kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
+        title=_title(result),
         style=(here / "style.css").read_text(encoding="utf-8"),
         subtitle=_subtitle(result),
         reading=[relations(sentence) for sentence in reading(result, found)],
-        findings=[_finding(row) for row in found],
+        findings=[_finding(row) for row in found if row.verdict is not Answer.UNTESTED],
+        untested=[_finding(row) for row in found if row.verdict is Answer.UNTESTED],
         topics=list(_topics(result, folder)),
         without_map=[scene for scene in result.scenes if scene not in result.up],
         failures=[_failure(row) for row in result.failures],
@@ -377,6 +382,14 @@ def _finding(finding: Finding) -> dict[str, Any]:
             for row in finding.evidence
         ],
     }
+
+
+def _title(result: Result) -> str:
+    """The name of a study; of a run, which has none, its scenes."""
+    if result.sweeps():
+        return result.name
+    scenes = result.scenes
+    return ", ".join(scenes) if len(scenes) <= MOST_NAMED else f"{len(scenes)} scenes"
 
 
 def _subtitle(result: Result) -> str:
