@@ -17,7 +17,7 @@ from semstab.errors import DataError, one_line
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace
 from semstab.model.results import UnitSummary
-from semstab.runtime.files import atomic_path, read_limited
+from semstab.runtime.files import atomic_path, parse_json, read_limited
 from semstab.runtime.json_form import from_json, to_json
 from semstab.statistics.sampling import InfluenceSums
 
@@ -97,7 +97,7 @@ def load_baseline(path: str | Path) -> Baseline:
         with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
                 raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
-            text = json.loads(archive.read(CONTENT))
+            text = parse_json(archive.read(CONTENT))
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("of another kind or version")
             content = from_json(_Content, text, path)

@@ -13,7 +13,6 @@ import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import yaml
 
@@ -42,6 +41,7 @@ from semstab.model.records import (
 )
 from semstab.model.results import SCHEMA, Unit, slug
 from semstab.runtime.files import (
+    DAMAGED_ARRAYS,
     TEMPORARY,
     FolderLock,
     atomic_path,
@@ -135,7 +135,7 @@ class Folder:
         """What an earlier start left of a portion, if its files are there as they were."""
         try:
             found = Finished.load(self.path / PORTIONS / key / f"{name}.npz")
-        except (OSError, ValueError, LookupError, EOFError, BadZipFile, DataError):
+        except (*DAMAGED_ARRAYS, DataError):
             return None
         return found if self._are_whole(found.about.files) else None
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import atomic_path, parse_json
 from semstab.runtime.json_form import from_json
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
 from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
@@ -153,7 +153,7 @@ class InfluenceSums:
 
         try:
             content = pq.read_table(path)
-            about = json.loads((content.schema.metadata or {})[b"semstab"])
+            about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
                 raise DataError("of another kind or version")
             about = dataclasses.asdict(from_json(About, about, path))
