@@ -13,6 +13,7 @@ from semstab import __version__
 from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
+from semstab.cli.gating import commit, gate
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
@@ -113,7 +114,7 @@ def root(
 
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (export, "export"),
-    (relabel, "relabel"), (conform, "conform"), (view, "view"), (list_, "list"),
+    (relabel, "relabel"), (gate, "gate"), (commit, "commit"), (conform, "conform"), (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)
 

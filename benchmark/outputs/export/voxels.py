@@ -25,6 +25,7 @@ from semstab.model.results import slug
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.maps import Overview
 from semstab.statistics import psa
+from semstab.statistics.commit import Commit
 
 Float64 = npt.NDArray[np.float64]
 
@@ -82,8 +83,11 @@ def voxels_of(
     columns: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
+    commit: Commit | None = None,
 ) -> Voxels:
     """Those of a unit with OP >= min_op and one of these dominant classes, all where none is named.
+
+    With thresholds, of those the ones whose label has enough evidence.
 
     `columns` names measures, op, category, psa, or columns of the unit's Parquet file; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
@@ -95,8 +99,11 @@ def voxels_of(
     keep = table.op >= min_op
     if classes:
         keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
+    if commit is not None:
+        keep &= commit.decide(table) >= 0
     if not keep.any():
         limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
+        limits += " and the evidence that --commit asks for" if commit is not None else ""
         raise ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {int(table.op.max(initial=0))}")
     chosen = {name: _column(name, table, record.voxels_file) for name in columns or usual()}
     scene, backbone = record.unit.scene, record.unit.backbone
