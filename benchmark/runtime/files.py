@@ -11,6 +11,7 @@ import os
 import stat
 import struct
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -31,7 +32,7 @@ TEMPORARY = ".semstab-"
 
 DAMAGED_ARRAYS = (
     OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
-    struct.error,
+    struct.error, tokenize.TokenError, SyntaxError,
 )  # fmt: skip
 """What numpy raises on a damaged .npz file of our own."""
 

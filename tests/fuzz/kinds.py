@@ -40,8 +40,8 @@ from semstab.datasets.surfaces.surface import Surface
 from semstab.engine import load_result
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
-from semstab.gate import gate_config
-from semstab.gate.rules import parse
+from semstab.gating import gate_config
+from semstab.gating.rules import parse
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.georeference import Georeference, wkt
 from semstab.model.labels import LabelSpace
@@ -172,7 +172,7 @@ def of_settings(folder: Path) -> Iterator[Kind]:
         "rules.yaml": (read_rules(None).model_dump(mode="json"), read_rules),
         "prompts.yaml": (read_prompts(None).model_dump(mode="json"), read_prompts),
     }
-    rules = ["alpha drop < 0.02", "class wall: recall > 0.6", "scene wall: class *: accuracy drop < 1 %"]
+    rules = ["alpha drop < 0.02", "class wall: recall > 0.6", "scene wall: class *: recall drop < 1 %"]
     contents["gate.yaml"] = ({"rules": rules, "level": 0.05, "undecided": "pass"}, read_gate)
     wall = {"by": "op", "at_least": 3, "precision": 0.97, "low": 0.95, "voxels": 200, "left": 0.7}
     commit = {"schema": 1, "precision": 0.95, "confidence": 0.95, "voxel_size": 0.25, "left": 0.6}
