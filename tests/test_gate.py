@@ -9,9 +9,11 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+import gate as simulation
 import numpy as np
 import pytest
 import tiny_scene
+from flights import Flight
 from posed_config import configure
 from posed_scene import fails
 from simulated_events import grid, log_of
@@ -163,6 +165,14 @@ def test_ends_are_one_sided_and_of_the_sums_differences():
         both = difference(new, base, key, same_frames=True, level=0.9)
         assert (found.value, found.low, found.high) == (both.value, both.low, both.high)
         assert found.value == pytest.approx(value(new, key) - value(base, key))
+
+
+def test_simulated_pairs_without_a_difference_seldom_fail_and_a_loss_of_the_margin_seldom_passes():
+    """A small part of tests/simulation/gate.py; docs/gate.md has the whole table."""
+    margin, fails_, _, passes, _, _ = simulation.rates(Flight(32, 1.5, 1.0, 15, 15, "uneven"), False, 25, 0)
+    assert 0.03 < margin < 0.12
+    assert fails_ <= 0.12
+    assert passes <= 0.16
 
 
 # --- The command ------------------------------------------------------------------------------------------------------

@@ -106,6 +106,7 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     whole = influence_sums(table, log, truth)
     part = influence_sums(rows_of(table, np.flatnonzero(kept)))
     assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean())
+    assert (coverage(whole, whole).low, coverage(whole, whole).high) == (1.0, 1.0)
     assert same_flight(whole, whole)
     assert not same_flight(whole, part)
     other = influence_sums(table, log, 1 - truth)

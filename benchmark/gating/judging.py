@@ -28,6 +28,7 @@ LEAST = 8
 """Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
 
 AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
+UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
 FEW = "{frames} frames are too few: fly {least} or more"
 
 
@@ -58,8 +59,6 @@ def change(
     new, base = comparable(new, base)
     if key == "coverage":
         found = coverage(new, base, both)
-        if identical(new, base, "psa"):
-            found = dataclasses.replace(found, value=1.0, low=1.0, high=1.0, undecided="")
         found = dataclasses.replace(found, value=found.value - 1, low=found.low - 1, high=found.high - 1)
     elif identical(new, base, key, k):
         same = estimate(new, key, k, _question(key, k, frames))
@@ -99,7 +98,7 @@ def of_frames(found: Interval, frames: int) -> Interval:
     if not reasons and found.question == NEXT_FLIGHT and found.degrees < LEAST_DEGREES:
         reasons.append(AS_LONG)
     if frames < LEAST:
-        reasons.append(FEW.format(frames=frames, least=LEAST))
+        reasons.append(FEW.format(frames=frames, least=LEAST) if frames else UNKNOWN_FRAMES)
     return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))
 
 

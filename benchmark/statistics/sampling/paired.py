@@ -52,7 +52,9 @@ def coverage(new: InfluenceSums, base: InfluenceSums, level: float = LEVEL) -> I
         np.bincount(at, weights=part["voxels"][:, 0], minlength=len(cell)) for at, part in zip(of, parts, strict=True)
     ]
     columns = np.stack([each[0], each[0] + each[1], each[1]], axis=1)
-    return of_places(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    found = of_places(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    same = np.allclose(each[0], each[1], rtol=1e-9)
+    return dataclasses.replace(found, low=1.0, high=1.0, undecided="") if same else found
 
 
 def same_flight(a: InfluenceSums, b: InfluenceSums) -> bool:
