@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +17,7 @@ from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.pixels.perturbation import perturb
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import DAMAGED_ARRAYS, atomic_path
 from semstab.runtime.prefetch import prefetch
 from semstab.task import Task
 
@@ -80,9 +79,9 @@ class Sights:
         try:
             with path.open("rb") as file, np.load(file) as content:
                 values = {field.name: content[field.name] for field in dataclasses.fields(cls)}
-        except (OSError, ValueError, LookupError, EOFError, BadZipFile):
+            return cls(**values | {name: int(values[name]) for name in ("size", "frames")})
+        except DAMAGED_ARRAYS:
             return None
-        return cls(**values | {name: int(values[name]) for name in ("size", "frames")})
 
 
 def look_at(
