@@ -66,6 +66,7 @@ def export(
     asprs: str | Path | None = None,
     onto: str | Path | None = None,
     radius: float | None = None,
+    beside: str | Path | None = None,
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
@@ -77,6 +78,7 @@ def export(
     asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
     onto      a cloud: what is written is this cloud, classified; a point outside of all voxels takes the nearest one
               within `radius` metres, a voxel's edge where not given
+    beside    a Parquet file with further columns of the same voxels, such as `compare` writes
 
     Raises ConfigError, DataError, MissingDependencyError, each with the file.
     """
@@ -91,7 +93,10 @@ def export(
 
     @functools.cache
     def chosen(usual: tuple[str, ...] | None) -> Voxels:
-        return voxels_of(result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds)
+        return voxels_of(
+            result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds,
+            beside=None if beside is None else Path(beside),
+        )  # fmt: skip
 
     if onto is not None:
         return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]
