@@ -18,6 +18,7 @@ from semstab.cli.gating import commit, gate
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
+from semstab.cli.remedying import remedies
 from semstab.cli.running import run, study, view
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
@@ -115,8 +116,8 @@ def root(
 
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
-    (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"), (conform, "conform"), (view, "view"),
-    (list_, "list"),
+    (remedies, "remedies"), (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"),
+    (conform, "conform"), (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)
 

@@ -16,6 +16,7 @@ from semstab.outputs import plots
 from semstab.outputs.averages import describe
 from semstab.outputs.findings import Answer, Finding, findings
 from semstab.outputs.plots.style import Figure
+from semstab.outputs.remedies import advice, of_interest, remedies
 from semstab.outputs.report.page import blocks, figure_block, filled
 from semstab.outputs.report.reading import reading, verdicts
 from semstab.outputs.tables import tables, write_tables
@@ -98,17 +99,21 @@ def write_report(result: Result, folder: str | Path) -> list[Path]:
 
 def render(result: Result, folder: Path) -> str:
     """The page."""
+    everything, result = result, of_interest(result)
     found = findings(result)
     return filled(
         "report.html.j2",
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
         title=_title(result),
         subtitle=_subtitle(result),
-        verdicts=[relations(sentence) for sentence in verdicts(result)],
+        verdicts=[
+            *(sentence for each in remedies(everything) for sentence in advice(each)),
+            *(relations(sentence) for sentence in verdicts(result)),
+        ],
         reading=[relations(sentence) for sentence in reading(result, found) if sentence not in verdicts(result)],
         findings=[_finding(row) for row in found if row.verdict is not Answer.UNTESTED],
         untested=[_finding(row) for row in found if row.verdict is Answer.UNTESTED],
-        topics=list(_topics(result, folder)),
+        topics=list(_topics(everything, folder)),
         without_map=[scene for scene in result.scenes if scene not in result.up],
         failures=[_failure(row) for row in result.failures],
         facts=list(_facts(result.manifest)),
@@ -134,6 +139,13 @@ class Topic:
 
 
 TOPICS = (
+    Topic(
+        "remedies",
+        "What would steady it?",
+        "Filters over the same model and frames. Labels that do not change are not yet right: read flicker beside what"
+        " it costs.",
+        ("remedies",),
+    ),
     Topic("glance", "At a glance", "", ("glance", "verdicts", "overview")),
     Topic(
         "flicker",

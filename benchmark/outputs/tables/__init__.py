@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semstab.model.records import Result
+from semstab.outputs.remedies import of_interest
 from semstab.outputs.tables.comparison import comparison
 from semstab.outputs.tables.correctness import ceiling, correctness, rules
 from semstab.outputs.tables.fusion import agreement, compared, fusion
 from semstab.outputs.tables.glance import glance
 from semstab.outputs.tables.image_space import flicker
 from semstab.outputs.tables.looks import correlogram
+from semstab.outputs.tables.remedies import remedy_tables
 from semstab.outputs.tables.sensitivity import sensitivity
 from semstab.outputs.tables.stability import classes, cross_backbone, persistence, scenes
 from semstab.outputs.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
@@ -42,7 +44,8 @@ BUILDERS = (
 
 def tables(result: Result) -> list[Table]:
     """Every table that the study has records for, in the paper's order."""
-    return [table for build in BUILDERS for table in build(result)]
+    shown = of_interest(result)
+    return [*remedy_tables(result), *(table for build in BUILDERS for table in build(shown))]
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:
