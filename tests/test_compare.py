@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import shutil
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,14 @@ import pytest
 from command_line import bench
 from posed_config import configure
 from posed_writer import write_posed
+from rich.console import Console
 
 import semstab
 from semstab.comparison.contrasts import corrected, over_scenes
 from semstab.comparison.opening import open_contenders
 from semstab.comparison.pairing import pair
-from semstab.comparison.writing import load_comparison
+from semstab.comparison.terminal import print_comparison
+from semstab.comparison.writing import load_comparison, markdown
 from semstab.errors import ConfigError, DataError
 from semstab.model.contrast import Against, Contrast, RunComparison
 from semstab.model.frames import Frame, Intrinsics
@@ -179,28 +182,33 @@ def test_what_is_claimed_is_corrected_for_all_that_is_compared_together():
     assert {row.change for row in many} == {""}
 
 
-def test_the_command_prints_80_columns_and_markdown(runs):
-    done = bench("compare", runs / "old", f"{runs}/new:net", cwd=runs, columns=80)
-    assert max(map(len, done.stdout.splitlines())) <= 80
-    for word in ("wall: new less old", "alpha b.f.", "door", "frames"):
-        assert word in done.stdout
-    done = bench("compare", runs / "old", f"{runs}/new:net", "--markdown", cwd=runs, columns=80)
-    assert done.stdout.startswith("## new against old\n")
-    assert "| Measure | old | The run |" in done.stdout
+def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
+    text = StringIO()
+    print_comparison(fault, Console(file=text, width=80))
+    assert max(map(len, text.getvalue().splitlines())) <= 80
+    for word in ("wall: new less old", "alpha b.f.", "door", "window", "frames"):
+        assert word in text.getvalue()
+    page = markdown(fault)
+    assert page.startswith("## new against old\n")
+    assert "| Measure | old | The run |" in page
+
+
+def test_the_command_writes_a_folder_and_refuses_bad_input_in_one_line(runs, tmp_path):
+    done = bench("compare", runs / "old", runs / "old", "--markdown", cwd=tmp_path, columns=80)
+    assert done.stdout.startswith("## net (2) against net\n")
+    done = bench("compare", runs / "old", runs / "new", cwd=tmp_path, code=2)
+    assert done.stderr.count("\n") == 1
+    assert "holds several label sources (net, same); name one" in done.stderr
 
 
 def test_bad_input_is_one_line(runs, tmp_path):
-    def refused(*words: object) -> str:
-        line = bench("compare", *words, cwd=tmp_path, code=2).stderr
-        assert line.count("\n") == 1
-        return line
-
-    assert "name two runs or more" in refused(runs / "old")
-    assert "holds several label sources (net, same)" in refused(runs / "old", runs / "new")
+    with pytest.raises(ConfigError, match="name two runs or more"):
+        semstab.compare([runs / "old"])
     broken = shutil.copytree(runs / "old", tmp_path / "broken")
     content = json.loads((broken / "summary.json").read_text())
     (broken / "summary.json").write_text(json.dumps({**content, "runs": [3]}))
-    assert "summary.json" in refused(runs / "old", broken)
+    with pytest.raises(DataError, match=r"summary\.json"):
+        semstab.compare([runs / "old", broken])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
     with pytest.raises(ConfigError, match="holds no comparison"):
