@@ -16,9 +16,11 @@ from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, inf
 from semstab.outputs.plots.histograms import Histograms, together
 from semstab.outputs.plots.judgement import statistics_figures
 from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability
+from semstab.outputs.plots.remedies import remedy_figure
 from semstab.outputs.plots.style import Figure
 from semstab.outputs.plots.sweeps import draw_sweep
 from semstab.outputs.plots.views import Views
+from semstab.outputs.remedies import of_interest, remedies
 from semstab.runtime.files import keep_only
 
 if TYPE_CHECKING:
@@ -58,8 +60,11 @@ def write_figures(
 def figures(result: Result, folder: str | Path, views: Views | None = None) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
     views = views or Views()
+    found = remedies(result)
+    result = of_interest(result)
     kept = [record for record in result.select() if record.voxels_file is not None]
     return [
+        *(remedy_figure(each, slug("remedies", each.model)) for each in found),
         *_overviews(result, kept, views, Path(folder) / OVERVIEW),
         *_distributions(kept, views),
         *_maps(result, kept, views),
