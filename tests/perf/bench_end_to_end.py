@@ -3,12 +3,12 @@
     python tests/perf/bench_end_to_end.py --backend open3d --json end_to_end.json
 
 A folder is made for each kind of depth and noise level: views of the built-in city, rendered at half the size and
-scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as 16-bit
-PNGs or as .npy in metres, and 8-bit labels. A bare read of .npy looks at each value once.
-Noise 0 compresses best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page
-cache, and are bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured
-start compiles what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop`
-is what manifest.json says of reading, flicker, fusion and observers.
+scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as
+16-bit PNGs or as .npy in metres, and 8-bit labels. A bare read of .npy looks at each value once. Noise 0 compresses
+best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page cache, and are
+bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured start compiles
+what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop` is what
+manifest.json says of reading, flicker, fusion and observers.
 """
 
 from __future__ import annotations
