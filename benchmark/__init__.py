@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from semstab import backbones, backends, datasets, engine, metrics, statistics
     from semstab.api import run, run_study
+    from semstab.comparison.writing import compare
     from semstab.config import Config
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
@@ -39,6 +40,7 @@ __all__ = [
     "VoxelTable",
     "backbones",
     "backends",
+    "compare",
     "datasets",
     "engine",
     "export",
@@ -68,6 +70,7 @@ _HOMES = {
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
+    "compare": "comparison.writing",
     "export": "outputs.export",
     "gate": "gating",
     "load": "outputs.loaded",

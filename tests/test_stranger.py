@@ -149,7 +149,7 @@ def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     assert "m would do, and tell apart what these blur" in told
     assert [size.voxel_size for size in result.select()[0].summary.sizes] == [0.5, 1, 2]
     advice = dataclasses.replace(result.advice["wide"], voxel_size=result.advice["wide"].suggested)
-    assert "as check suggests" in printed(dataclasses.replace(result, advice={"wide": advice}))
+    assert "check suggests the same" in printed(dataclasses.replace(result, advice={"wide": advice}))
     assert "over voxel sizes, from 8 frames: alpha" in told
     assert "'background' is" in told
     assert "--set 'exclude.classes=[background]' leaves it out" in told

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
+from semstab.cli.comparing import compare
 from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
@@ -17,6 +18,7 @@ from semstab.cli.gating import commit, gate
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
+from semstab.cli.remedying import remedies
 from semstab.cli.running import run, study, view
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
@@ -113,8 +115,9 @@ def root(
 
 
 for command, name in (
-    (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (export, "export"),
-    (relabel, "relabel"), (gate, "gate"), (commit, "commit"), (conform, "conform"), (view, "view"), (list_, "list"),
+    (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
+    (remedies, "remedies"), (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"),
+    (conform, "conform"), (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)
 

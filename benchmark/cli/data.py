@@ -17,6 +17,7 @@ from semstab.cli.options import (
     DatasetName,
     DatasetOptions,
     DatasetSettings,
+    Filters,
     Frames,
     Quiet,
     Scenes,
@@ -66,6 +67,7 @@ def predict(
     mapping: Annotated[
         str | None, typer.Option(help="strict, or lenient: near classes count as well.", show_default="strict")
     ] = None,
+    filters: Filters = None,
     scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
     top_k: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
@@ -96,7 +98,7 @@ def predict(
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
     elif of_dataset:
         raise ConfigError("--option says how a dataset is read; choose one with --data or --dataset")
-    said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
+    said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
     command.run(
         predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
         options=of_model,

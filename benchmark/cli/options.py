@@ -53,6 +53,15 @@ Classes = Annotated[
     str | None,
     typer.Option(metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them."),
 ]
+Filters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--filter",
+        metavar="NAME:NUMBER",
+        help="What steadies the labels: ema:0.6, vote:5, ... (`list`); repeatable, in this order.",
+        autocompletion=completion.filters,
+    ),
+]
 VoxelSize = Annotated[
     float | None, typer.Option(help="Edge of a voxel, metres.", show_default="what `check` suggests; city: 0.2")
 ]

@@ -142,6 +142,9 @@ class Config(Settings):
         description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
         " other; keeps every observation, fuses the ground truth too",
     )
+    frame_quality: bool = Field(
+        False, description="also judge each frame's labels: right, foreseen, late; `remedies` does"
+    )
     critical_classes: list[str] = Field(
         default_factory=list,
         description="classes that the verdict depends on; all that have enough places where none is named",

@@ -165,6 +165,7 @@ class Folder:
             variation=planned.variation,
             summary=content.summary,
             image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
+            quality=content.quality if planned.image_space else None,
             voxels_file=self.path / voxels if planned.kept else None,
             truth_file=truth if planned.image_space and f"{TRUTH}/{truth.name}" in content.files else None,
         )

@@ -58,7 +58,7 @@ def _size(scene: str, found: VoxelAdvice, scenes: int) -> str:
     if found.voxel_size < found.suggested:
         return f"{text}, so that noise tears places apart; check suggests {found.suggested:g} m"
     if found.voxel_size == found.suggested:
-        return f"{text}, as check suggests"
+        return f"{text}; check suggests the same"
     if found.voxel_size > COARSE * found.suggested:
         return f"{text}; {found.suggested:g} m would do, and tell apart what these blur"
     return f"{text}; check suggests {found.suggested:g} m"

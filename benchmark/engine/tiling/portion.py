@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from semstab.engine.series import FrameRow
 from semstab.engine.tiling.partition import Part
-from semstab.model.records import ImageSpace
+from semstab.model.records import FrameQuality, ImageSpace
 from semstab.model.results import Agreement, FrameReport, SizeAlpha
 from semstab.runtime.files import atomic_path
 from semstab.runtime.json_form import from_json, to_json
@@ -60,13 +60,14 @@ class About:
 
     files    digests of its files, by their path in the folder
     checked  how far it agrees with the reference on a sample of its voxels
-    image_space, sizes  of the frames
+    image_space, sizes, quality  of the frames
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
     checked: Agreement | None = None
     image_space: ImageSpace | None = None
     sizes: tuple[SizeAlpha, ...] = ()
+    quality: FrameQuality | None = None
 
 
 @dataclass(frozen=True, eq=False)

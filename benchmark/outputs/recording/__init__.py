@@ -17,6 +17,11 @@ difference_report/BACKBONE/A and B      TextDocument: how many they are
 legend, all_classes                     Points2D: the classes in use and their colours
 drift_legend                            SegmentationImage: the levels of drift
 log                                     TextLog: each unit's final numbers
+
+and in the recording of a comparison
+
+change/RUN/agreement, .../truth         VoxelGridMap: what each voxel lost or gained
+places/RUN                              Points3D: the places that got worse, with their numbers
 """
 
 from semstab.outputs.recording.observer import Recording

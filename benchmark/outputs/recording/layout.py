@@ -256,7 +256,7 @@ def _map(
         name=title,
         background=BACKGROUND,
         line_grid=False,
-        eye_controls=_eye(scenery, aspect),
+        eye_controls=eye(scenery, aspect),
     )
 
 
@@ -271,7 +271,7 @@ def _comparison(task: Task, first: str, second: str, known: Known) -> rrb.Contai
         name=f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
         background=BACKGROUND,
         line_grid=False,
-        eye_controls=_eye(scenery, DIFFERENCE_ASPECT),
+        eye_controls=eye(scenery, DIFFERENCE_ASPECT),
     )
     found = rrb.TextDocumentView(origin=path(scene, "difference_report", backbone, pair), name="What differs")
     maps = rrb.Horizontal(
@@ -305,7 +305,8 @@ def _axis(span: tuple[float, float] | None) -> rrb.ScalarAxis | None:
     return rrb.ScalarAxis(range=(low - margin, high + margin))
 
 
-def _eye(scenery: Scenery | None, aspect: float) -> rrb.EyeControls3D | None:
+def eye(scenery: Scenery | None, aspect: float) -> rrb.EyeControls3D | None:
+    """From where a view of that width by height shows it; None where the viewer chooses."""
     if scenery is None:
         return None
     target, distance = fit(scenery, aspect)

@@ -22,7 +22,7 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
         return ["No unit at the study's own settings was finished: there is nothing to say yet."]
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
     return [
-        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
+        *verdicts(result),
         *(remark if remark.endswith(":") else f"{remark}." for remark in remarks(result)),  # may begin with a name
         *_once(pooled(records)),
         *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
@@ -32,6 +32,11 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
         *_findings(found),
         *_implementations(result),
     ]
+
+
+def verdicts(result: Result) -> list[str]:
+    """On each backbone."""
+    return [sentence for rows in by_backbone(result.select()).values() for sentence in _verdict(rows)]
 
 
 def _once(voxels: Pooled) -> Iterator[str]:
