@@ -20,7 +20,7 @@ from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import Int64, check_depth, check_frame, check_settings
 from semstab.backends.shared.blocks import blocks_of
 from semstab.backends.shared.columns import update_rows
-from semstab.backends.shared.observed import Observed
+from semstab.backends.shared.observed import Observed, ObservedScores
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
@@ -92,6 +92,8 @@ class Open3DBlocks(FusionBackend):
         if frame.scores is not None:
             check_frame(frame, self.num_classes)
         seen = self._pixels.observe(frame)
+        if isinstance(seen, ObservedScores):
+            seen = seen.sparse()
         observed = time.perf_counter()
         rows = self._activate(self._pixels.index_of(seen.key)) if len(seen.key) else seen.key
         change = self._update(rows, seen, frame.index)

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import re
+from collections import Counter
 from html.parser import HTMLParser
 
 import pytest
@@ -21,7 +22,7 @@ from semstab.outputs.averages import ENOUGH, pooled
 from semstab.outputs.findings import findings
 from semstab.outputs.plots import figures
 from semstab.outputs.report import write_report
-from semstab.outputs.report.reading import reading
+from semstab.outputs.report.reading import reading, verdicts
 from semstab.outputs.tables import tables
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
@@ -135,7 +136,10 @@ def test_every_table_and_figure_stands_on_the_page(walls):
             for column, cell in zip(table.columns, row, strict=True):
                 printed = plain(column.text(cell)).replace("--", "\N{EN DASH}")
                 assert printed in text.replace("\N{MINUS SIGN}", "-")
-    assert {f"figure-{figure.name}" for figure in figures(result, folder)} <= ids
+    drawn = figures(result, folder)
+    assert {f"figure-{figure.name}" for figure in drawn} <= ids
+    for caption, times in Counter(plain(item.caption) for item in (*tables(result), *drawn)).items():
+        assert text.count(caption) >= times
 
 
 def test_rows_have_as_many_cells_as_the_table_has_columns(walls):
@@ -287,6 +291,11 @@ def agreement(name, agrees):
     return Agreement("s", "m", ("numpy", name), (1, 1), (0, 0), {}, agrees)
 
 
+def test_hardly_any_voxels_seen_once_need_no_sentence():
+    few = study(record(voxels((5, 1, SURE), (3 * ENOUGH, 4, SPLIT)), backbone="net"))
+    assert not any("seen once" in sentence for sentence in read(few))
+
+
 def test_the_reading_says_which_implementations_agree():
     rows = (agreement("numba", True), agreement("open3d", True), agreement("mine", True), agreement("mine", False))
     sentences = read(study(record(voxels((5, 1, SURE)))))
@@ -295,6 +304,8 @@ def test_the_reading_says_which_implementations_agree():
     sentences = reading(found, ())
     assert "numba and open3d leave the same maps as numpy." in sentences
     assert "mine and numpy disagree in 1 of 2 comparisons." in sentences
+    drawn = dataclasses.replace(found, agreement=tuple(dataclasses.replace(row, one_in=16) for row in rows[:1]))
+    assert "numba leaves the same maps as numpy, as far as one voxel in 16 tells." in reading(drawn, ())
 
 
 def test_the_reading_says_what_became_of_each_finding(walls):
@@ -308,6 +319,7 @@ def test_the_reading_says_what_became_of_each_finding(walls):
 def test_the_reading_of_the_walls_says_their_numbers(walls):
     voxels_seen = pooled(walls[0].select())
     said = reading(walls[0], ())
+    assert said[:1] == verdicts(walls[0])
     assert said[0].startswith("Verdict on ")
     assert any(line.startswith(f"{voxels_seen.once:.0%} of the voxels were seen once.") for line in said)
     assert set(walls[0].scenes) == set(STEPS)

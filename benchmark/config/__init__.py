@@ -127,6 +127,9 @@ class Config(Settings):
         description="edge of a voxel, metres; where it is not given, what `check` suggests for data of files",
     )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
+    top_k: int | None = Field(
+        None, ge=1, description="fuse the so many largest scores of each pixel; null: all, without loss"
+    )
     frames: FrameSelection = FrameSelection()
     scene_frames: dict[str, FrameSelection] = Field(
         default_factory=dict, description="frames of single scenes, instead of `frames`"
@@ -141,6 +144,9 @@ class Config(Settings):
         False,
         description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
         " other; keeps every observation, fuses the ground truth too",
+    )
+    frame_quality: bool = Field(
+        False, description="also judge each frame's labels: right, foreseen, late; `remedies` does"
     )
     critical_classes: list[str] = Field(
         default_factory=list,

@@ -34,7 +34,7 @@ from semstab.task import Task, applies, frame_indices, selected, tasks_of
 FORMAT = 4
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
-IN_KEYS = ("voxel_size", "pixel_stride", "exclude", "perturbation", "strata", "statistics", "critical_classes")
+IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes")
 """Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
 the input, frames, classes, the backend."""
 
@@ -323,14 +323,14 @@ def _check_count(variation: Variation, task: Task) -> None:
 
 def identity(config: Config, task: Task) -> str:
     """Hash of the settings that a unit's numbers depend on, beside its input."""
-    mapping = task.mapping
+    mapping, beside = task.mapping, task.scene.filtering(task.backbone)
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
         "frames": task.indices,
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    return _hash(config, content)
+    return _hash(config, content | ({"beside": beside.model} if config.frame_quality else {}))
 
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:

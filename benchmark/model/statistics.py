@@ -65,12 +65,16 @@ class Interval(Estimate):
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
+Level = Literal[
+    "stable", "partly stable", "usable", "unstable", "undecided", "too coarse", "misleading", "no verdict",
+]  # fmt: skip
+
 
 @dataclass(frozen=True)
 class StabilityVerdict:
-    """What the evidence says of a backbone on a scene: a key of ADVICE, and the line that gives the reason."""
+    """What the evidence says of a backbone on a scene: a level, see ADVICE, and the line that gives the reason."""
 
-    level: str
+    level: Level
     line: str
 
 
@@ -414,6 +418,14 @@ class MapStatistics:
     fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
     beyond_coin: BeyondCoin
+
+    @property
+    def order_known(self) -> bool:
+        """Whether a quarter of the places seen twice say what a random order of their observations gives.
+
+        Of soft scores without a log only a few do, and not just any.
+        """
+        return 4 * self.drift.voxels >= self.repeated.voxels
 
     @property
     def sections(self) -> int:

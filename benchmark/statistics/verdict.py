@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from semstab.model.statistics import NEXT_FLIGHT, ClassReach, Estimate, Interval, Judged, Reach, StabilityVerdict
+from semstab.model.statistics import NEXT_FLIGHT, ClassReach, Estimate, Interval, Judged, Level, Reach, StabilityVerdict
 from semstab.statistics.sampling import LEAST_FRAMES
 
 RELIABLE = 0.8
@@ -22,7 +22,7 @@ DANGEROUS = 0.05
 LEAST_VOXELS, LEAST_BLOCKS = 100, 16
 """Voxels seen twice or more, and blocks of them, below which there is no verdict."""
 
-ADVICE = {
+ADVICE: dict[Level, str] = {
     "stable": "its labels agree from frame to frame; act on them",
     "partly stable": "act on its labels but for those of the class named",
     "usable": "act on a label only where several frames agree",
@@ -102,7 +102,7 @@ def _class_share(row: ClassReach) -> str:
     return f"{chance}{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
 
 
-def _level(judged: Judged, reach: Reach | None) -> str:
+def _level(judged: Judged, reach: Reach | None) -> Level:
     basis = _basis(judged, reach)
     if math.isnan(basis.low):
         return "no verdict"

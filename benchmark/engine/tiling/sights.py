@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.association import back_project, check_depth, voxel_index
-from semstab.backends.shared.keys import index_of_keys
-from semstab.engine.tiling.look import look
-from semstab.errors import DataError
+from semstab.backends.shared.association import check_depth
+from semstab.backends.shared.keys import index_of_keys, out_of_reach
+from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.pixels.perturbation import perturb
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import DAMAGED_ARRAYS, atomic_path
 from semstab.runtime.prefetch import prefetch
 from semstab.task import Task
 
@@ -49,6 +48,7 @@ class Sights:
     frame   (m,) int32 index of a frame, cell (m, 2) int32 a cell that it sees: ix // size, iy // size; sorted
     place   (c, 2) int32 all cells, voxels and observations (c,) in each, estimated from a sample of the voxels
     frames  how many were looked at
+    origin  (3,) voxel of the first camera
     """
 
     size: int
@@ -58,6 +58,7 @@ class Sights:
     voxels: Float64
     observations: Float64
     frames: int
+    origin: Int64 = field(default_factory=lambda: np.zeros(3, np.int64))
 
     def in_tiles(self, size: int) -> Sights:
         """The same for cells of that size, a multiple of this one."""
@@ -67,7 +68,7 @@ class Sights:
         of, cells = of.ravel(), len(place)
         voxels = np.bincount(of, weights=self.voxels, minlength=cells).astype(np.float64)
         observations = np.bincount(of, weights=self.observations, minlength=cells).astype(np.float64)
-        return Sights(size, rows[:, 0], rows[:, 1:], place, voxels, observations, self.frames)
+        return Sights(size, rows[:, 0], rows[:, 1:], place, voxels, observations, self.frames, self.origin)
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
@@ -80,9 +81,9 @@ class Sights:
         try:
             with path.open("rb") as file, np.load(file) as content:
                 values = {field.name: content[field.name] for field in dataclasses.fields(cls)}
-        except (OSError, ValueError, LookupError, EOFError, BadZipFile):
+            return cls(**values | {name: int(values[name]) for name in ("size", "frames")})
+        except DAMAGED_ARRAYS:
             return None
-        return cls(**values | {name: int(values[name]) for name in ("size", "frames")})
 
 
 def look_at(
@@ -90,9 +91,9 @@ def look_at(
 ) -> Sights:
     """What the frames of a task see, by cells of that edge in voxels, or wider ones.
 
-    Raises DataError where a frame cannot be read, or has no finite depth.
+    Raises DataError where a frame cannot be read, has no finite depth, or reaches too far for a map.
     """
-    origin = _origin(task, voxel_size)
+    origin = np.floor(_geometry(task, task.indices[0], pixel_stride).T_wc[:3, 3] / voxel_size).astype(np.int64)
 
     def seen(index: int) -> _Seen:
         return _look(_geometry(task, index, pixel_stride), voxel_size, origin, cell)
@@ -101,11 +102,6 @@ def look_at(
     for fetched in prefetch(seen, task.indices, threads=threads):
         collected.add(fetched.item)
     return collected.sights()
-
-
-def _origin(task: Task, voxel_size: float) -> Int64:
-    first = task.scene.T_wc(task.indices[0])[:3, 3]
-    return np.floor(first / voxel_size).astype(np.int64)
 
 
 def _geometry(task: Task, index: int, pixel_stride: int) -> Frame:
@@ -131,17 +127,18 @@ def _look(frame: Frame, voxel_size: float, origin: Int64, size: int) -> _Seen:
     H, W = frame.shape
     camera = frame.intrinsics
     ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
+    rays, margin = frame_terms(ray_x, frame.T_wc, voxel_size)
+    everything, row = np.zeros(W, np.uint8), np.empty(W, np.int64)
     room = min(H * W, 1 << 14)
     while True:
         cells, keys, drawn = (np.empty(room, np.int64) for _ in range(3))
         n, m = look(
-            fixed(frame.depth), ray_x, ray_y, fixed(frame.T_wc), voxel_size, origin, size.bit_length() - 1, SHARE,
-            cells, keys, drawn,
+            fixed(frame.depth), everything, ray_x, ray_y, fixed(frame.T_wc), voxel_size, origin, rays, margin,
+            size.bit_length() - 1, SHARE, row, cells, keys, drawn,
         )  # fmt: skip
-        if n == -2:
-            voxel_index(back_project(frame), voxel_size, frame)
-            raise DataError(f"{frame.where('depth')}: depth beyond 2^31 voxels; leave it out, or use larger voxels")
-        if n >= 0:
+        if n == LOST:
+            raise out_of_reach(frame, origin, voxel_size)
+        if n != NO_ROOM:
             break
         room = min(H * W, 8 * room)
     packed = np.unique(cells[:n])
@@ -188,7 +185,7 @@ class _Collected:
         of, scale = of.ravel()[: len(index)], ALL / self._share
         voxels = (scale * np.bincount(of, minlength=len(place))).astype(np.float64)
         observations = (scale * np.bincount(of, weights=self._looks, minlength=len(place))).astype(np.float64)
-        return Sights(self._size, rows[:, 0], rows[:, 1:], place, voxels, observations, self._frames)
+        return Sights(self._size, rows[:, 0], rows[:, 1:], place, voxels, observations, self._frames, self._origin)
 
     def _widen(self) -> None:
         self._size *= 2

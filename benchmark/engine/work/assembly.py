@@ -65,6 +65,7 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
         return content
     image_space = replace(frames.about.image_space, flicker_percent=summary.flicker_percent)
     tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
+    content = replace(content, quality=frames.about.quality)
     return replace(content, image_space=image_space, up=_up(planned, tiles, int(sums.total[2]), frames.poses))
 
 

@@ -31,7 +31,7 @@ from semstab.metrics.matching import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.measures import dominant, measures, vss
 from semstab.model.parquet import Tile
-from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
+from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
     RECURRENT,
     STAGES,
@@ -83,10 +83,19 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     if one.request.image_space and stream.image_space is not None:
         image_space = stream.image_space.result(summary.flicker_percent)
         content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
+        content = dataclasses.replace(content, quality=_quality(stream))
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_finished(unit, table, summary))
     return Outcome(one.request.identity, content, files=returned)
+
+
+def _quality(stream: Stream) -> FrameQuality | None:
+    """What the labels of single frames are worth, where that is asked for."""
+    if stream.judge is None:
+        return None
+    made = stream.task.scene.filtering(stream.task.backbone)
+    return stream.judge.result(made.model, made.filters, made.milliseconds)
 
 
 def _table(backend: FusionBackend, task: Task) -> VoxelTable:
@@ -198,7 +207,7 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
         saved, returned = _written(job, _portion_savers(stream, one, portion, table))
         image_space = None if stream.image_space is None else stream.image_space.result(math.nan)
         finished = Finished(
-            About(saved, checked, image_space, () if one.sizes is None else one.sizes.alphas()),
+            About(saved, checked, image_space, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
             series_array(one.rows),
             sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),

@@ -143,7 +143,7 @@ class Pass:
             made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
                 made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target), request.within)
-            if request.image_space and request.judged:
+            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []
@@ -154,9 +154,17 @@ class Pass:
             color = self.observers.want_color or any(stream.shown == index for stream in self._streams)
             frame = self._scene.frame(index, self.job.backbone, color=color)
             wanted = any(stream.truth_task is not None and index in stream.indices for stream in self._streams)
-            return Decoded(index, frame, _ground_truth(self._scene, index) if wanted else None)
+            truth = _ground_truth(self._scene, index) if wanted else None
+            return Decoded(index, frame, truth, self._unfiltered(index))
         except Exception as error:  # noqa: BLE001 - raised again by `_feed`
             return Decoded(index, error=error)
+
+    def _unfiltered(self, index: int) -> Frame | None:
+        """What the model says of a frame without filters; None where that is not wanted, or it has none."""
+        if all(stream.judge is None for stream in self._streams):
+            return None
+        name = self._scene.filtering(self.job.backbone).model
+        return None if name == self.job.backbone else self._scene.frame(index, name, color=False)
 
     def _feed(self, stream: Stream, fetched: Fetched[Decoded]) -> None:
         """A frame into every map of a stream."""

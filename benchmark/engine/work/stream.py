@@ -17,7 +17,7 @@ from semstab.engine.series import FrameRow
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
 from semstab.engine.work.sizes import SizeMaps
-from semstab.metrics import flicker_percent
+from semstab.metrics import FrameJudge, flicker_percent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
@@ -71,17 +71,21 @@ class UnitMap:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame as its scene has it, with its ground truth where that is wanted; or the error that came instead."""
+    """A frame as its scene has it; or the error that came instead.
+
+    truth  its ground truth, where that is wanted; model  what the model said before filters, where that is wanted
+    """
 
     index: int
     frame: Frame | None = None
     truth: Frame | None = None
+    model: Frame | None = None
     error: Exception | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes that it keeps in memory."""
-        return sum(frame.nbytes for frame in (self.frame, self.truth) if frame is not None)
+        return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,8 @@ class Stream:
         self.indices = frozenset(self.task.indices)
         self.previous: Frame | None = None
         self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
+        wanted = self.image_space is not None and maps[0].request.config.frame_quality
+        self.judge = FrameJudge(len(self.task.mapping.target)) if wanted else None
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
         self.truth_task = truth_task(self.task) if takes_truth else None
         self.poses: list[Any] = []
@@ -125,6 +131,10 @@ class Stream:
         if self.image_space is not None:
             with watch("image space"):
                 self.image_space.add(frame, truth)
+        if self.judge is not None:
+            with watch("frame quality"):
+                model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
+                self.judge.add(frame, model, truth)
         if decoded.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
             frame = frame if color else dataclasses.replace(frame, color=None)
@@ -143,8 +153,8 @@ def streams_of(maps: Iterable[UnitMap]) -> list[Stream]:
     groups: dict[Any, list[UnitMap]] = {}
     for one in maps:
         config = one.request.config
-        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, tuple(one.task.indices))
-        groups.setdefault(same, []).append(one)
+        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
+        groups.setdefault((*same, tuple(one.task.indices)), []).append(one)
     return [Stream(group) for group in groups.values()]
 
 

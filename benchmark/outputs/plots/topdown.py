@@ -42,8 +42,10 @@ def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
     return right, np.cross(up_axis, right), up_axis
 
 
-def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
+def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) -> tuple[Int64, float]:
     """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
+
+    rank (n,) says which voxel of a cell is shown instead of the topmost one: the highest.
 
     The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
     each voxel covers the cells that a level square of its size touches.
@@ -58,7 +60,8 @@ def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
     first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
     inside = ((cells >= first) & (cells <= last)).all(axis=1)
     cells, rows = cells[inside] - first, rows[inside]
-    order = np.argsort((centers @ up_axis)[rows], kind="stable")  # the topmost is written last
+    height = centers @ up_axis if rank is None else rank
+    order = np.argsort(height[rows], kind="stable")  # the topmost is written last
     image = np.full(last - first + 1, EMPTY, dtype=np.int64)
     image[tuple(cells[order].T)] = rows[order]
     return image[::-1], cell
@@ -114,7 +117,7 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool
     covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
     if np.mean(covered_columns) <= LIDDED or high - low < 4 * table.voxel_size:
         return every, up_axis, "from above"
-    return heights <= cut, up_axis, f"from above, cut open at {cut:.3g} m"
+    return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
 
 
 def _area(table: VoxelTable, axis: Float64) -> int:

@@ -10,8 +10,8 @@ from semstab.metrics import macro_mean
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.outputs.averages import ENOUGH, Pooled, by_backbone, pooled
-from semstab.outputs.findings import Finding
-from semstab.outputs.remarks import mixed, remarks
+from semstab.outputs.findings import Answer, Finding
+from semstab.outputs.remarks import HARDLY_ANY, mixed, remarks
 from semstab.outputs.tables.stability import comparable
 
 
@@ -22,8 +22,8 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
         return ["No unit at the study's own settings was finished: there is nothing to say yet."]
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
     return [
-        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
-        *(f"{remark[0].upper()}{remark[1:]}." for remark in remarks(result)),
+        *verdicts(result),
+        *(remark if remark.endswith(":") else f"{remark}." for remark in remarks(result)),  # may begin with a name
         *_once(pooled(records)),
         *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
         *_ranking(result),
@@ -34,8 +34,13 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
     ]
 
 
+def verdicts(result: Result) -> list[str]:
+    """On each backbone."""
+    return [sentence for rows in by_backbone(result.select()).values() for sentence in _verdict(rows)]
+
+
 def _once(voxels: Pooled) -> Iterator[str]:
-    if not math.isnan(voxels.once):
+    if voxels.once >= HARDLY_ANY:
         yield (
             f"{voxels.once:.0%} of the voxels were seen once. They look stable because no second look could contradict"
             " them: read every measure where voxels recur (OP>=3)."
@@ -114,8 +119,9 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
 
 
 def _findings(found: Sequence[Finding]) -> Iterator[str]:
-    parts = (f"{row.claim[0].lower()}{row.claim[1:].rstrip('.')} ({row.said})" for row in found)
-    if found:
+    tested = [row for row in found if row.verdict is not Answer.UNTESTED]
+    parts = (f"{row.claim[0].lower()}{row.claim[1:].rstrip('.')} ({row.said})" for row in tested)
+    if tested:
         yield f"The paper's findings here: {'; '.join(parts)}."
 
 
@@ -126,7 +132,10 @@ def _implementations(result: Result) -> Iterator[str]:
         for name in dict.fromkeys(row.backends[1] for row in result.agreement)
     }
     if same := [name for name, agrees in rows.items() if all(agrees)]:
-        yield f"{' and '.join(same)} {'leaves' if len(same) == 1 else 'leave'} the same maps as {result.backend}."
+        drawn = max(row.one_in for row in result.agreement if row.backends[1] in same)
+        sample = f", as far as one voxel in {drawn} tells" if drawn > 1 else ""
+        leave = "leaves" if len(same) == 1 else "leave"
+        yield f"{' and '.join(same)} {leave} the same maps as {result.backend}{sample}."
     for name, agrees in rows.items():
         if not all(agrees):
             yield f"{name} and {result.backend} disagree in {agrees.count(False)} of {len(agrees)} comparisons."
