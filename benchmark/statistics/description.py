@@ -61,6 +61,7 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
+from semstab.statistics.flipping import flipping
 from semstab.statistics.looks import Sample, correlogram, reach_of
 from semstab.statistics.sampling import InfluenceSums, Places, influence_sums, judged_of
 from semstab.statistics.scene_drift import scene_drift
@@ -150,6 +151,7 @@ def analyse(
         edge=means.places.edge,
     )
     judged = judged_of(sums)
+    flips_at = flipping(table, maps["stable"], means.places)
     repeats = int(np.count_nonzero(again))
     repeated = Repeated(repeats, repeats / len(table) if len(table) else math.nan)
     reach = None if sample is None else reach_of(sample, table, sums, critical=critical)
@@ -157,6 +159,7 @@ def analyse(
         name or "backbone",
         judged=judged,
         reach=reach,
+        flips=flips_at,
         voxels=repeated.voxels,
         share=repeated.share,
         blocks=means.places.count,
@@ -173,6 +176,7 @@ def analyse(
         blocks=BlockCut(means.places.count, judged.alpha.block_size),
         verdict=said,
         agreement=agreement,
+        flipping=flips_at,
         judged=judged,
         reach=reach,
         correlogram=None if sample is None else correlogram(sample),

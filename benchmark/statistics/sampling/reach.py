@@ -155,6 +155,19 @@ class Arrangement:
             parts = self._parts(influence, size)
         return Spread.mean(parts) if parts else Spread(math.nan, 0.0, 1.0)
 
+    def longest(self, influence: Float64, size: Float64, level: float) -> float:
+        """The reach, in cells, that errors exceed with no more than the weight 1 - level; 0 where they do not reach."""
+        if self.count < 2 or np.abs(influence).max() < ROUNDING:
+            return 0.0
+        with one_thread():
+            weights = self._weights(influence, size)
+        beyond, longest = 1.0, 0.0
+        for longest, weight in sorted((self._correlations[number].reach, weight) for number, _, weight in weights):
+            beyond -= weight
+            if beyond <= 1 - level:
+                break
+        return longest
+
     def _parts(self, influence: Float64, size: Float64) -> list[Part]:
         """What the variance is under each reach that is not unlikely."""
         most, found = carriers(influence), []
