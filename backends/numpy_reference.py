@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections import defaultdict
 
 import numpy as np
 
@@ -39,7 +41,7 @@ class NumpyReference:
         check_settings(voxel_size, num_classes)
         self.voxel_size = voxel_size
         self.num_classes = num_classes
-        self._row: dict[tuple[int, int, int], int] = {}  # voxel q -> its row
+        self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
         self._history: list[tuple[Int64, int, Observations]] = []  # (rows, frame, observations), frame after frame
         self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
         self._op = np.zeros(0, dtype=np.int64)
@@ -71,7 +73,7 @@ class NumpyReference:
 
     def events(self) -> Events:
         """The history: every observation of every voxel."""
-        voxels = np.array(list(self._row), dtype=np.int64).reshape(-1, 3)
+        voxels = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
         order = np.lexsort(voxels.T[::-1])
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
@@ -95,8 +97,8 @@ class NumpyReference:
 
     def _rows(self, seen: Observations) -> Int64:
         """The rows of the frame's voxels, new ones added."""
-        voxels = map(tuple, seen.index.tolist())
-        rows = np.array([self._row.setdefault(q, len(self._row)) for q in voxels], dtype=np.int64)
+        voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
+        rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         if len(self._row) > len(self._op):
             room = 2 * len(self._row) - len(self._op)
             self._evidence = np.pad(self._evidence, ((0, room), (0, 0)))

@@ -31,6 +31,9 @@ from semstab.model.voxels import VoxelTable, index_columns
 INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""
 
+LEAST_BLOCKS = 4
+"""Of a new map, however many classes there are."""
+
 COPIED_BLOCKS = 1024
 """Blocks that move at a time when a map grows, so that the copy needs no second map's worth of memory."""
 
@@ -66,12 +69,12 @@ class Open3DBlocks(FusionBackend):
             "frame_entropy_sum": (o3c.float64, 1),
         }
         voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self.attributes.values())
-        self.grid = self._new_grid(max(64, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
+        self.grid = self._new_grid(max(LEAST_BLOCKS, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
-        """The attributes of a voxel; of a block about a quarter is seen, and the grid doubles as it grows."""
-        return 10 * voxels * (8 * num_classes + 48)
+        """The attributes of a voxel; a quarter of a block is seen, the grid doubles, an empty one has blocks."""
+        return max(10 * voxels, LEAST_BLOCKS * 4**3) * (8 * num_classes + 48)
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""

@@ -304,7 +304,7 @@ def test_clouds_that_cannot_be_classified(fused, points):
     las = las_cloud(fused / "c.las", points, point_format=3)
     header = laspy.read(las).header
     las.write_bytes(las.read_bytes()[: header.offset_to_point_data + 10 * header.point_format.size])
-    fails(DataError, f"c.las: ends after 10 of {len(points)} points", classify, las)
+    fails(DataError, rf"c\.las: .*ends after 10 of {len(points)} points", classify, las)
     short = ply_cloud(fused / "short.ply", points)
     short.write_bytes(short.read_bytes()[:-30])
     fails(DataError, "it is cut short", classify, short, "never.ply")

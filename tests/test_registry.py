@@ -90,27 +90,26 @@ def test_errors_are_what_they_look_like():
 
 
 @pytest.fixture
-def plugins(monkeypatch):
-    """Entry points as another package would declare them."""
+def shapes(monkeypatch):
+    """A registry to which another package adds by entry points."""
     declared = [
         EntryPoint("ratio", "fractions:Fraction", "semstab.shapes"),
         EntryPoint("engine", "fractions:Fraction", "semstab.shapes"),
     ]
     monkeypatch.setattr(registry, "entry_points", lambda group: [p for p in declared if p.group == group])
+    return Registry(SHAPES.kind, SHAPES.builtin)
 
 
-@pytest.mark.usefixtures("plugins")
-def test_other_packages_add_names():
+def test_other_packages_add_names(shapes):
     from fractions import Fraction
 
-    assert SHAPES.load("ratio") is Fraction
-    assert SHAPES.entry("ratio").summary == "from the package fractions"
+    assert shapes.load("ratio") is Fraction
+    assert shapes.entry("ratio").summary == "from the package fractions"
     assert "ratio" not in Registry("backend", {}).entries()
 
 
-@pytest.mark.usefixtures("plugins")
-def test_other_packages_do_not_replace_names():
-    assert SHAPES.entry("engine").install == "pip install the-engine"
+def test_other_packages_do_not_replace_names(shapes):
+    assert shapes.entry("engine").install == "pip install the-engine"
 
 
 def test_the_package_imports_nothing_heavy():

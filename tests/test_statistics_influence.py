@@ -7,8 +7,12 @@ import pytest
 from simulated_events import grid, log_of, log_of_evidence, soft
 
 from semstab.errors import DataError
-from semstab.model.measures import dominant, entropy, vss
+from semstab.metrics.matching import rows_of
+from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
+from semstab.statistics.correctness import correctness
+from semstab.statistics.drift import expected_sbd
+from semstab.statistics.sampling import coverage, identical, mean_over_frames, same_flight
 from semstab.statistics.sampling.collect import influence_sums
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
 from semstab.statistics.steady import steady
@@ -33,6 +37,7 @@ def test_the_sums_give_every_number_back(soft_evidence):
     again, often = table.op >= 2, table.op >= 3
     right = dominant(table) == truth
     stable = np.where(often, steady(table), 0.0)
+    excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
         "psa": psa(table)[again].mean(),
         "alpha": krippendorff_alpha(table),
@@ -41,14 +46,21 @@ def test_the_sums_give_every_number_back(soft_evidence):
         "accuracy": right[again].mean(),
         "look_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
         "wrong_of_stable": (stable * ~right).sum() / stable.sum(),
+        "miou": known.miou,
+        "ece": known.ece,
+        "sbd_excess": np.nan if soft_evidence else np.nanmean(excess[again]),
     }
-    for sums in (influence_sums(table, log, truth), influence_sums(table, None, truth)):
+    for given in (log, None):
+        sums = influence_sums(table, given, truth, sbd_excess=excess)
         assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)
     sums = influence_sums(table, log, truth)
     by_class = [row.alpha for row in class_agreement(table, log)]
     assert [value(sums, "alpha", k) for k in range(3)] == pytest.approx(by_class)
     true_one = again & (truth == 1)
     assert value(sums, "accuracy", 1) == pytest.approx(right[true_one].mean())
+    said_one = again & (dominant(table) == 1)
+    assert value(sums, "precision", 1) == pytest.approx(right[said_one].mean())
+    assert value(sums, "iou", 1) == pytest.approx((right & true_one).sum() / (true_one | said_one).sum())
 
 
 def test_parts_of_a_map_add_up_and_a_file_holds_them(tmp_path):
@@ -81,6 +93,23 @@ def test_a_share_is_the_frames_own_quality():
     lost = share - share[0]
     assert lost[[0, 1, 3, 4]] == pytest.approx(0)
     assert lost[2] == pytest.approx(-2 * 25 / 50)
+
+
+def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
+    rng = np.random.default_rng(0)
+    found = mean_over_frames(np.arange(1, 80), values := rng.normal(3.0, 1.0, 79))
+    assert (found.value, found.frames, found.undecided) == (pytest.approx(values.mean()), 79, "")
+    assert 0.9 < (found.high - found.low) / (2 * 1.99 * values.std() / np.sqrt(79)) < 1.6
+    assert "too few frames" in mean_over_frames(np.arange(12), np.append(values[:11], np.nan)).undecided
+    table, log, truth = flight(side=16)
+    kept = table.index[:, 0] < 12
+    whole = influence_sums(table, log, truth)
+    part = influence_sums(rows_of(table, np.flatnonzero(kept)))
+    assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean())
+    assert same_flight(whole, whole)
+    assert not same_flight(whole, part)
+    assert identical(whole, whole.coarsened(2 * whole.edge, 1))
+    assert not identical(whole, influence_sums(table, log, 1 - truth))
 
 
 def test_at_most_so_many_cubes_and_groups_of_frames():

@@ -9,10 +9,20 @@ import numpy as np
 import pytest
 from flights import Flight, fly, sums_of, world
 from intervals import Row, trials
+from scipy import stats
 from simulated_events import grid, log_of
 
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
-from semstab.statistics.sampling import difference, estimate, influence_sums, merged, value
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval
+from semstab.statistics.sampling import (
+    difference,
+    estimate,
+    influence_sums,
+    mean_of,
+    merged,
+    standard_error,
+    unpaired,
+    value,
+)
 
 
 def sums_from(labels, side, voxel_size=0.125):
@@ -173,3 +183,34 @@ def covered(row: Row) -> bool:
 def test_intervals_hold_what_they_are_about(flight, question):
     (row,) = trials(flight, 40, 0, question, ("alpha",))
     assert covered(row)
+
+
+# --- Of several numbers -----------------------------------------------------------------------------------------------
+
+
+def around(value, error, degrees=30.0, **more):
+    half = stats.t.ppf(0.975, degrees) * error
+    return Interval(value, value - half, value + half, degrees=degrees, **more)
+
+
+def test_a_mean_over_scenes_errs_less_than_each():
+    scenes = [around(0.3, 0.1), around(-0.1, 0.1), around(0.1, 0.1), around(0.1, 0.1)]
+    found = mean_of(scenes)
+    assert found.value == pytest.approx(0.1)
+    assert (found.high - found.value) == pytest.approx((scenes[0].high - 0.3) / 2)
+    assert found.degrees == pytest.approx(120)
+    assert found.p_value == pytest.approx(2 * stats.t.sf(0.1 / 0.05, 120))
+    assert mean_of(scenes[:1]) is scenes[0]
+
+
+def test_a_mean_says_what_is_undecided_in_a_scene_and_answers_the_lesser_question():
+    found = mean_of([around(0.0, 1.0, question=NEXT_FLIGHT), around(0.0, 1.0, question=THIS_MAP, undecided="too few")])
+    assert (found.question, found.undecided) == (THIS_MAP, "too few")
+
+
+def test_numbers_that_share_nothing_differ_by_both_errors():
+    found = unpaired(around(0.5, 0.3, 20), around(0.1, 0.4, 50))
+    assert found.value == pytest.approx(0.4)
+    assert standard_error(around(0.5, 0.3, 20)) == pytest.approx(0.3)
+    assert found.p_value == pytest.approx(2 * stats.t.sf(0.4 / 0.5, 0.25**2 / (0.09**2 / 20 + 0.16**2 / 50)))
+    assert found.low == pytest.approx(0.4 - math.hypot(0.3 * stats.t.ppf(0.975, 20), 0.4 * stats.t.ppf(0.975, 50)))

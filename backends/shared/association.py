@@ -99,8 +99,7 @@ def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | No
         return Observations(*nothing)
     key, low, size = pack(voxel_index(points, voxel_size, frame), frame)
     voxels, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
-    s_sum = np.zeros((len(voxels), num_classes))
-    np.add.at(s_sum, inverse, evidence_of(frame, num_classes, chosen))
+    s_sum = _sums_of_evidence(frame, num_classes, chosen, inverse.ravel(), len(voxels))
     return Observations(unpack(voxels, low, size), s_sum / count[:, None], count)
 
 
@@ -157,16 +156,13 @@ def unpack(key: Int64, low: Int64, size: tuple[int, ...]) -> Int64:
     return np.stack(np.unravel_index(key, size), axis=1) + low
 
 
-def evidence_of(frame: Frame, num_classes: int, pixels: Mask | None = None) -> Float64:
-    """Evidence vectors s (n, K) of the valid pixels, or of some of them (H, W), in row order.
-
-    One-hot labels, or scores normalised to sum 1.
-    """
-    valid = frame.valid if pixels is None else pixels
-    if frame.scores is not None:
-        s = frame.scores[valid].astype(np.float64)
-        normalised: Float64 = s / s.sum(axis=1, keepdims=True)
-        return normalised
-    assert frame.labels is not None
-    one_hot: Float64 = np.eye(num_classes)[frame.labels[valid]]
-    return one_hot
+def _sums_of_evidence(frame: Frame, num_classes: int, chosen: Mask, voxel: Int64, voxels: int) -> Float64:
+    """Sums (m, K) of s over the pixels of each voxel, by the voxel (n,) of each: one-hot labels, or scores of sum 1."""
+    if frame.labels is not None and frame.scores is None:  # never a vector a pixel: of many classes it takes too much
+        seen = voxel * num_classes + frame.labels[chosen]
+        return np.bincount(seen, minlength=voxels * num_classes).reshape(voxels, num_classes).astype(np.float64)
+    assert frame.scores is not None
+    s = frame.scores[chosen].astype(np.float64)
+    s_sum = np.zeros((voxels, num_classes))
+    np.add.at(s_sum, voxel, s / s.sum(axis=1, keepdims=True))
+    return s_sum

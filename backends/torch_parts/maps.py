@@ -32,7 +32,10 @@ from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
 
 FIRST_ROWS = 1 << 12
-"""Voxels that a new map has room for."""
+"""Voxels that a new map has room for, at most."""
+
+FIRST_BYTES = 1 << 27
+"""Memory that a new map takes at once, at most: with 20,000 classes that are fewer voxels."""
 
 COPIED_ROWS = 1 << 20
 """Rows that go to memory at a time."""
@@ -72,7 +75,8 @@ class TorchMaps:
         self._grid: MapGrid | None = None
         with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
             self.storage = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
-            self.storage.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or FIRST_ROWS)
+            first = min(FIRST_ROWS, FIRST_BYTES // sum(c.row_bytes for c in self.storage.columns.values()))
+            self.storage.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or first)
         self._totals = {name: MapTotal(K) for name, K in num_classes.items()}
 
     @property

@@ -195,6 +195,8 @@ def load_result(folder: str | Path) -> Result:
     """What a finished run or study found, from its folder. Raises DataError where it is not there or damaged."""
     folder = Path(folder)
     path = folder / "summary.json"
+    if _is_earlier(folder):
+        raise DataError(f"{folder}: holds results of an earlier version of semstab; run it again, into another folder")
     content = read_json(path)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: not a summary of this version of semstab; run it again, into another folder")
@@ -253,7 +255,7 @@ def _claimed(path: Path) -> dict[str, Any] | None:
     if not path.is_dir():
         raise ConfigError(f"{path}: is a file; name a folder")
     settings = path / SETTINGS
-    if (path / "study.yaml").exists() or (settings.exists() and _first_line(settings) != LAYOUT):
+    if _is_earlier(path):
         raise ConfigError(f"{path}: holds results of an earlier version of semstab; choose another folder")
     if settings.exists():
         return read_yaml(settings)
@@ -261,6 +263,11 @@ def _claimed(path: Path) -> dict[str, Any] | None:
     if any(entry.name != UNITS and not entry.name.startswith(TEMPORARY) for entry in entries):  # a birth's beginnings
         raise ConfigError(f"{path}: is not empty and holds no run or study; choose another folder")
     return None
+
+
+def _is_earlier(folder: Path) -> bool:
+    settings = folder / SETTINGS
+    return (folder / "study.yaml").exists() or (settings.exists() and _first_line(settings) != LAYOUT)
 
 
 def _first_line(path: Path) -> str:

@@ -106,6 +106,11 @@ class Evidence(NDArrayOperatorsMixin):
         entry = np.arange(starts[-1]) + np.repeat(first - starts[:-1], count)
         return Evidence(starts, self.label[entry], self.weight[entry], self.K)
 
+    def only(self, labels: npt.NDArray[np.uint16]) -> Evidence:
+        """Of these classes (k,), ascending, among which are all that have an entry: they become 0 to k - 1."""
+        label = np.searchsorted(labels, self.label).astype(np.uint16)
+        return Evidence(self.starts, label, self.weight, len(labels))
+
     def chunks(self) -> Iterator[slice]:
         """Consecutive rows that together are small when dense."""
         return row_chunks(len(self), self.K)

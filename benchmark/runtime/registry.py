@@ -7,6 +7,7 @@ Built-in entries are one line each; other packages add theirs with the entry poi
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,8 +39,12 @@ class Registry:
 
     def entries(self) -> dict[str, Entry]:
         """Every known entry by name; a built-in name is not replaced by a plug-in's."""
-        plugins = {point.name: _plugin(point) for point in entry_points(group=f"semstab.{self.kind}s")}
-        return plugins | dict(self.builtin)
+        return self._plugins | self.builtin
+
+    @functools.cached_property
+    def _plugins(self) -> dict[str, Entry]:
+        """Those of other packages, read once: looking through all that are installed takes a while."""
+        return {point.name: _plugin(point) for point in entry_points(group=f"semstab.{self.kind}s")}
 
     def entry(self, name: str) -> Entry:
         """The entry of that name. Raises ConfigError, with the nearest known name, where there is none."""

@@ -6,6 +6,9 @@ probability that a class drawn from s_t equals one drawn from s_u.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -49,7 +52,7 @@ def fleiss_kappa(table: VoxelTable) -> float:
     1 - (1 - mean PSA) / (1 - ||p||^2) with p the mean belief. OP may vary from voxel to voxel: where it does not, this
     is Fleiss' own definition. NaN where no two frames saw one place, or only one class was predicted.
     """
-    return float(kappa_of(kappa_columns(table).sum(axis=0)))
+    return float(kappa_of(_sums(kappa_columns, table)))
 
 
 def krippendorff_alpha(table: VoxelTable) -> float:
@@ -58,7 +61,12 @@ def krippendorff_alpha(table: VoxelTable) -> float:
     1 - (1 - A) / (1 - A_e): A is the mean of PSA weighted by OP, and A_e is the same agreement between all
     observations, as if they were of one voxel. NaN where no two frames saw one place, or only one class was predicted.
     """
-    return float(alpha_of(alpha_columns(table).sum(axis=0)))
+    return float(alpha_of(_sums(alpha_columns, table)))
+
+
+def _sums(columns: Callable[[VoxelTable], Float64], table: VoxelTable) -> Float64:
+    """Sums (C,) of columns (n, C) over a table's voxels, of which few are dense at a time."""
+    return functools.reduce(np.add, (columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks()))
 
 
 def psa_columns(table: VoxelTable) -> Float64:

@@ -24,6 +24,9 @@ LEAST_BLOCKS = 32
 LEVEL = 0.95
 REPLICATES = 2000
 ROUNDING = 1e-9
+TINY = 1e-12
+AT_ONCE = 2**20
+"""Numbers in the sums of which a statistic is taken together: all of 20,000 classes would take 3 GB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,3 +187,15 @@ def _derivative(statistic: Statistic, totals: Float64, step: Float64) -> Float64
     """Half the difference (R,) of the statistic one step ahead of the totals and one behind."""
     half: Float64 = (statistic(totals + step) - statistic(totals - step)) / 2
     return half
+
+
+def gradient_of(statistic: Statistic, total: Float64) -> Float64:
+    """Central differences (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
+    gradient = np.zeros_like(total)
+    some = np.flatnonzero(total)
+    for at in np.array_split(some, len(some) * len(total) // AT_ONCE + 1):
+        step = 1e-5 * np.maximum(np.abs(total[at]), TINY)
+        steps = np.zeros((len(at), len(total)))
+        steps[np.arange(len(at)), at] = step
+        gradient[at] = (statistic(total + steps) - statistic(total - steps)) / (2 * step)
+    return gradient

@@ -148,6 +148,7 @@ def analyse(
         events,
         None if known is None else known.label,
         sample=None if sample is None else sample.shared(),
+        sbd_excess=maps["sbd_excess"],
         edge=means.places.edge,
     )
     judged = judged_of(sums)

@@ -324,7 +324,8 @@ def measure_voxels(chunk, first, T, log, K, entries, drifts, terms, seeds, draws
     of the trend over all orders, for T > ENUMERATED.
     """
     starts, order, column, share, work = _room(T.max() if T.shape[0] else 0, entries, K)
-    number, state, scatter = np.full(K, -1), np.empty(1, dtype=np.uint64), np.zeros((K, K))
+    most = min(K, entries)  # classes that one voxel can have
+    number, state, scatter = np.full(K, -1), np.empty(1, dtype=np.uint64), np.zeros((most, most))
     for i in range(chunk, T.shape[0], CHUNKS):
         A, one_hot = load(log, first[i], T[i], number, starts, column, share)
         voxel = starts, column, share, T[i], A, one_hot

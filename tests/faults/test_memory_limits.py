@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from posed_config import configure
 from posed_writer import write_posed
 
 import semstab
+from semstab.backends.numpy_reference import NumpyReference
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.runtime.memory import available_bytes, group_bytes
+from semstab.statistics.agreement import between_of
+from semstab.statistics.looks.correlogram import band
 
 SIDE, FRAMES = 160, 6
 
@@ -93,3 +97,19 @@ def test_the_processes_own_limit_bounds_what_is_free() -> None:
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert 0 < int(said) <= 50_000_000
     assert available_bytes() > 50_000_000
+
+
+def test_thousands_of_classes_take_no_square_of_them() -> None:
+    """A matrix of 6,000 by 6,000 would take 288 MB."""
+    K = 6000
+    depth, labels = np.full((6, 8), 2, np.float32), np.arange(48, dtype=np.uint16).reshape(6, 8) * 100
+    frame = Frame(0, depth, Intrinsics(8, 8, 4, 3), np.eye(4), labels=labels)
+    sums = np.zeros((9, 3 + K))
+    sums[:, :103] = [3, 5, 5, *100 * [0.05]]
+    tracemalloc.start()
+    try:
+        NumpyReference(0.5, K).integrate(frame)
+        assert band(sums, between_of).value < 1
+        assert tracemalloc.get_traced_memory()[1] < 1e8
+    finally:
+        tracemalloc.stop()

@@ -35,7 +35,7 @@ from kinds import Kind, kinds  # noqa: E402
 from semstab.errors import LONGEST_LINE, SemstabError  # noqa: E402
 
 SLOW = 2.0
-"""Seconds of reading after which an input hangs."""
+"""Seconds of computing after which an input hangs; of waiting, ten times as many: others use the machine."""
 
 DEAD = 30.0
 """Seconds after which a worker that does not even hear the alarm is killed."""
@@ -61,7 +61,8 @@ class Outcome:
 
 def tried(kind: Kind, file: Path, slow: float) -> Outcome:
     """Read a damaged file."""
-    signal.setitimer(signal.ITIMER_REAL, slow)
+    signal.setitimer(signal.ITIMER_PROF, slow)
+    signal.setitimer(signal.ITIMER_REAL, 10 * slow)
     try:
         kind.read(file)
     except SemstabError as error:
@@ -73,6 +74,7 @@ def tried(kind: Kind, file: Path, slow: float) -> Outcome:
     except BaseException:  # noqa: BLE001  what it is all about; Rust's panics are no Exceptions
         return Outcome(False, traceback.format_exc())
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
     return Outcome(False)
 
@@ -100,12 +102,12 @@ def inputs(every: list[Kind], seed: int) -> Iterator[tuple[Kind, Path, bytes]]:
 
 @contextlib.contextmanager
 def watched() -> Iterator[None]:
-    """The alarm is heard, and nothing is written to the terminal by libraries or by the program's remarks."""
+    """The alarms are heard, and nothing is written to the terminal by libraries or by the program's remarks."""
 
     def ring(*_: object) -> None:
         raise HangError
 
-    before = signal.signal(signal.SIGALRM, ring)
+    before = {alarm: signal.signal(alarm, ring) for alarm in (signal.SIGPROF, signal.SIGALRM)}
     logging.disable(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
@@ -113,7 +115,8 @@ def watched() -> Iterator[None]:
             yield
     finally:
         logging.disable(logging.NOTSET)
-        signal.signal(signal.SIGALRM, before)
+        for alarm, handler in before.items():
+            signal.signal(alarm, handler)
 
 
 def attempt(kind: Kind, file: Path, content: bytes, slow: float = SLOW) -> Outcome:

@@ -110,8 +110,6 @@ def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: P
         with library.open(out, mode="w", header=header, do_compress=compress) as writer:
             for points in reader.chunk_iterator(min(CHUNK, points_at_once(reader.header))):
                 writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
-            if (read := writer.header.point_count) < reader.header.point_count:
-                raise DataError(f"{cloud}: ends after {read:,} of {reader.header.point_count:,} points")
             if extended := _without_copc(reader.evlrs or ()):
                 writer.write_evlrs(type(reader.header.vlrs)(extended))
 

@@ -5,6 +5,7 @@ One number of a map averages over all pairs of frames, so that it says as much a
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNDEFINED, Correlogram, Estimate, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
-from semstab.statistics.blocks import LEVEL, Statistic, spatial_blocks
+from semstab.statistics.blocks import LEVEL, Statistic, gradient_of, spatial_blocks
 from semstab.statistics.looks.entries import Sample
 
 Float64 = npt.NDArray[np.float64]
@@ -58,7 +59,7 @@ def correlogram(sample: Sample) -> Correlogram:
     Of a voxel's looks those that are 1, 2, 4, 8, ... looks apart are paired, so that the cost is linear. Chance is that
     of the pairs in the bin. Bands are at 95 % over blocks of space, for these frames.
     """
-    seen, limit = shared_observations(sample.seen, sample.limit)
+    seen, limit = _of_seen_classes(*shared_observations(sample.seen, sample.limit))
     bins = {axis: _Bins(edges, 3 + seen.K) for axis, edges in (*EDGES.items(), ("standard", STANDARD))}
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     blocks = spatial_blocks(index, seen.voxel_size)
@@ -69,6 +70,12 @@ def correlogram(sample: Sample) -> Correlogram:
     nothing = LagBin(*STANDARD, math.nan, 0, UNDEFINED, math.nan)
     (standard,) = found.pop("standard") or (nothing,)
     return Correlogram(**found, standard=standard)
+
+
+def _of_seen_classes(*logs: Events) -> Iterator[Events]:
+    """Without the classes that are in none of them: of the others nothing changes."""
+    labels = np.unique(np.concatenate([log.evidence.label for log in logs]))
+    return (dataclasses.replace(log, evidence=log.evidence.only(labels), classes=()) for log in logs)
 
 
 def _pairs(sample: Sample, seen: Events, limit: Events, index: npt.NDArray[np.int32], block: Int64) -> Iterator[_Pairs]:
@@ -141,9 +148,7 @@ def band(sums: Float64, statistic: Statistic, level: float = LEVEL) -> Estimate:
 
     total, B = sums.sum(axis=0), len(sums)
     value = float(statistic(total))
-    steps = np.diag(1e-5 * np.maximum(np.abs(total), 1e-12))
-    gradient = (statistic(total + steps) - statistic(total - steps)) / (2 * np.diagonal(steps))
-    error = math.sqrt(B / max(B - 1, 1) * float(np.square(sums @ gradient).sum()))
+    error = math.sqrt(B / max(B - 1, 1) * float(np.square(sums @ gradient_of(statistic, total)).sum()))
     if B < 2 or math.isnan(error) or value >= 1:
         return Estimate(value, math.nan, math.nan)
     half = float(student.ppf((1 + level) / 2, B - 1)) * error / (1 - value)

@@ -1,8 +1,18 @@
 """What a map's numbers would be elsewhere, or in the next flight: sums by frame and cube of space, and intervals."""
 
 from semstab.statistics.sampling.collect import influence_sums
-from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
-from semstab.statistics.sampling.intervals import LEAST_FRAMES, difference, estimate, judged_of, question_of
+from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
+from semstab.statistics.sampling.intervals import (
+    LEAST_FRAMES,
+    difference,
+    estimate,
+    judged_of,
+    mean_of,
+    question_of,
+    standard_error,
+    unpaired,
+)
+from semstab.statistics.sampling.paired import coverage, identical, mean_over_frames, same_flight
 from semstab.statistics.sampling.places import Places
 
 __all__ = [
@@ -10,11 +20,19 @@ __all__ = [
     "InfluenceSums",
     "Places",
     "aligned",
+    "coverage",
     "difference",
     "estimate",
+    "identical",
     "influence_sums",
     "judged_of",
+    "mean_of",
+    "mean_over_frames",
     "merged",
+    "of_places_alone",
     "question_of",
+    "same_flight",
+    "standard_error",
+    "unpaired",
     "value",
 ]

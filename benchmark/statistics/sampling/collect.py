@@ -14,7 +14,8 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
-from semstab.statistics.sampling.influence import MOST_CELLS, MOST_CLASSES, MOST_GROUPS, InfluenceSums, layout
+from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
+from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
 
 Float64 = npt.NDArray[np.float64]
@@ -27,6 +28,7 @@ def influence_sums(
     true_label: Int64 | None = None,
     *,
     sample: tuple[Events, Events] | None = None,
+    sbd_excess: Float64 | None = None,
     edge: float | None = None,
 ) -> InfluenceSums:
     """The sums of a map.
@@ -36,6 +38,7 @@ def influence_sums(
     true_label  (n,) the true class of each voxel, -1 where it is not known
     sample      the same observations of sampled voxels, as they were and as they would be with labels that do not
                 depend on the view
+    sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
     """
@@ -43,7 +46,7 @@ def influence_sums(
     edge = cell_edge(index, table.voxel_size) if edge is None else edge
     likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
     whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
-    whole = dataclasses.replace(whole, classes=table.classes)
+    whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)
     if sample is None:
         return whole
     seen, limit = (
@@ -69,7 +72,8 @@ def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float
     again = np.flatnonzero(op >= 2)
     index = np.stack([events.ix, events.iy, events.iz], axis=1)
     at, of = cells_of(index[again], events.voxel_size, edge)
-    step, K = _step(events.frame), int(events.evidence.shape[1])
+    K = int(events.evidence.shape[1])
+    step = _step(events.frame, K)
     frames, group = np.unique(events.frame // step, return_inverse=True)
     sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
@@ -110,6 +114,34 @@ def _with_frames(whole: InfluenceSums, seen: InfluenceSums) -> InfluenceSums:
     )
 
 
+def _with_places(
+    sums: InfluenceSums, table: VoxelTable, true_label: Int64 | None, sbd_excess: Float64 | None
+) -> InfluenceSums:
+    """With rows for the sums that belong to no frame: SBD less that in random order, and how far beliefs are right."""
+    again = np.flatnonzero(table.op >= 2)
+    at, of = cells_of(table.index[again], table.voxel_size, sums.edge)
+    columns, own = np.zeros((len(at), sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
+    if sbd_excess is not None:
+        known = ~np.isnan(sbd_excess[again])
+        for name, values in zip(OF_PLACES[:2], (np.nan_to_num(sbd_excess[again]), known), strict=True):
+            columns[:, own[name]] = np.bincount(of, weights=values, minlength=len(at))[:, None]
+    if true_label is not None:
+        label, e = true_label[again], table.evidence.take(again)
+        confidence = e.max(axis=1) / e.sum(axis=1)
+        known, right = label >= 0, dominant(table)[again] == label
+        bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
+        gap = np.bincount(of * BINS + bins, weights=known * (right - confidence), minlength=len(at) * BINS)
+        columns[:, own["gap"]] = gap.reshape(-1, BINS)
+        columns[:, own["judged"]] = np.bincount(of, weights=known, minlength=len(at))[:, None]
+    some = columns.any(axis=1)
+    return dataclasses.replace(
+        sums,
+        cell=np.concatenate([sums.cell, at[some]]),
+        frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
+        columns=np.concatenate([sums.columns, columns[some]]),
+    )
+
+
 def cells_of(
     index: npt.NDArray[np.int32], voxel_size: float, edge: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
@@ -129,9 +161,9 @@ def cell_edge(index: npt.NDArray[np.int32], voxel_size: float) -> float:
     return edge
 
 
-def _step(frame: npt.NDArray[np.int32]) -> int:
+def _step(frame: npt.NDArray[np.int32], K: int) -> int:
     step, distinct = 1, np.unique(frame)
-    while len(distinct) > MOST_GROUPS:
+    while len(distinct) > most_groups(K):
         step, distinct = 2 * step, np.unique(distinct // 2)
     return step
 
@@ -153,8 +185,7 @@ def _sums_of_log(
     from semstab.statistics.sampling import loops
 
     K = int(events.evidence.shape[1])
-    columns = layout(K, truth=true_label is not None)
-    sums = np.zeros((cells, groups, max(part.stop for part in columns.values())))
+    sums = np.zeros((cells, groups, width(K, truth=true_label is not None)))
     order = again[np.argsort(of, kind="stable")]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
     truth = np.full(len(op), -1) if true_label is None else true_label
@@ -204,7 +235,10 @@ def _sums_of_table(
         }  # fmt: skip
         if table.K <= MOST_CLASSES:
             true = (label[:, None] == np.arange(table.K)).astype(np.float64)
-            values |= {"class_known": true, "class_right": true * right[:, None]}
-    names = layout(table.K, truth=true_label is not None)
-    columns = np.column_stack([np.asarray(values[name], float) for name in names])
+            predicted = known[:, None] * (dominant(table)[again][:, None] == np.arange(table.K))
+            values |= {"class_known": true, "class_right": true * right[:, None], "class_predicted": predicted}
+    columns = np.zeros((len(T), width(table.K, truth=true_label is not None)))
+    for name, own in layout(table.K, truth=true_label is not None).items():
+        if name not in OF_PLACES:
+            columns[:, own] = np.asarray(values[name], float).reshape(len(T), -1)
     return np.stack([np.bincount(of, weights=column, minlength=cells) for column in columns.T], axis=1)

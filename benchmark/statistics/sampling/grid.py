@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.model.statistics import THIS_MAP, Question
+from semstab.statistics.blocks import gradient_of
 from semstab.statistics.sampling.influence import Statistic
 from semstab.statistics.sampling.reach import Arrangement, Spread, arrangement, one_thread
 
@@ -81,7 +82,7 @@ def influences(
     halves (m, 2): of places that two frames saw, what of the first two sums both are held for, instead of half each.
     """
     total = columns.sum(axis=0)
-    gradient = _gradient(of, total)
+    gradient = gradient_of(of, total)
     places, row = np.unique(cell.astype(np.int64), axis=0, return_inverse=True)
     row = row.ravel()
     everything = np.abs(_sums(row, columns[:, 1], len(places)))
@@ -105,13 +106,6 @@ def influences(
 def _sums(row: npt.NDArray[np.int64], values: Float64, rows: int) -> Float64:
     sums: Float64 = np.bincount(row, weights=values, minlength=rows).astype(np.float64)
     return sums
-
-
-def _gradient(of: Statistic, total: Float64) -> Float64:
-    """Central differences (C,) of a statistic at sums (C,)."""
-    steps = np.diag(1e-5 * np.maximum(np.abs(total), TINY))
-    gradient: Float64 = (of(total + steps) - of(total - steps)) / (2 * np.diagonal(steps))
-    return np.where(total == 0, 0.0, gradient)
 
 
 # --- Variance ---------------------------------------------------------------------------------------------------------

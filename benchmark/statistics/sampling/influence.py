@@ -19,33 +19,24 @@ import numpy.typing as npt
 from semstab.errors import DataError, one_line
 from semstab.runtime.files import atomic_path
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
+from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
-SCHEMA = 1
+SCHEMA = 2
 MOST_CELLS, MOST_GROUPS = 256, 64
 """Cubes of space and groups of frames that are kept apart, at most."""
 
-MOST_CLASSES = 64
-"""Sums by class are kept up to so many classes."""
-
-PLAIN = (
-    "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
-)  # fmt: skip
-WITH_TRUTH = ("known", "right", "looks", "looks_right", "stable", "stable_wrong")
+MOST_SUMS = 2**24
+"""Numbers in the sums, at most: of thousands of classes fewer groups of frames are kept apart."""
 
 
-def layout(K: int, *, truth: bool) -> dict[str, slice]:
-    """Which columns of the sums each name stands for; those by class have K columns."""
-    by_class = ["class_apart", "class_own"] if K <= MOST_CLASSES else []
-    known = [*WITH_TRUTH, *(["class_known", "class_right"] if by_class else [])] if truth else []
-    widths = [(name, 1) for name in PLAIN] + [(name, K) for name in ["evidence", *by_class]]
-    widths += [(name, K if name.startswith("class") else 1) for name in known]
-    ends = np.cumsum([width for _, width in widths])
-    return {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+def most_groups(K: int) -> int:
+    """Of frames that are kept apart with K classes."""
+    return max(1, min(MOST_GROUPS, MOST_SUMS // (MOST_CELLS * K)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +44,8 @@ class InfluenceSums:
     """Sums over the observations in voxels with OP >= 2, a row for each cube of space and group of frames.
 
     cell     (m, 3) int32 which cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the same
-    frame    (m,) int32 which group: frame index // step; -1 where the frames are not known, for want of a log
+    frame    (m,) int32 which group: frame index // step; -1 where the frames are not known, for want of a log, and for
+             sums that belong to none (`OF_PLACES`)
     columns  (m, C) float64, see `layout`. A place counts 1 / T for each of its T frames in `voxels`, 1 in
              `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`
     edge     metres, a power of 2
@@ -113,12 +105,17 @@ class InfluenceSums:
             limit=None if self.limit is None else self.limit.coarsened(edge, step),
         )
 
+    def without_truth(self) -> InfluenceSums:
+        """Without what is right and wrong."""
+        columns = self.columns[:, : width(self.K, truth=False)]
+        return dataclasses.replace(self, columns=columns, truth=False)
+
     def bounded(self) -> InfluenceSums:
-        """With at most MOST_CELLS cubes and MOST_GROUPS groups."""
+        """With at most MOST_CELLS cubes and `most_groups`."""
         edge, step = self.edge, self.step
         while len(np.unique(self.cell // round(edge / self.edge), axis=0)) > MOST_CELLS:
             edge *= 2
-        while step and len(np.unique(self.frame // (step // self.step))) > MOST_GROUPS:
+        while step and len(np.unique(self.frame // (step // self.step))) > most_groups(self.K):
             step *= 2
         return self if (edge, step) == (self.edge, self.step) else self.coarsened(edge, step)
 
@@ -161,14 +158,14 @@ class InfluenceSums:
             about["classes"] = tuple(about["classes"])
             part, *keys = (content.column(name).to_numpy() for name in KEYS)
             columns = np.stack([column.to_numpy() for column in content.columns[len(KEYS) :]], axis=1)
-            if columns.shape[1] != _width(about["K"], truth=about["truth"]):
+            if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
             found: list[InfluenceSums | None] = []
             for number in range(3):
                 own = part == number
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 some = about | ({"truth": False} if number else {})
-                sums = columns[own, : _width(about["K"], truth=some["truth"])].astype(np.float64)
+                sums = columns[own, : width(about["K"], truth=some["truth"])].astype(np.float64)
                 made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
                 found.append(made if own.any() or not number else None)
             whole, seen, limit = found
@@ -180,10 +177,6 @@ class InfluenceSums:
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
 """The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 its limit."""
-
-
-def _width(K: int, *, truth: bool) -> int:
-    return max(int(part.stop) for part in layout(K, truth=truth).values())
 
 
 def merged(*parts: InfluenceSums) -> InfluenceSums:
@@ -282,18 +275,30 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "accuracy": Functional(("right", "known"), ratio_of),
     "look_accuracy": Functional(("looks_right", "looks"), ratio_of),
     "wrong_of_stable": Functional(("stable_wrong", "stable"), ratio_of),
+    "sbd_excess": Functional(("sbd_excess", "sbd_known"), ratio_of, -1.0, 1.0, "plain"),
+    "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
+    "ece": Functional(("judged", "judged", "gap"), ece_of, scale="plain"),
 }
 """By key: PSA, both alphas, the share of its ceiling that alpha between frames reaches, and entropy at OP >= 2, VSS at
-OP >= 3; with ground truth the accuracy of the fused labels at OP >= 2 and of single looks, and the wrong among the
-stable places at OP >= 3."""
+OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused labels at
+OP >= 2 and of single looks, the wrong among the stable places at OP >= 3, mean intersection over union and expected
+calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
     "alpha_between": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement"),
     "reached": Functional(CLASS_SUMS, reached_of(class_between_of), -math.inf, math.inf, "plain", sampled=True),
     "accuracy": Functional(("class_right", "class_known"), ratio_of),
+    "precision": Functional(("class_right", "class_predicted"), ratio_of),
+    "iou": Functional(("class_right", "known", "class_known", "class_predicted"), iou_of),
 }
-"""Of one class: alphas against all others, accuracy where it is the true one."""
+"""Of one class: alphas against all others, accuracy where it is the true one (recall) and where it is predicted
+(precision), and intersection over union."""
+
+
+def of_places_alone(key: str, k: int | None = None) -> bool:
+    """Whether a number says nothing of frames, so that its intervals are for this map."""
+    return set(functional(key, k).names) <= set(OF_PLACES)
 
 
 def functional(key: str, k: int | None = None) -> Functional:

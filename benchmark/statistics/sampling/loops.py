@@ -10,6 +10,9 @@ from semstab.statistics.kernels import CHUNKS
 (VOXELS, PSA, OBSERVATIONS, AGREEING, OWN, TWICE, TWICE_AGREEING, RECURRENT, VSS, ENTROPY) = range(10)
 """The columns that every map has, before those by class."""
 
+DRIFT = 2
+"""How many columns of drift follow those."""
+
 (KNOWN, RIGHT, LOOKS, LOOKS_RIGHT, STABLE, STABLE_WRONG) = range(6)
 """The columns with ground truth, counted from the first of them."""
 
@@ -73,16 +76,19 @@ def _label_without(total, row, active, A):
 
 
 @serial
-def _add_truth(out, rows, first, T, group, truth, likely, total, active, A, without, column, K):
-    """What is right: of the fused label by leaving a frame out, of each look by itself."""
-    right = 1.0 if _label(total, active, A) == truth else 0.0
-    mean = 0.0
+def _add_truth(out, rows, first, T, group, truth, likely, total, active, A, without, mean, column, K):
+    """What is right: of the fused label by leaving a frame out, of each look by itself; mean (K,) is room."""
+    label = _label(total, active, A)
+    right = 1.0 if label == truth else 0.0
+    for j in range(A):
+        mean[active[j]] = 0.0
+    mean[truth] = 0.0
     for t in range(T):
-        without[t] = 1.0 if _label_without(total, rows[t], active, A) == truth else 0.0
-        mean += without[t] / T
+        without[t] = _label_without(total, rows[t], active, A)
+        mean[without[t]] += 1.0 / T
     for t in range(T):
         sums = out[group[first + t]]
-        own = (right + (T - 1) * (mean - without[t])) / T
+        own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) / T
         sums[column + KNOWN] += 1.0 / T
         sums[column + RIGHT] += own
         sums[column + LOOKS] += 1.0
@@ -93,6 +99,9 @@ def _add_truth(out, rows, first, T, group, truth, likely, total, active, A, with
         if K:
             sums[column + 6 + truth] += 1.0 / T
             sums[column + 6 + K + truth] += own
+            for j in range(A):
+                k = active[j]
+                sums[column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) / T
 
 
 @serial
@@ -109,9 +118,9 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
     longest = op.max() if op.shape[0] else 0
     rows = np.zeros((longest, K))
     total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
-    own, without = np.empty(longest), np.empty(longest)
+    own, without, mean = np.empty(longest), np.empty(longest, np.int64), np.empty(K)
     scale = 1.0 / np.log(K)
-    first_truth = ENTROPY + 1 + (3 * K if by_class else K)
+    first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         out = sums[cell]
         for i in order[bounds[cell] : bounds[cell + 1]]:
@@ -157,7 +166,7 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
                         add[ENTROPY + 1 + 2 * K + k] += s[k] ** 2
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    out, rows, first, T, group, truth[i], likely[i], total, active, A, without,
+                    out, rows, first, T, group, truth[i], likely[i], total, active, A, without, mean,
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
             _cleared(log, first, T, rows)

@@ -1,0 +1,263 @@
+"""By how much runs differ: each measure with its interval, the question that this answers, and its p-value."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.comparison.opening import Entry, Flicker
+from semstab.comparison.pairing import Common
+from semstab.comparison.quantities import (
+    BY_CLASS,
+    COVERAGE,
+    FLICKER,
+    HEADLINES,
+    IN_SUMS,
+    ONE_AGAINST_ALL,
+    REACHED,
+    quantities,
+)
+from semstab.metrics import macro_mean
+from semstab.model.contrast import Contrast
+from semstab.model.measures import Measure, Quantity, mean
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
+from semstab.statistics.comparison import LEAST_VOXELS, holm
+from semstab.statistics.sampling import (
+    InfluenceSums,
+    Places,
+    aligned,
+    coverage,
+    difference,
+    estimate,
+    mean_of,
+    mean_over_frames,
+    of_places_alone,
+    question_of,
+    standard_error,
+    unpaired,
+    value,
+)
+from semstab.statistics.sampling.influence import columns_of, functional
+
+LEVEL = 0.05
+"""Corrected p-value below which a difference is claimed."""
+
+
+def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
+    """All that is compared of a scene, in the order of `quantities`; `number` is the other run's among the runs."""
+    found = {row.measure: row for row in _rows(common, base, other, number)}
+    return tuple(found[quantity.key] for quantity in quantities() if quantity.key in found)
+
+
+def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
+    """The same of each class: against all others, or of the places that are of the class.
+
+    These are by the ground truth, or else by what all runs together say, so that none of them chooses its own.
+    """
+    names = base.classes or tuple(str(k) for k in range(base.sums.K))
+    own = list(_of_places(common, names, number)) if common.tables else []
+    rows = [*_against_all(common, base, other, names, number), *own]
+    order = {quantity.key: place for place, quantity in enumerate(BY_CLASS)}
+    return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
+
+
+def over_scenes(found: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
+    """The macro mean of each measure (and class) over the scenes that have it."""
+    groups: dict[tuple[str, str], list[Contrast]] = {}
+    for row in (row for rows in found for row in rows):
+        groups.setdefault((row.measure, row.of), []).append(row)
+    return tuple(
+        Contrast(
+            measure,
+            of,
+            macro_mean([row.base for row in rows]),
+            macro_mean([row.other for row in rows]),
+            mean_of([row.difference for row in rows]),
+            math.nan,
+            "",
+        )
+        for (measure, of), rows in groups.items()
+    )
+
+
+def tested(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
+    """Lists with p-values corrected for all that stand in them together, and what is said of each difference."""
+    corrected = iter(holm([row.difference.p_value for rows in lists for row in rows]))
+    better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
+    return [tuple(_said(row, next(corrected), better[row.measure]) for row in rows) for rows in lists]
+
+
+def _said(row: Contrast, p_holm: float, sign: float) -> Contrast:
+    shown = p_holm < LEVEL and row.difference.decided
+    gain = -sign * row.difference.value
+    return dataclasses.replace(row, p_holm=p_holm, change=("better" if gain > 0 else "worse") if shown else "")
+
+
+# --- Of a scene -------------------------------------------------------------------------------------------------------
+
+
+def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Contrast]:
+    for quantity in IN_SUMS:
+        sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
+        yield from _row(quantity, sums[0], sums[number], common)
+    if _same_ceiling(base, other):
+        yield from _row(REACHED, base.sums.without_truth(), other.sums.without_truth(), common)
+    if common.basis != "flights":
+        yield _coverage(base.sums, other.sums)
+    if base.flicker and other.flicker:
+        yield _flicker(base.flicker, other.flicker, paired=common.same_frames is not False)
+    done = {quantity.key for quantity in (*HEADLINES, *IN_SUMS)}
+    for quantity in quantities():
+        if isinstance(quantity, Measure) and quantity.key not in done and common.tables:
+            yield _of_voxels(quantity, common.tables[0], common.tables[number], common.sums[0].edge)
+
+
+def _row(
+    quantity: Quantity, base: InfluenceSums, other: InfluenceSums, common: Common, k: int | None = None, of: str = ""
+) -> Iterator[Contrast]:
+    """A number of the sums, where either run has it."""
+    key = quantity.key
+    before, after = value(base, key, k), value(other, key, k)
+    if not (math.isnan(before) and math.isnan(after)):
+        yield Contrast(key, of, before, after, _difference(base, other, key, k, common), math.nan, "")
+
+
+def _difference(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None, common: Common) -> Interval:
+    question, number = _question(key, k, base, other), functional(key, k)
+    if base.truth != other.truth:
+        base, other = base.without_truth(), other.without_truth()
+    if common.basis == "flights":
+        return unpaired(estimate(other, key, k, question), estimate(base, key, k, question))
+    if _same(base, other, key, k):
+        return _none(estimate(base, key, k, question))
+    found = difference(other, base, key, k, question, same_frames=common.same_frames)
+    most = number.high - number.low
+    return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
+
+
+def _question(key: str, k: int | None, *sums: InfluenceSums) -> Question:
+    all_tell = {question_of(own) for own in sums} == {NEXT_FLIGHT} and not of_places_alone(key, k)
+    return NEXT_FLIGHT if all_tell else THIS_MAP
+
+
+def _same(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None) -> bool:
+    """Whether all that a number is of is the same in both, place by place and frame by frame."""
+    one, two = (columns_of(own, key, k) for own in aligned(base, other))
+    return one.shape == two.shape and bool(np.array_equal(one, two, equal_nan=True))
+
+
+def _none(found: Interval) -> Interval:
+    """A difference that there is nowhere."""
+    return dataclasses.replace(found, value=0.0, low=0.0, high=0.0, p_value=math.nan)
+
+
+def _same_ceiling(base: Entry, other: Entry) -> bool:
+    """Whether both judge against the same labels: those of the truth, or their own in finer cells."""
+    found = [entry.summary.statistics for entry in (base, other)]
+    return len({own.reach.by if own is not None and own.reach is not None else "" for own in found} - {""}) == 1
+
+
+def _coverage(base: InfluenceSums, other: InfluenceSums) -> Contrast:
+    ratio = coverage(other, base)
+    change = dataclasses.replace(ratio, value=ratio.value - 1, low=ratio.low - 1, high=ratio.high - 1)
+    change = _none(change) if _same(base, other, "psa", None) or _as_many(base, other) else _with_p_value(change)
+    return Contrast(COVERAGE.key, "", 1.0, ratio.value, change, math.nan, "")
+
+
+def _as_many(base: InfluenceSums, other: InfluenceSums) -> bool:
+    """Whether both have as many voxels in every cube."""
+    one, two = (own.coarsened(max(base.edge, other.edge), 0) for own in (base, other))
+    return bool(np.array_equal(one.cell, two.cell) and np.allclose(one["voxels"], two["voxels"]))
+
+
+def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
+    frames = sorted(base.keys() & other.keys()) if paired else []
+    if len(frames) > 1:
+        before, after = (np.array([own[frame] for frame in frames]) for own in (base, other))
+        change = mean_over_frames(np.array(frames), after - before)
+        found = _none(change) if np.array_equal(before, after) else _with_p_value(change)
+    else:
+        before, after = (np.array([*own.values()]) for own in (base, other))
+        each = [mean_over_frames(np.array([*own]), np.array([*own.values()])) for own in (base, other)]
+        found = unpaired(each[1], each[0])
+    return Contrast(FLICKER.key, "", mean(before), mean(after), found, math.nan, "")
+
+
+def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
+    """The mean of a measure over the voxels where it is defined, by its differences voxel by voxel."""
+    before, after = measure.of(base), measure.of(other)
+    known = ~np.isnan(before) & ~np.isnan(after)
+    before, after = before[known], after[known]
+    if not len(before):
+        return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
+    places = Places(base.index[known], base.voxel_size, edge)
+    columns = np.stack([after - before, np.ones(len(before))], axis=1)
+    change = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
+    found = _none(change) if np.array_equal(before, after) else _with_p_value(change)
+    return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
+
+
+def _with_p_value(found: Interval) -> Interval:
+    """That the number is 0, by its interval."""
+    from scipy import stats
+
+    error = standard_error(found)
+    if not error > 0:
+        return found
+    degrees = found.degrees if found.degrees > 0 else math.inf
+    return dataclasses.replace(found, p_value=float(2 * stats.t.sf(abs(found.value) / error, degrees)))
+
+
+# --- By class ---------------------------------------------------------------------------------------------------------
+
+
+def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str], number: int) -> Iterator[Contrast]:
+    for quantity in ONE_AGAINST_ALL:
+        sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
+        before, after = sums[0], sums[number]
+        if quantity is REACHED:
+            before, after = base.sums.without_truth(), other.sums.without_truth()
+        if quantity is REACHED and not _same_ceiling(base, other):
+            continue
+        for k, name in enumerate(names):
+            if _enough(before, k):
+                yield from _row(quantity, before, after, common, k, name)
+
+
+def _enough(sums: InfluenceSums, k: int) -> bool:
+    """Whether a class has evidence worth so many voxels."""
+    seen = sums["observations"].sum() / max(sums["voxels"].sum(), 1e-9)
+    return bool(sums["evidence"][:, k].sum() >= LEAST_VOXELS * seen)
+
+
+def _of_places(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
+    labels = class_of_places(common)
+    wanted = [quantity for quantity in BY_CLASS if quantity not in ONE_AGAINST_ALL]
+    for k, name in enumerate(names):
+        where = labels == k
+        if np.count_nonzero(where) < LEAST_VOXELS:
+            continue
+        sums = common.among(where)
+        for quantity in wanted:
+            yield from _row(quantity, sums[0], sums[number], common, of=name)
+
+
+def class_of_places(common: Common) -> npt.NDArray[np.int64]:
+    """The class (n,) of each common place: the true one, or what all runs together say; -1 where it is not known."""
+    return common.label if common.label is not None else joint_class(common.tables)
+
+
+def joint_class(tables: Iterable[VoxelTable]) -> npt.NDArray[np.int64]:
+    """The dominant class (n,) of the same voxels in several maps, each counting alike."""
+    first, *others = tables
+    beliefs = first.evidence[:] / first.op[:, None]
+    for other in others:
+        beliefs = beliefs + other.evidence[:] / other.op[:, None]
+    label: npt.NDArray[np.int64] = beliefs.round(9).argmax(axis=1)
+    return label

@@ -1,0 +1,195 @@
+"""What runs have in common on a scene: looks, voxels, cubes of space, or nothing; and what that leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.comparison.opening import Entry
+from semstab.metrics.matching import observations, rows_of
+from semstab.model.comparison import CommonLooks, MapCoverage
+from semstab.model.contrast import Basis
+from semstab.model.measures import sbd
+from semstab.model.records import Record
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.comparison import coverage, repeated_rows
+from semstab.statistics.correctness import join_truth
+from semstab.statistics.drift import expected_sbd
+from semstab.statistics.looks import Looks
+from semstab.statistics.looks.ignored import common_looks
+from semstab.statistics.sampling import InfluenceSums, influence_sums
+
+Int64 = npt.NDArray[np.int64]
+
+NEAR = 1e-3
+"""Metres within which cameras of the same frame lie."""
+
+FEW = 0.1
+"""A part of a map's voxels below which it is said how few are in common."""
+
+BY_CUBES = "its numbers are compared by sums in the same cubes of space, each map with all its voxels, but not voxel by"
+BY_CUBES += " voxel: no list of places, no change of a voxel"
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """Runs on a scene, as far as they can be held against each other.
+
+    sums    of each run, of the common places; for `cubes` and `flights` of its whole map
+    whole   the same of soft scores, where `sums` has looks reduced to their largest class
+    tables  of the common places; none for `cubes` and `flights`
+    logs    of these tables, where looks are in common
+    label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
+    looks   what the common looks are
+    maps    the whole maps, and truth that of the ground truth, where there are voxels
+    same_frames  whether frames are paired; None where the sums tell
+    """
+
+    basis: Basis
+    remarks: tuple[str, ...]
+    sums: tuple[InfluenceSums, ...]
+    whole: tuple[InfluenceSums, ...]
+    tables: tuple[VoxelTable, ...] = ()
+    logs: tuple[Events, ...] = ()
+    label: Int64 | None = None
+    looks: CommonLooks | None = None
+    maps: tuple[VoxelTable, ...] = ()
+    truth: VoxelTable | None = None
+    coverage: tuple[MapCoverage, ...] = ()
+    same_frames: bool | None = None
+
+    def among(self, where: npt.NDArray[np.bool_]) -> tuple[InfluenceSums, ...]:
+        """The sums of some of the common places (n,)."""
+        return tuple(
+            _sums(rows_of(table, where), _some(log, where), None if self.label is None else self.label[where])
+            for table, log in zip(self.tables, self.logs or (None,) * len(self.tables), strict=True)
+        )
+
+
+def pair(entries: Sequence[Entry], names: Sequence[str]) -> Common:
+    """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
+    if remark := _other_frame_of_reference(entries):
+        return _apart(entries, remark)
+    if remark := _other_voxels(entries):
+        own = tuple(entry.sums for entry in entries)
+        return Common("cubes", (remark,), own, own)
+    records = [entry.with_voxels("a comparison by voxels") for entry in entries]
+    maps = {name: record.table() for name, record in zip(names, records, strict=True)}
+    covered = coverage(maps)
+    if not any(row.common_share for row in covered):
+        return _apart(entries, "the maps have no voxel in common: other places, or other frames of reference")
+    truth = _truth(records)
+    found = _by_looks(records, maps, truth) or _by_voxels(maps, truth)
+    remarks = (*found.remarks, *_remarks(covered))
+    return replace(found, remarks=remarks, maps=tuple(maps.values()), truth=truth, coverage=covered)
+
+
+# --- What is in common ------------------------------------------------------------------------------------------------
+
+
+def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common | None:
+    """The looks that all made; None where the looks of one were not kept, or are of other frames."""
+    looks = [_looks_of(record) for record in records]
+    there = [own for own in looks if own is not None]
+    if len(there) < len(looks) or not _same_frames(there):
+        return None
+    shared = common_looks(dict(zip(maps, there, strict=True)))
+    tables = tuple(log.table() for log in shared.logs.values())
+    if not any(table.op.max(initial=0) >= 2 for table in tables):
+        return None
+    label = None if truth is None else join_truth(tables[0], truth).label
+    sums, whole = (
+        tuple(_sums(log.table(), log, label) for log in logs.values()) for logs in (shared.logs, shared.whole)
+    )
+    logs = tuple(shared.logs.values())
+    return Common("looks", (), sums, whole, tables, logs, label, shared.found)
+
+
+def _by_voxels(maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common:
+    """The voxels that all saw twice or more, whatever each saw of them."""
+    tables = tuple(table.rows(rows) for table, rows in zip(maps.values(), repeated_rows(maps), strict=True))
+    label = None if truth is None else join_truth(tables[0], truth).label
+    sums = tuple(_sums(table, None, label) for table in tables)
+    remark = "the runs made other looks, of other frames: they are paired on voxels alone, for this map"
+    return Common("voxels", (remark,), sums, sums, tables, (), label, same_frames=False)
+
+
+def _apart(entries: Sequence[Entry], reason: str) -> Common:
+    own = tuple(entry.sums for entry in entries)
+    remark = f"{reason}: nothing can be paired; each map's own numbers stand beside each other"
+    return Common("flights", (remark,), own, own, same_frames=False)
+
+
+def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> InfluenceSums:
+    return influence_sums(table, log, label, sbd_excess=sbd(table) - expected_sbd(table))
+
+
+def _some(log: Events | None, where: npt.NDArray[np.bool_]) -> Events | None:
+    return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
+
+
+def _looks_of(record: Record) -> Looks | None:
+    file = record.looks_file
+    return Looks.load(file) if file is not None and file.is_file() else None
+
+
+def _same_frames(looks: Sequence[Looks]) -> bool:
+    """Whether frames of one index were taken from one place, and most of the shorter flight's are in the others."""
+    first, *others = ({view.frame: view.centre for view in own.views} for own in looks)
+    for other in others:
+        both = first.keys() & other.keys()
+        if 2 * len(both) < min(len(first), len(other)):
+            return False
+        if any(np.abs(first[frame] - other[frame]).max() > NEAR for frame in both):
+            return False
+    return True
+
+
+def _truth(records: Sequence[Record]) -> VoxelTable | None:
+    """The map of the ground truth, of the first run that fused it."""
+    files = [record.truth_file for record in records if record.truth_file is not None and record.truth_file.is_file()]
+    truth = VoxelTable.load(files[0]) if files else None
+    return truth if truth is not None and truth.classes == records[0].table().classes else None
+
+
+# --- What is not ------------------------------------------------------------------------------------------------------
+
+
+def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
+    """Why coordinates are not those of the same places; empty where they are."""
+    first, *others = (entry.georeference for entry in entries)
+    for entry, own in zip(entries[1:], others, strict=True):
+        if (own is None) != (first is None):
+            without = entry if own is None else entries[0]
+            return f"{without.where} has no georeference, and the other has one"
+        if own is not None and first is not None and own != first:
+            what = "coordinate reference systems" if own.crs != first.crs else "offsets of the coordinates"
+            return f"the {what} of {entries[0].where} and {entry.where} differ"
+    return ""
+
+
+def _other_voxels(entries: Sequence[Entry]) -> str:
+    """Why there are no voxels to pair; empty where there are."""
+    sizes = [entry.summary.table.voxel_size for entry in entries]
+    if len(set(sizes)) > 1:
+        listed = " and ".join(f"{size:g} m" for size in dict.fromkeys(sizes))
+        return f"voxels of {listed}: {BY_CUBES}"
+    for entry in entries:
+        if entry.record is None:
+            return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"
+        if entry.record.voxels_file is None or not entry.record.voxels_file.is_file():
+            return f"{entry.where} kept no voxels: {BY_CUBES}"
+    return ""
+
+
+def _remarks(covered: Sequence[MapCoverage]) -> list[str]:
+    """Where a map has hardly anything in common with the others."""
+    return [
+        f"only {row.common_share:.1%} of the voxels of {row.backbone} are in all maps: are the frames of reference the"
+        " same?"
+        for row in covered
+        if row.common_share < FEW
+    ]

@@ -1,0 +1,135 @@
+"""Opening what is compared: folders, a label source of them, small summaries; each error in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+import tiny_scene
+from posed_config import configure
+from posed_scene import fails
+
+import semstab
+from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
+from semstab.errors import ConfigError, DataError
+from semstab.statistics.sampling import value
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of a wall with the label sources a and b."""
+    base = tmp_path_factory.mktemp("opening")
+    tiny_scene.write(base / "wall", frames=6)
+    semstab.run(configure(base / "wall", check=None), out=base / "run", report=False)
+    return base / "run"
+
+
+def test_a_label_source_is_selected_behind_a_colon(run):
+    found = open_contender(f"{run}:b")
+    assert (found.backbone, list(found.scenes), found.source) == ("b", ["wall"], run)
+    entry = found.scenes["wall"]
+    assert entry.classes == entry.with_voxels("").table().classes
+    assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa.value)
+    assert list(entry.flicker) == [1, 2, 3, 4, 5]
+    assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.summary.flicker_percent)
+
+
+def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
+    shutil.copytree(run, tmp_path / "new")
+    names = [each.name for each in open_contenders([f"{run}:a", f"{run}:b"])]
+    assert names == ["a", "b"]
+    assert [each.name for each in open_contenders([f"{run}:a", f"{tmp_path}/new:a"])] == ["run", "new"]
+    three = open_contenders([f"{run}:a", f"{tmp_path}/new:a", f"{run}:b"])
+    assert [each.name for each in three] == ["run:a", "new:a", "run:b"]
+    assert [each.name for each in open_contenders([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
+
+
+def test_a_path_with_a_colon_is_a_path(run, tmp_path):
+    shutil.copytree(run, tmp_path / "a:b")
+    assert open_contender(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
+
+
+@pytest.mark.parametrize(
+    ("named", "line"),
+    [
+        ("{run}", "holds several label sources (a, b); name one: {run}:a"),
+        ("{run}:q", "no backbone 'q'; known: a, b"),
+        ("{run}/nothing", "there is no such folder"),
+        ("{run}/units", "summary.json: cannot be read"),
+        ("{run}/config.yaml", "neither a run's folder nor a small summary"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_line(run, named, line):
+    fails((ConfigError, DataError), re.escape(line.format(run=run)), open_contender, named.format(run=run))
+
+
+def test_an_earlier_layout_is_said(run, tmp_path):
+    shutil.copytree(run, tmp_path / "old")
+    settings = tmp_path / "old/config.yaml"
+    settings.write_text(settings.read_text().replace("layout 3", "layout 2"))
+    fails(
+        DataError,
+        re.escape("holds results of an earlier version of semstab; run it again"),
+        open_contender,
+        f"{tmp_path}/old:a",
+    )
+
+
+def test_runs_of_other_scenes_and_classes_are_refused(run):
+    one = open_contender(f"{run}:a")
+    other = dataclasses.replace(one, scenes={"street": one.scenes["wall"]})
+    fails(DataError, re.escape("have no scene in common (wall; street)"), shared_scenes, [one, other])
+    entry = dataclasses.replace(one.scenes["wall"])
+    entry.__dict__["sums"] = dataclasses.replace(entry.sums, classes=("floor", *entry.classes[1:]))
+    fails(
+        DataError,
+        re.escape(f"class 0 is {entry.read_sums().classes[0]} and floor"),
+        shared_scenes,
+        [one, dataclasses.replace(one, scenes={"wall": entry})],
+    )
+
+
+def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
+    one, file = open_contender(f"{run}:a"), tmp_path / "kept.semstab"
+    save_summary(one, file)
+    kept = open_contender(file)
+    assert (kept.backbone, list(kept.scenes)) == ("a", ["wall"])
+    own, back = one.scenes["wall"], kept.scenes["wall"]
+    assert (back.summary.statistics.agreement, back.image_space) == (own.summary.statistics.agreement, own.image_space)
+    assert (back.up, back.flicker) == (own.up, own.flicker)
+    assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha_between", "reached", "vss"))
+    fails(
+        DataError,
+        re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"),
+        back.with_voxels,
+        "mIoU",
+    )
+
+
+def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
+    one, file = open_contender(f"{run}:a"), tmp_path / "kept.semstab"
+    save_summary(one, file)
+    most = file.stat().st_size - 500
+    save_summary(one, file, most)
+    assert file.stat().st_size <= most
+    coarse, fine = open_contender(file).scenes["wall"].sums, one.scenes["wall"].sums
+    assert coarse.edge > fine.edge
+    assert value(coarse, "alpha") == pytest.approx(value(fine, "alpha"))
+    fails(DataError, re.escape("keep fewer scenes"), save_summary, one, file, 100)
+
+
+def test_a_damaged_small_summary_is_one_line(run, tmp_path):
+    file = tmp_path / "kept.semstab"
+    save_summary(open_contender(f"{run}:a"), file)
+    whole = file.read_bytes()
+    for data in (whole[: len(whole) // 2], b"", whole[:200] + b"\0" * 200 + whole[400:]):
+        file.write_bytes(data)
+        fails(DataError, re.escape(str(file)), open_contender, file)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("summary.json", json.dumps({"kind": "else"}))
+    fails(DataError, re.escape("of another kind or version"), open_contender, file)
