@@ -208,10 +208,10 @@ def test_settings_that_make_no_sense_are_refused():
 
 
 def scene(labels, K=2, frame_orders=99):
-    return tested(log_of(labels, K=K), frame_orders)
+    return drift_of(log_of(labels, K=K), frame_orders)
 
 
-def tested(events, frame_orders=99):
+def drift_of(events, frame_orders=99):
     table = events.table()
     return scene_drift(table, events, small(events, draws=1, most=1), seed=0, frame_orders=frame_orders)
 
@@ -242,7 +242,7 @@ def test_the_scene_test_finds_a_common_drift():
 
 def test_errors_that_last_are_no_drift_and_a_short_flight_cannot_tell_them_apart():
     """Each frame errs as the one before in 0.8: of 40 frames no p-value tells, of 12 never."""
-    found = [tested(without_drift(np.random.default_rng(seed), (40, 40, 6), "frame", 0.8)) for seed in range(8)]
+    found = [drift_of(without_drift(np.random.default_rng(seed), (40, 40, 6), "frame", 0.8)) for seed in range(8)]
     assert np.mean([math.isnan(s.trend_p) for s in found]) > 0.5
     assert not any(s.trend_p <= 0.05 for s in found)
     assert math.isnan(scene(drifting(np.random.default_rng(0), 200, 12)).trend_p)

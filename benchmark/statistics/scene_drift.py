@@ -147,12 +147,13 @@ def _lasting(departures: Float64, frame: Int64, frames: int) -> float:
     if frames < 2:
         return 0.0
     size = np.bincount(frame, minlength=frames).astype(np.float64)
-    series = np.bincount(frame, weights=departures, minlength=frames)
+    series: Float64 = np.bincount(frame, weights=departures, minlength=frames).astype(np.float64)
     series = series - size / size.sum() * series.sum()
     span = -(-frames // MOST_SPANS)  # frames that are looked at as one, where there are many
     starts = np.arange(0, frames, span)
-    series, size = np.add.reduceat(series, starts), np.add.reduceat(size, starts)
-    return span * arrangement(np.arange(len(starts))[:, None]).longest(series, size, CERTAIN)
+    sums: Float64 = np.add.reduceat(series, starts)
+    sizes: Float64 = np.add.reduceat(size, starts)
+    return span * arrangement(np.arange(len(starts))[:, None]).longest(sums, sizes, CERTAIN)
 
 
 def _total(values: Float64) -> float:
