@@ -94,7 +94,7 @@ def test_errors_that_reach_as_far_as_the_scene_decide_nothing():
 def test_frames_of_uneven_quality_widen_what_is_said_of_the_next_flight():
     sums = simulated(frames=64, looks=64, quality="bad", side=32)
     here, next_one = estimate(sums, "alpha", question=THIS_MAP), estimate(sums, "alpha")
-    assert next_one.high - next_one.low > 1.5 * (here.high - here.low)
+    assert next_one.high - next_one.low > 1.3 * (here.high - here.low)
     assert (here.question, next_one.question, next_one.frames) == (THIS_MAP, NEXT_FLIGHT, 64)
     assert next_one.decided
 
