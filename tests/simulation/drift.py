@@ -3,8 +3,8 @@
     python tests/simulation/drift.py [--runs 200]
 
 Groups of 12 voxels that are first seen together, in frames whose errors are anew in each or last (autocorrelation 0.8),
-common to a group or to a frame. Share of scenes of which a p-value is told, and with p <= 0.05, of the test by SBD and of
-that by the trend.
+common to a group or to a frame. Share of scenes of which a p-value is told, and with p <= 0.05, of the test by SBD and
+of that by the trend.
 """
 
 from __future__ import annotations
