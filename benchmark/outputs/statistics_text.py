@@ -139,7 +139,7 @@ def _reach(reach: Reach) -> list[Row]:
 
 
 def _standard(found: LagBin) -> list[Row]:
-    ceiling = "" if math.isnan(found.ceiling) else f"ceiling {found.ceiling:.2f}; {found.pairs} pairs"
+    ceiling = "" if math.isnan(found.ceiling) else f"ceiling {found.ceiling:.2f}; {found.pairs} pairs; this map"
     return [(f"alpha b.f., views {found.low:g} to {found.high:g} deg.", found.alpha, ceiling)]
 
 

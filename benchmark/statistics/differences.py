@@ -70,13 +70,13 @@ class OnCommonPlaces:
         unknown = ({ACCURACY} if truth is None else set()) | ({ALPHA_BETWEEN} if reduced else set())
         return cls(sums, places, frozenset(SUMMED) - unknown)
 
-    def value(self, measure: Quantity, name: str, columns: Float64, statistic: Statistic) -> Interval:
+    def value(self, measure: Quantity, name: str, columns: Float64, statistic: Statistic) -> Estimate:
         """Of one backbone; columns (n, C) are those that the statistic is of."""
         if measure in self.known:
             sums = self.sums[name]
-            return estimate(sums, measure.key, question=question_of(sums))
+            return _ends(estimate(sums, measure.key, question=question_of(sums)))
         bounds = (-1.0, 1.0) if measure in (ALPHA, ALPHA_BETWEEN) else (0.0, 1.0)
-        return self.places.estimate(columns, statistic, bounds, "agreement" if bounds[0] else None)
+        return _ends(self.places.estimate(columns, statistic, bounds, "agreement" if bounds[0] else None))
 
     def difference(self, measure: Quantity, a: str, b: str, columns: Mapping[str, Float64], of: Statistic) -> Interval:
         """Of backbone a less backbone b."""
@@ -113,8 +113,11 @@ def differences(
 
 def _row(measure: Quantity, a: str, b: str, found: Interval, *, tested: bool) -> PairedDifference:
     p = found.p_value if tested else float("nan")
-    ends = Estimate(found.value, found.low, found.high)
-    return PairedDifference(measure.key, a, b, ends, p, float("nan"), found.question, found.undecided)
+    return PairedDifference(measure.key, a, b, _ends(found), p, float("nan"), found.question, found.undecided)
+
+
+def _ends(found: Interval) -> Estimate:
+    return Estimate(found.value, found.low, found.high)
 
 
 # --- What is claimed --------------------------------------------------------------------------------------------------

@@ -161,12 +161,10 @@ class Arrangement:
             return 0.0
         with one_thread():
             weights = self._weights(influence, size)
-        beyond, longest = 1.0, 0.0
-        for longest, weight in sorted((self._correlations[number].reach, weight) for number, _, weight in weights):
-            beyond -= weight
-            if beyond <= 1 - level:
-                break
-        return longest
+        reaches, shares = np.array(
+            sorted((self._correlations[number].reach, weight) for number, _, weight in weights)
+        ).T
+        return float(reaches[min(np.searchsorted(np.cumsum(shares), level), len(reaches) - 1)])
 
     def _parts(self, influence: Float64, size: Float64) -> list[Part]:
         """What the variance is under each reach that is not unlikely."""
