@@ -114,6 +114,12 @@ def test_few_frames_and_no_frames_say_so():
     assert without.value == pytest.approx(few.value)
 
 
+def test_quality_that_lasts_as_long_as_the_flight_decides_nothing():
+    found = estimate(simulated(6, frames=32, looks=32, quality="lasting", side=24), "alpha")
+    assert "lasts about as long as the flight" in found.undecided
+    assert estimate(simulated(6, frames=32, looks=32, side=24), "alpha").decided
+
+
 def test_every_number_has_an_interval_around_it():
     sums = simulated(frames=64, looks=6, quality="uneven")
     for key, k in [(key, None) for key in ("psa", "vss", "entropy", "accuracy", "look_accuracy", "wrong_of_stable")] + [
@@ -177,7 +183,7 @@ def covered(row: Row) -> bool:
         (Flight(side=64, reach=2.0), THIS_MAP),
         (Flight(side=64, reach=4.0, ease=2.0), THIS_MAP),
         (Flight(24, 1.5, 1.0, 60, 60, "bad"), NEXT_FLIGHT),
-        (Flight(24, 1.5, 1.0, 60, 5, "uneven"), NEXT_FLIGHT),
+        (Flight(24, 1.5, 1.0, 30, 5, "lasting"), NEXT_FLIGHT),
     ],
 )
 def test_intervals_hold_what_they_are_about(flight, question):
