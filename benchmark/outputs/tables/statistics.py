@@ -109,7 +109,7 @@ def drift(result: Result) -> list[Table]:
     seen = SEEN_TWICE if logged else one_class
     tests = (
         " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
-        " the frames. Trending: voxels whose own trend is significant at a false discovery rate of 5%, of those seen"
+        " stretches of time; none where errors may last too long for six of them. Trending: voxels whose own trend is significant at a false discovery rate of 5%, of those seen"
         " six times or more."
     )
     caption = (
