@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 
 import cv2
@@ -216,7 +215,7 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
         assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        assert math.isnan(row["sbd_p"])  # so few frames cannot tell how long errors last
+        assert "sbd_p" not in row  # so few frames cannot tell how long errors last
         assert row["trend"] == pytest.approx(base[row["backbone"]].drift.tests.trend, nan_ok=True)
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
