@@ -53,6 +53,9 @@ REGISTRY = Registry(
             "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
             install="pip install 'semstab[segearth]'",
         ),
+        "stored": Entry(
+            "semstab.predict.stored:Stored", "labels that a scene has already, for --filter: --set source=NAME"
+        ),
     },
 )
 

@@ -33,7 +33,8 @@ class Wrapped(Backbone):
 
     def reset(self) -> None:
         """Forget all images."""
-        self.inner.reset()
+        if self.inner.sequential:
+            self.inner.reset()
 
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -10,12 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.registry import Entry, Registry
 
 OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
+
+GIVEN = ("voxel_size", "num_classes", "within")
+"""What every map is made with; the rest are options of its backend."""
 
 REGISTRY = Registry(
     "backend",
@@ -132,18 +137,43 @@ class GrowingMap(FusionBackend, Protocol):
         """Voxel indices (n, 3) of the voxels of those rows."""
 
 
-def create(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> FusionBackend:
-    """A new, empty map.
+def create(
+    name: str, *, voxel_size: float, num_classes: int, within: Extent | None = None, **options: Any
+) -> FusionBackend:
+    """A new, empty map, restricted to the voxels `within` an extent where one is given.
 
     voxel_size in metres, num_classes K >= 2; options are the backend's own (open3d: device, block_resolution).
-    Raises ConfigError for an unknown name or option, MissingDependencyError where its engine is not installed.
+    Raises ConfigError for an unknown name or option, and for an extent where the backend does not associate pixel by
+    pixel; MissingDependencyError where its engine is not installed.
     """
     cls = REGISTRY.load(name)
     known = _options(cls)
+    if not isinstance(within, Extent | None):
+        raise ConfigError(f"backend '{name}' has no option 'within'; the plan sets it")
     if unknown := sorted(set(options) - set(known)):
         listed = f"it takes {', '.join(known)}" if known else "it takes none"
         raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
+    if within is not None:
+        return _restricted(cls, name, voxel_size, num_classes, within, options)
     return cast(FusionBackend, cls(voxel_size=voxel_size, num_classes=num_classes, **options))
+
+
+def _restricted(
+    cls: Any, name: str, voxel_size: float, num_classes: int, within: Extent, options: Mapping[str, Any]
+) -> FusionBackend:
+    from semstab.backends.shared.restricted import Restricted
+
+    if not restrictable(name):
+        raise ConfigError(f"backend '{name}' does not associate pixel by pixel; it cannot be restricted to a part")
+    if "within" in inspect.signature(cls).parameters:
+        return cast(FusionBackend, cls(voxel_size=voxel_size, num_classes=num_classes, within=within, **options))
+    whole = create(name, voxel_size=voxel_size, num_classes=num_classes, **options)
+    return Restricted(whole, voxel_size, within)
+
+
+def restrictable(name: str) -> bool:
+    """Whether maps of the backend of that name can be restricted to an extent."""
+    return bool(getattr(REGISTRY.load(name), "pointwise", True))
 
 
 def takes_option(name: str, option: str) -> bool:
@@ -166,4 +196,4 @@ def expected_bytes(name: str, voxels: int, observations: int, num_classes: int) 
 
 
 def _options(cls: Any) -> list[str]:
-    return [name for name in inspect.signature(cls).parameters if name not in ("voxel_size", "num_classes")]
+    return [name for name in inspect.signature(cls).parameters if name not in GIVEN]

@@ -1,8 +1,9 @@
 """Backend `numba`: an open-addressing hash map of voxels, updated in compiled parallel code.
 
 A voxel's record holds the class that it saw first; further classes hang on it as a chain of nodes. So memory follows
-the classes that were seen, not K, and a voxel on which all frames agree touches one record. The map is cut into
-partitions by a hash of the voxel's key; each is updated by one thread at a time, in the frame's order.
+the classes that were seen, not K, and a voxel on which all frames agree touches one record. Soft scores that have most
+classes give it a dense row of all K. The map is cut into partitions by a hash of the voxel's key; each is updated by
+one thread at a time, in the frame's order.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import Changes
+from semstab.backends.numba_parts.dense import count_rows, update_dense
 from semstab.backends.numba_parts.history import History
 from semstab.backends.numba_parts.loops import (
     SLOT,
@@ -31,10 +33,12 @@ from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import columns_of_keys, index_of_keys
-from semstab.backends.shared.observed import Observed
+from semstab.backends.shared.observed import Observed, ObservedScores
+from semstab.backends.shared.score_vectors import LANES
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
@@ -54,6 +58,7 @@ class NumbaHash:
     evidence  'float64', or 'float32' for half the memory of the evidence
     threads   how many to use; all of numba's where not given
     history   keep every observation, for `events`; memory then grows with each
+    within    the voxels that the map is restricted to
     """
 
     _loaded: ClassVar[bool] = False
@@ -65,6 +70,7 @@ class NumbaHash:
         evidence: str = "float64",
         threads: int | None = None,
         history: bool = False,
+        within: Extent | None = None,
     ) -> None:
         check_settings(voxel_size, num_classes)
         if evidence not in ("float64", "float32"):
@@ -77,13 +83,15 @@ class NumbaHash:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.threads = threads
-        self._pixels = Aggregator(voxel_size, num_classes)
+        self._pixels = Aggregator(voxel_size, num_classes, within)
         self._history = History(voxel_size, num_classes) if history else None
         record, node = record_types(np.dtype(evidence))
         self._total = MapTotal(num_classes)
         self._records = np.zeros(1024, dtype=record)
         self._nodes = np.zeros(1024, dtype=node)
         self._nodes_used = 0
+        self._dense = np.zeros((1, -(-num_classes // LANES) * LANES), dtype=evidence)
+        self._dense_used = 0
         self._slots = np.zeros((PARTITIONS, 64), dtype=SLOT)
         self._slots["row"] = -1
         self._used = np.zeros(PARTITIONS, dtype=np.int64)
@@ -110,12 +118,13 @@ class NumbaHash:
             observed = time.perf_counter()
             change = self._add(seen, frame.index)
             if self._history is not None:
-                self._history.append(seen, self.changes.row, frame.index)
+                entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
+                self._history.append(entries, self.changes.row, frame.index)
             return self._total.add(frame.index, change, started, observed)
         finally:
             nb.set_num_threads(threads)
 
-    def _add(self, seen: Observed, frame: int) -> Change:
+    def _add(self, seen: Observed | ObservedScores, frame: int) -> Change:
         """Add a frame's observations."""
         self._make_slots(int((self._used + np.diff(seen.bounds)).max()))
         row, slot = np.empty_like(seen.key), np.empty_like(seen.key)
@@ -123,14 +132,21 @@ class NumbaHash:
         look_up(seen.key, seen.bounds, self._slots, row, slot, new)
         base = len(self) + np.concatenate([[0], np.cumsum(new)])
         _grow(self._records, int(base[-1]))
-        self._make_nodes(np.diff(seen.start[seen.bounds]))
         sums = np.zeros((PARTITIONS, 4))
         self.changes = changes = Changes.room(row, seen.key)
-        update(
-            seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, self.num_classes,
-            row, slot, base, self._slots, self._records, self._nodes, self._ranges, sums,
-            changes.drift, changes.before, changes.after,
-        )  # fmt: skip
+        report = sums, changes.drift, changes.before, changes.after
+        if isinstance(seen, ObservedScores):
+            dense_base = self._make_dense(seen, row)
+            update_dense(
+                seen.key, seen.pixels, seen.row, seen.sums, seen.bounds, frame, row, slot, base, dense_base,
+                self._slots, self._records, self._nodes, self._dense, *report,
+            )  # fmt: skip
+        else:
+            self._make_nodes(np.diff(seen.start[seen.bounds]))
+            update(
+                seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, row, slot, base,
+                self._slots, self._records, self._nodes, self._dense, self._ranges, *report,
+            )  # fmt: skip
         self._used += new
         vss, entropy, _, recurrent = sums.sum(axis=0)
         drift = sums[:, 2].sum()
@@ -147,10 +163,10 @@ class NumbaHash:
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
         values: dict[str, Any] = {name: self._records[name][order] for name in columns}
         starts = np.zeros(len(order) + 1, dtype=np.int64)
-        count_chain(self._records, self._nodes, order, starts)
+        count_chain(self._records, self._nodes, self._dense, order, starts)
         np.cumsum(starts, out=starts)
         label, weight = np.empty(starts[-1], dtype=np.uint16), np.empty(starts[-1])
-        read_chain(self._records, self._nodes, order, starts, label, weight)
+        read_chain(self._records, self._nodes, self._dense, order, starts, label, weight)
         del order
         return VoxelTable(
             **index,
@@ -171,7 +187,7 @@ class NumbaHash:
     def evidence_of(self, rows: Int64) -> npt.NDArray[np.float64]:
         """Evidence (n, K) of the voxels of those rows."""
         evidence = np.zeros((len(rows), self.num_classes))
-        unchain(self._records, self._nodes, rows, evidence)
+        unchain(self._records, self._nodes, self._dense, rows, evidence)
         return evidence
 
     @property
@@ -198,6 +214,17 @@ class NumbaHash:
             slots = np.empty((PARTITIONS, size), dtype=SLOT)
             rehash(self._slots, slots)
             self._slots = slots
+
+    def _make_dense(self, seen: ObservedScores, row: Int64) -> Int64:
+        """Room for a dense row for each of the frame's voxels; where those of each partition begin."""
+        needed = np.zeros(PARTITIONS, dtype=np.int64)
+        count_rows(row, seen.bounds, self._records, needed)
+        base = self._dense_used + np.concatenate([[0], np.cumsum(needed)])
+        self._dense_used = int(base[-1])
+        used, stride = self._dense_used, self._dense.shape[1]
+        if used > len(self._dense):
+            self._dense.resize((max(used, len(self._dense) + len(self._dense) // 4), stride), refcheck=False)
+        return base
 
     def _make_nodes(self, entries: Int64) -> None:
         """Give each partition room for a node an entry; what is left of its last stretch is used first."""

@@ -19,8 +19,10 @@ from semstab.backends.shared.association import (
     observe,
     voxel_index,
 )
+from semstab.backends.shared.restricted import falling_into
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.model.evidence import Evidence
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable, index_columns
@@ -37,10 +39,11 @@ class NumpyReference:
 
     keeps_log = True
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         check_settings(voxel_size, num_classes)
         self.voxel_size = voxel_size
         self.num_classes = num_classes
+        self.within = within
         self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
         self._history: list[tuple[Int64, int, Observations]] = []  # (rows, frame, observations), frame after frame
         self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
@@ -92,8 +95,9 @@ class NumpyReference:
         )
 
     def _pixels(self, frame: Frame) -> Mask:
-        """Those of the frame that are observed: the valid ones."""
-        return frame.valid
+        """Those of the frame that are observed: the valid ones that fall into the extent."""
+        valid = frame.valid
+        return valid if self.within is None else valid & falling_into(self.within, frame, self.voxel_size)
 
     def _rows(self, seen: Observations) -> Int64:
         """The rows of the frame's voxels, new ones added."""
@@ -110,8 +114,8 @@ class NumpySample(NumpyReference):
     """The reference on one in `ONE_IN` of the voxels, drawn at random by their index, through all frames."""
 
     def _pixels(self, frame: Frame) -> Mask:
-        chosen = frame.valid.copy()
-        chosen[chosen] = in_sample(voxel_index(back_project(frame), self.voxel_size, frame))
+        chosen = super()._pixels(frame).copy()
+        chosen[chosen] = in_sample(voxel_index(back_project(frame, chosen), self.voxel_size, frame))
         return chosen
 
 

@@ -20,10 +20,11 @@ from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import Int64, check_depth, check_frame, check_settings
 from semstab.backends.shared.blocks import blocks_of
 from semstab.backends.shared.columns import update_rows
-from semstab.backends.shared.observed import Observed
+from semstab.backends.shared.observed import Observed, ObservedScores
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
@@ -45,9 +46,17 @@ class Open3DBlocks(FusionBackend):
 
     device            'CPU:0', or 'CUDA:0' where Open3D sees such a device
     block_resolution  voxels along an edge of a block; a block takes memory for all of its voxels
+    within            the voxels that the map is restricted to
     """
 
-    def __init__(self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4) -> None:
+    def __init__(
+        self,
+        voxel_size: float,
+        num_classes: int,
+        device: str = "CPU:0",
+        block_resolution: int = 4,
+        within: Extent | None = None,
+    ) -> None:
         check_settings(voxel_size, num_classes)
         if not 1 <= block_resolution <= 64:
             raise ConfigError(f"block_resolution = {block_resolution}: use 1 to 64 (4 suits surfaces)")
@@ -56,7 +65,7 @@ class Open3DBlocks(FusionBackend):
         self.block_resolution = block_resolution
         self.device = _device(device)
         self.in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
-        self._pixels = Aggregator(voxel_size, num_classes)
+        self._pixels = Aggregator(voxel_size, num_classes, within)
         self._total = MapTotal(num_classes)
         self.attributes = {
             "op": (o3c.int32, 1),
@@ -83,6 +92,8 @@ class Open3DBlocks(FusionBackend):
         if frame.scores is not None:
             check_frame(frame, self.num_classes)
         seen = self._pixels.observe(frame)
+        if isinstance(seen, ObservedScores):
+            seen = seen.sparse()
         observed = time.perf_counter()
         rows = self._activate(self._pixels.index_of(seen.key)) if len(seen.key) else seen.key
         change = self._update(rows, seen, frame.index)

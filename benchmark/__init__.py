@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from semstab import backbones, backends, datasets, engine, metrics, statistics
     from semstab.api import run, run_study
+    from semstab.comparison.writing import compare
     from semstab.config import Config
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
+    from semstab.gating import GateConfig, gate
     from semstab.model.frames import Frame, Intrinsics
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import Events, VoxelTable
@@ -18,16 +20,19 @@ if TYPE_CHECKING:
     from semstab.outputs.loaded import load
     from semstab.outputs.relabel import Belief, relabel
     from semstab.settings import load_config, load_study
+    from semstab.statistics.commit import Commit
 
 __version__ = "0.3.0"
 
 __all__ = [
     "Belief",
+    "Commit",
     "Config",
     "ConfigError",
     "DataError",
     "Events",
     "Frame",
+    "GateConfig",
     "Intrinsics",
     "LabelSpace",
     "MissingDependencyError",
@@ -35,9 +40,11 @@ __all__ = [
     "VoxelTable",
     "backbones",
     "backends",
+    "compare",
     "datasets",
     "engine",
     "export",
+    "gate",
     "load",
     "load_config",
     "load_result",
@@ -51,17 +58,21 @@ __all__ = [
 
 _HOMES = {
     "Belief": "outputs.relabel",
+    "Commit": "statistics.commit",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
     "Events": "model.voxels",
     "Frame": "model.frames",
+    "GateConfig": "gating",
     "Intrinsics": "model.frames",
     "LabelSpace": "model.labels",
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
+    "compare": "comparison.writing",
     "export": "outputs.export",
+    "gate": "gating",
     "load": "outputs.loaded",
     "load_config": "settings",
     "load_result": "engine.folder",

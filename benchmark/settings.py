@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from semstab.config import Config, merge, nearest, read_yaml
+from semstab.config import Config, merge, nearest, read_yaml, validated
 from semstab.config.selection import in_full
-from semstab.datasets import resolved
+from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
 from semstab.errors import ConfigError
 from semstab.predict.live import NAME as PREDICTED
 from semstab.predict.predictor import PredictorConfig
+from semstab.predict.stored import NAME as STORED
+from semstab.predict.stored import StoredSequence
 
 
 def load_config(
@@ -73,6 +75,34 @@ def predicted_config(
         "options": {"dataset": inner, "backbones": [predictor.model_dump(mode="json") for predictor in predictors]},
     }
     return load_config(None, content)
+
+
+def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: Mapping[str, Any]) -> Config:
+    """The configuration of a file with overrides on top, filters over the label sources that it selects.
+
+    Sources with scores give scores. Raises what opening the dataset raises.
+    """
+    config = resolve(load_config(path, overrides))
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    scene = dataset.scene((config.scenes or dataset.scenes)[0])
+    names = config.backbones or [name for name in scene.backbones if name not in config.region_maps]
+    truth = [name for name in names if name == GROUND_TRUTH]
+    predictors = [
+        validated(
+            PredictorConfig,
+            {
+                "backbone": STORED,
+                "options": {"source": name},
+                "scores": StoredSequence(scene, name, False).has_scores,
+                "filters": filters,
+            },
+        )
+        for name in names
+        if name not in truth
+    ]
+    content = merge(dataset_defaults({"dataset": config.dataset.model_dump()}), _over(_of_file(path), overrides))
+    selected = [*(predictor.source_name for predictor in predictors), *truth]
+    return predicted_config(predictors, None, {**content, "backbones": selected})
 
 
 def resolve(config: Config) -> Config:

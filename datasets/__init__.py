@@ -8,14 +8,18 @@ from typing import Any, cast
 from pydantic import BaseModel
 
 from semstab.config import DatasetConfig, validated
-from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
 from semstab.runtime.registry import Entry, Registry
 
-__all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Scene", "open_dataset", "options_model", "resolved"]
+__all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Filtering", "Scene", "open_dataset", "options_model", "resolved"]
 
 REGISTRY = Registry(
     "dataset",
     {
+        "predicted": Entry(
+            "semstab.predict.live:PredictedDataset",
+            "another dataset with labels that models make while it is fused: `run --predict`",
+        ),
         "city": Entry(
             "semstab.datasets.city:City",
             "the built-in scene: a simulated UAV flight over a procedural city, with simulated backbones",

@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import FileOptions, FourIntrinsics, GroundTruth, UpAxis, VoidIds, zero_is_void
-from semstab.datasets.files.reader import FileDataset, files_named, frames_of
+from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.json_files import number, read_object
 from semstab.datasets.formats.text_tables import read_matrices
 from semstab.datasets.views.cameras import Camera, camera_of
@@ -55,19 +55,25 @@ class Replica(FileDataset[ReplicaOptions]):
 
     def is_scene(self, folder: Path) -> bool:
         """Whether the trajectory of one of the exports is there."""
-        return _export(folder) is not None
+        return self._export(folder) is not None
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth image. Raises DataError where there are not as many poses."""
-        export = _export(folder)
+        export = self._export(folder)
         assert export is not None
         poses = read_matrices(folder / export.trajectory)
         where, _, before = export.depth.rpartition("/")
-        depth = files_named(folder / where, before, ".png")
+        images, _, frame = export.color.removesuffix("{name}").rpartition("/")
+        instead = images_named(folder / images, frame)
+        depth = self.depth_files(folder / where, before, ".png", instead=instead)
         camera, scale = self._camera(folder, export)
         return frames_of(
             folder, depth, camera, pose=export.trajectory, color=export.color, poses=poses, depth_scale=scale
         )
+
+    def _export(self, folder: Path) -> Export | None:
+        there = (e for e in EXPORTS if (folder / e.trajectory).is_file() and self.has_depth((folder / e.depth).parent))
+        return next(there, None)
 
     def _camera(self, folder: Path, export: Export) -> tuple[Camera, float]:
         """The camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""
@@ -76,11 +82,6 @@ class Replica(FileDataset[ReplicaOptions]):
         if path is not None:
             numbers, size, scale = _cam_params(path / "cam_params.json")
         return camera_of(self.options.intrinsics, numbers, size), scale
-
-
-def _export(folder: Path) -> Export | None:
-    there = (e for e in EXPORTS if (folder / e.trajectory).is_file() and (folder / e.depth).parent.is_dir())
-    return next(there, None)
 
 
 def _cam_params(path: Path) -> tuple[tuple[float, float, float, float], tuple[int, int], float]:

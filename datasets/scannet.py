@@ -50,8 +50,9 @@ class ScanNet(FileDataset[ScanNetOptions]):
     looks_like = "depth/, pose/ and intrinsic/intrinsic_depth.txt"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether depth/, pose/ and the intrinsics of the depth are there."""
-        return (folder / "depth").is_dir() and (folder / "pose").is_dir() and _matrix_file(folder, "depth").is_file()
+        """Whether depth/, pose/ and the intrinsics of the depth are there; with a surface, the latter two."""
+        there = self.has_depth(folder / "depth") and (folder / "pose").is_dir()
+        return there and _matrix_file(folder, self.options.intrinsics).is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth image."""
@@ -59,7 +60,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         label_camera = None
         if self.options.label_camera != self.options.intrinsics and _matrix_file(folder, "color").is_file():
             label_camera = self._camera(folder, self.options.label_camera)
-        depth = files_named(folder / "depth", "", ".png")
+        depth = self.depth_files(folder / "depth", "", ".png", instead=files_named(folder / "pose", "", ".txt"))
         return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
     def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:

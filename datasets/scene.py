@@ -23,6 +23,20 @@ GROUND_TRUTH = "gt"
 """The name under which a scene's ground truth labels are selected like a backbone's."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Filtering:
+    """Filters between a model and what is read as a label source.
+
+    model         the label source without them; the source itself where that is not there
+    filters       'ema:0.6+threshold:0.5'; '' where there are none
+    milliseconds  of CPU time that they took for a frame so far, in the median
+    """
+
+    model: str
+    filters: str = ""
+    milliseconds: float = 0.0
+
+
 class Scene(ABC):
     """One sequence. Opening it reads no image; what reads one may be called from several threads at once.
 
@@ -103,6 +117,10 @@ class Scene(ABC):
     def depth_scale(self) -> float | None:
         """Units of stored depth in a metre, None where depth is not stored."""
         return None
+
+    def filtering(self, backbone: str) -> Filtering:
+        """What was done to a label source before it is read."""
+        return Filtering(backbone)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """The frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""

@@ -50,7 +50,7 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
         color = self.options.color_intrinsics
         camera = self._camera(folder)
         label_camera = None if color is None else Camera(Intrinsics(*color), self.options.color_size)
-        depth = files_named(folder, "", ".depth.png")
+        depth = self.depth_files(folder, "", ".depth.png", instead=files_named(folder, "", ".pose.txt"))
         return frames_of(folder, depth, camera, pose="{name}.pose.txt", color="{name}.color", label_camera=label_camera)
 
     def _camera(self, folder: Path) -> Camera:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import CameraAxes, FileOptions, FourIntrinsics, MaxDepth, UpAxis
-from semstab.datasets.files.reader import FileDataset, files_named, frames_of
+from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.text_tables import read_table
 from semstab.datasets.views.cameras import camera_of
 from semstab.datasets.views.poses import from_quaternions
@@ -43,9 +43,9 @@ class TartanAir(FileDataset[TartanAirOptions]):
         super().__init__(options.model_copy(update={"ground_truth": truth}))
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether the camera's poses and depth are there."""
+        """Whether the camera's poses and depth are there; with a surface, the poses."""
         side = self.options.camera
-        return (folder / f"pose_{side}.txt").is_file() and (folder / f"depth_{side}").is_dir()
+        return (folder / f"pose_{side}.txt").is_file() and self.has_depth(folder / f"depth_{side}")
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth map. Raises DataError where there are not as many poses."""
@@ -53,7 +53,8 @@ class TartanAir(FileDataset[TartanAirOptions]):
         path = folder / f"pose_{side}.txt"
         numbers = read_table(path, 7, "tx ty tz qx qy qz qw")
         poses = from_quaternions(numbers[:, :3], numbers[:, 3:], path)
-        depth = files_named(folder / f"depth_{side}", "", f"_{side}_depth.npy")
+        images = images_named(folder / f"image_{side}", "", f"_{side}")
+        depth = self.depth_files(folder / f"depth_{side}", "", f"_{side}_depth.npy", instead=images)
         camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
         color = f"image_{side}/{{name}}_{side}"
         return frames_of(folder, depth, camera, pose=path.name, color=color, poses=poses, what="depth maps")

@@ -58,18 +58,20 @@ class Tum(FileDataset[TumOptions]):
     looks_like = "depth.txt, groundtruth.txt and rgb.txt"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether depth.txt is there."""
-        return (folder / "depth.txt").is_file()
+        """Whether depth.txt is there, or with a surface rgb.txt."""
+        return (folder / self._list(folder)).is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a depth image that has a colour image; where no pose is near, its pose is NaN.
+
+        Where a surface gives the depth and no depth.txt is there, one a colour image.
 
         Raises DataError for time stamps that do not ascend, or where nothing fits together in time.
         """
         trajectory = inside(self.options.root, folder, self.options.trajectory, "option trajectory")
         numbers = read_table(trajectory, 8, "timestamp tx ty tz qx qy qz qw")
         _require_ascending(trajectory, numbers[:, 0])
-        times, depths = self._listed(folder, "depth.txt")
+        times, depths = self._listed(folder, self._list(folder))
         colors = self._colors(folder, times)
         kept = np.array([color is not None for color in colors]) if colors else np.ones(len(times), dtype=np.bool_)
         if not kept.any():
@@ -97,6 +99,11 @@ class Tum(FileDataset[TumOptions]):
             )
             for k in np.flatnonzero(kept)
         ]
+
+    def _list(self, folder: Path) -> str:
+        """The list of the images that make the frames."""
+        cast = self.options.surface is not None and not (folder / "depth.txt").is_file()
+        return "rgb.txt" if cast else "depth.txt"
 
     def _colors(self, folder: Path, times: npt.NDArray[np.float64]) -> list[Path | None]:
         """The colour image of each depth image; none at all where there is no rgb.txt."""

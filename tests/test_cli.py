@@ -28,6 +28,12 @@ def test_help_shows_the_options_and_the_commands(tmp_path) -> None:
         assert word in result.stdout
 
 
+def test_flags_take_no_value(tmp_path) -> None:
+    assert not [
+        command for command in ("", "relabel") if "<bool>" in bench(*command.split(), "--help", cwd=tmp_path).stdout
+    ]
+
+
 def test_help_imports_nothing_heavy(tmp_path) -> None:
     code = (
         "import sys; sys.argv = ['semstab-bench', '--help']\n"

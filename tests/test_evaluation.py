@@ -18,8 +18,7 @@ from records import record, study, voxels
 
 import semstab
 from semstab.engine import Observer, load_result, run_study
-from semstab.engine.units import make_plan
-from semstab.engine.work.memory import estimate
+from semstab.engine.work.memory import Kind
 from semstab.errors import ConfigError
 from semstab.metrics import sbd
 from semstab.model.voxels import Events, VoxelTable
@@ -167,12 +166,9 @@ def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=30)
-    plain, full = (configure(root, backends=["numba"], check=None, statistics=wanted) for wanted in (False, True))
-    (task,) = make_plan(plain).tasks
-    without, expected = estimate(task, plain), estimate(task, full)
+    without, expected = (Kind("numba", 3, logged=wanted).bytes(222, 30 * 48) for wanted in (False, True))
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
-    assert expected.observations == without.observations == 30 * 48
-    assert expected.bytes - without.bytes > held
+    assert expected - without > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):
         semstab.engine.run(configure(root, backends=["numba"], check=None, statistics=True, memory_gb=1e-6))
 

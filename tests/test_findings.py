@@ -147,6 +147,8 @@ def test_numbers_below_zero_are_said_the_other_way_round():
     against = dataclasses.replace(drifting((N, 2, 0.05), (N, 4, 0.02)), settling=below, disagreement=below)
     assert "; higher by 0.0100 (0.0050 to 0.0150) than in random order" in falling_drift(against).numbers
     assert more_disagreement(against).numbers.endswith("From OP=2 to OP>=3 PSA rises by 0.0100 (0.0050 to 0.0150).")
+    nothing = dataclasses.replace(against, settling=Estimate(-1e-6, -2e-5, 1e-4))
+    assert "; neither lower nor higher (0.0000 to 0.0001) than in random order" in falling_drift(nothing).numbers
 
 
 def test_sbd_that_rises_once_does_not_fall():

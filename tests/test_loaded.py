@@ -55,6 +55,7 @@ def test_series_and_events_of_a_unit(run):
 def test_what_a_notebook_shows(run):
     shown = run._repr_html_()
     assert "<td>scene</td><td>a</td><td>numpy</td>" in shown
+    assert f"<td>{run.result.records[0].statistics.verdict.level}</td></tr>" in shown
     assert shown == run.result._repr_html_()
     table = run.table(backbone="a")
     assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()

@@ -12,13 +12,13 @@ from posed_config import configure
 import semstab
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
-from semstab.engine.units import make_plan
+from semstab.engine.sizing import sized
+from semstab.engine.tiling.sights import look_at
+from semstab.engine.units import Plan, make_plan
 from semstab.engine.work import memory
-from semstab.engine.work.memory import estimate, require_memory
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.runtime.memory import available_bytes
-from semstab.task import Task, read
 
 FRAMES = 30
 
@@ -28,44 +28,46 @@ def root(tmp_path):
     return tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=FRAMES)
 
 
-def planned(root, **settings) -> tuple[Task, Config]:
+def planned(root, **settings) -> tuple[Plan, Config]:
     config = configure(root, **{"backends": ["open3d"], **settings})
-    return make_plan(config).tasks[0], config
+    return make_plan(config), config
 
 
-def test_the_estimate_is_exact_for_a_steady_flight(root) -> None:
-    task, config = planned(root)
+def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) -> None:
+    """From a sample of one in eight voxels; frames that see nothing new add observations only."""
+    root = tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=60)
+    plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.engine.run(config).runs[0].table
-    expected = estimate(task, config)
-    assert expected.voxels == table.voxels
-    assert expected.observations == table.observations
-
-
-def test_a_single_frame_has_an_estimate(root) -> None:
-    task, config = planned(root, frames={"count": 1})
-    assert estimate(task, config).voxels == tiny_scene.WIDTH * tiny_scene.HEIGHT
+    sights = look_at(plan.tasks[0], 0.05)
+    assert sights.voxels.sum() == pytest.approx(table.voxels, rel=0.3)
+    assert sights.observations.sum() == pytest.approx(table.observations, rel=0.3)
 
 
 def test_what_does_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) -> None:
-    _, config = planned(root, memory_gb=1e-6)
+    _, config = planned(root, memory_gb=1e-6, tile_size="off")
     said = r"wall, a: about .* million voxels of 0.25 m would take .* GB, and 1e-06 GB is memory_gb; use larger voxels"
-    with pytest.raises(ConfigError, match=said + r".*pixel_stride.*\(numpy\)"):
+    with pytest.raises(ConfigError, match=said + r".*pixel_stride.*\(numpy\).*off forbids to fuse it in tiles"):
         semstab.engine.run(config, out=tmp_path / "run")
     assert not (tmp_path / "run" / "voxels").exists()
 
 
-def test_the_limit_is_what_is_free_where_none_is_set(root, monkeypatch) -> None:
-    task, config = planned(root)
-    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
-    with pytest.raises(ConfigError, match="1e-06 GB are free"):
-        require_memory(task, config, read(task, 0))
+def test_what_does_not_fit_is_fused_in_tiles(root, tmp_path) -> None:
+    """The limit is what is free, where none is set."""
+    plan, config = planned(root)
+    assert not sized(config, plan.units, tmp_path).tilings
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory, "available_bytes", lambda: 1000)
+        sizing = sized(config, plan.units, tmp_path)
+    assert sizing.tilings.keys() == {each.identity for each in plan.units}
+    assert "1e-06 GB are there: fused in" in sizing.remarks[0]
 
 
-def test_no_further_frame_is_read_where_there_is_ample_room(root, monkeypatch) -> None:
-    task, config = planned(root)
-    first = read(task, 0)
-    monkeypatch.setattr(memory, "read", lambda *_: pytest.fail("a frame was read"))
-    require_memory(task, config, first)
+def test_no_further_frame_is_read_where_there_is_ample_room(root, tmp_path, monkeypatch) -> None:
+    plan, config = planned(root)
+    monkeypatch.setattr("semstab.engine.sizing.look_at", lambda *_: pytest.fail("frames were read"))
+    sizing = sized(config, plan.units, tmp_path)
+    assert not sizing.tilings
+    assert not sizing.refused
 
 
 def test_the_limit_changes_no_number_and_is_not_kept(root) -> None:

@@ -411,7 +411,7 @@ def test_a_room_is_cut_open_beneath_its_ceiling_and_a_wall_is_seen_from_the_side
     x, y = (index.ravel() for index in np.meshgrid(range(20), range(20)))
     floor, ceiling = np.stack([x, y, 0 * x], axis=1), np.stack([x, y, 0 * x + 15], axis=1)
     room = FromAbove.of(table_at(np.concatenate([floor, ceiling])), (0, 0, 1))
-    assert room.view.startswith("from above, cut open at")
+    assert room.view.startswith("cut open at")
     assert (room.table.iz == 0).all()
     assert FromAbove.of(table_at(floor), (0, 0, 1)).view == "from above"
     assert FromAbove.of(table_at(np.stack([x, 0 * x, y], axis=1)), (0, 0, 1)).view == "from the side"

@@ -658,7 +658,7 @@ def test_frames_have_colour_where_it_is_wanted(scene):
 
 def test_a_frame_that_is_asked_for_again_is_predicted_once(scene, monkeypatch):
     backbone = Shifting()
-    monkeypatch.setattr("semstab.predict.live.load_predictor", lambda config: backbone)
+    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: backbone)
     dataset = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options)
     opened = dataset.scene("flight")
     for index in (0, 1, 0, 1):
@@ -692,7 +692,7 @@ def test_runs_that_cannot_predict(scene, predictors, message):
 
 
 def test_regions_cannot_be_fused(scene, monkeypatch):
-    monkeypatch.setattr("semstab.predict.live.load_predictor", lambda config: Tiles())
+    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: Tiles())
     with pytest.raises(ConfigError, match="finds regions without classes, which cannot be fused"):
         run(live_config(scene, PREDICTOR))
 

@@ -175,7 +175,7 @@ def test_a_taxonomy_leaves_a_backbone_sequential():
 @pytest.fixture
 def live(monkeypatch):
     """Opens a scene whose labels an average predicts; all scenes of one dataset share the model."""
-    monkeypatch.setattr("semstab.predict.live.load_predictor", lambda config: Average())
+    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: Average())
 
     def open_it(root, name="flight", **settings):
         config = resolve(live_config(root, **settings))

@@ -34,6 +34,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import SERIES, Recording, background, looks, observer, tracker, voxel_maps
 from semstab.outputs.recording.entities import Clock
 from semstab.outputs.recording.layout import Scenery, direction, fit
+from semstab.outputs.recording.legend import LINE, Legend
 from semstab.outputs.recording.series import OF_THE_BACKBONE
 from semstab.task import Task
 
@@ -174,12 +175,30 @@ def test_the_final_voxels_are_those_of_the_run(run, backbone) -> None:
 
 
 def test_voxels_have_the_colours_of_the_legend(run) -> None:
+    """Of all classes at first; in the end of those in use, those with the most voxels first."""
     rows = read(run / "recording.rrd")
-    (legend,), (names,) = rows["/wall/legend"], rows["/wall/legend/names"]
-    assert names["Points2D:labels"] == ["wall", "door", "window"]
-    table = VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
-    expected = np.array(legend["Points2D:colors"])[metrics.dominant(table)]
-    np.testing.assert_array_equal(grid(rows, "/wall/map/a/numpy")["class"], expected)
+    assert rows["/wall/legend/names"][0]["Points2D:labels"] == ["wall", "door", "window"]
+    final, names = (rows[entity][-1] for entity in ("/wall/legend", "/wall/legend/names"))
+    colors = dict(zip(names["Points2D:labels"], final["Points2D:colors"], strict=True))
+    labels = {unit: metrics.dominant(VoxelTable.load(run / "voxels" / f"wall__{unit}__numpy.parquet")) for unit in "ab"}
+    used = np.bincount(np.concatenate([*labels.values()]), minlength=3)
+    assert names["Points2D:labels"] == [("wall", "door", "window")[k] for k in np.argsort(-used) if used[k]]
+    drawn = grid(rows, "/wall/map/a/numpy")["class"]
+    assert list(drawn) == [colors[("wall", "door", "window")[k]] for k in labels["a"]]
+
+
+@pytest.mark.parametrize("K", [41, 150])
+def test_the_legend_of_many_classes_is_two_lines_and_a_tab(K) -> None:
+    classes = LabelSpace("many", tuple(f"class number {k}" for k in range(K)))
+    legend = Legend([classes])
+    assert legend.size(whole=False)[1] <= 2 * LINE < legend.size(whole=True)[1]
+    legend.see(classes, np.array([7, 7, 3]))
+    assert [name for name, _ in legend.used] == ["class number 7", "class number 3"]
+    assert legend.shown == 2
+    assert not legend.is_whole  # the camera may see the others
+    legend.see(classes, np.arange(K))
+    assert 2 < legend.shown < K
+    assert not legend.is_whole
 
 
 def test_the_largest_sbd_has_the_last_colour() -> None:

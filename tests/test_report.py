@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import re
+from collections import Counter
 from html.parser import HTMLParser
 
 import pytest
@@ -21,7 +22,7 @@ from semstab.outputs.averages import ENOUGH, pooled
 from semstab.outputs.findings import findings
 from semstab.outputs.plots import figures
 from semstab.outputs.report import write_report
-from semstab.outputs.report.reading import reading
+from semstab.outputs.report.reading import reading, verdicts
 from semstab.outputs.tables import tables
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
@@ -135,7 +136,10 @@ def test_every_table_and_figure_stands_on_the_page(walls):
             for column, cell in zip(table.columns, row, strict=True):
                 printed = plain(column.text(cell)).replace("--", "\N{EN DASH}")
                 assert printed in text.replace("\N{MINUS SIGN}", "-")
-    assert {f"figure-{figure.name}" for figure in figures(result, folder)} <= ids
+    drawn = figures(result, folder)
+    assert {f"figure-{figure.name}" for figure in drawn} <= ids
+    for caption, times in Counter(plain(item.caption) for item in (*tables(result), *drawn)).items():
+        assert text.count(caption) >= times
 
 
 def test_rows_have_as_many_cells_as_the_table_has_columns(walls):
@@ -308,6 +312,7 @@ def test_the_reading_says_what_became_of_each_finding(walls):
 def test_the_reading_of_the_walls_says_their_numbers(walls):
     voxels_seen = pooled(walls[0].select())
     said = reading(walls[0], ())
+    assert said[:1] == verdicts(walls[0])
     assert said[0].startswith("Verdict on ")
     assert any(line.startswith(f"{voxels_seen.once:.0%} of the voxels were seen once.") for line in said)
     assert set(walls[0].scenes) == set(STEPS)

@@ -106,10 +106,19 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     whole = influence_sums(table, log, truth)
     part = influence_sums(rows_of(table, np.flatnonzero(kept)))
     assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean())
+    assert (coverage(whole, whole).low, coverage(whole, whole).high) == (1.0, 1.0)
     assert same_flight(whole, whole)
     assert not same_flight(whole, part)
-    assert identical(whole, whole.coarsened(2 * whole.edge, 1))
-    assert not identical(whole, influence_sums(table, log, 1 - truth))
+    other = influence_sums(table, log, 1 - truth)
+    assert identical(whole, other, "alpha")
+    assert not identical(whole, other, "accuracy")
+
+
+def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers():
+    table = (log := log_of(np.zeros((9, 1), dtype=int), index=grid(3))).table()
+    for given in (log, None):
+        sums = influence_sums(table, given, np.zeros(9, dtype=np.int64), sbd_excess=np.full(9, np.nan))
+        assert np.isnan([value(sums, key) for key in ("alpha", "miou", "ece", "sbd_excess")]).all()
 
 
 def test_at_most_so_many_cubes_and_groups_of_frames():

@@ -136,7 +136,7 @@ def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) 
     result = semstab.run(config, out=tmp_path / "run", report=False)
     size = result.advice["wide"].voxel_size
     assert size == checked.suggestion.voxel_size == result.select()[0].summary.table.voxel_size
-    assert f"voxels of {size:g} m: the smallest in which half of the points fall again" in printed(result)
+    assert f"Voxels of {size:g} m: the smallest in which half of the points fall again" in printed(result)
     assert read_yaml(tmp_path / "run" / "config.yaml")["voxel_size"] == size
     assert checked.persistence[1].voxel_size == size
 
@@ -145,9 +145,11 @@ def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0))
     assert not result.advice["wide"].chosen
     told = printed(result)
-    assert "voxels of 1 m: " in told
+    assert "oxels of 1 m: " in told
     assert "m would do, and tell apart what these blur" in told
     assert [size.voxel_size for size in result.select()[0].summary.sizes] == [0.5, 1, 2]
+    advice = dataclasses.replace(result.advice["wide"], voxel_size=result.advice["wide"].suggested)
+    assert "check suggests the same" in printed(dataclasses.replace(result, advice={"wide": advice}))
     assert "over voxel sizes, from 8 frames: alpha" in told
     assert "'background' is" in told
     assert "--set 'exclude.classes=[background]' leaves it out" in told

@@ -62,7 +62,8 @@ def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> No
     """A new one must be thought of."""
     selects = {"dataset", "scenes", "backbones", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
     plans = {"name", "description", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
-    elsewhere = {"check_geometry", "threads", "memory_gb"}
+    plans |= {"frame_quality"}  # with the label source that it compares with
+    elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size"}
     assert set(Config.model_fields) == selects | plans | elsewhere | set(IN_KEYS)
 
 
@@ -96,7 +97,7 @@ def test_bad_settings_are_one_line_that_names_the_setting(tmp_path, content, mes
 
 
 def test_the_shipped_studies_fit_together() -> None:
-    assert shipped_studies() == ("city", "uavid3d")
+    assert shipped_studies() == ("city", "remedies", "uavid3d")
     assert all(load_study(name).description for name in shipped_studies())
     grid = make_plan(resolve(load_study("city")))
     assert {cell.variation.sweep for cell in grid.units} == {

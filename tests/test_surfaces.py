@@ -12,7 +12,16 @@ import cv2
 import looking_down as down
 import numpy as np
 import pytest
-from dataset_writers import write_colmap, write_transforms
+from dataset_writers import (
+    write_colmap,
+    write_replica,
+    write_scannet,
+    write_semantic_nerf,
+    write_seven_scenes,
+    write_tartanair,
+    write_transforms,
+    write_tum,
+)
 from posed_config import configure, dataset_of
 from posed_scene import fails
 from posed_writer import write_posed
@@ -171,6 +180,41 @@ def test_other_datasets_need_no_depth_either(mesh, tmp_path) -> None:
         "trans"
     )
     np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        ("scannet", write_scannet, "depth"),
+        ("seven_scenes", write_seven_scenes, "*.depth.png"),
+        ("replica", write_replica, "results/depth*"),
+        ("replica", write_semantic_nerf, "depth"),
+        ("tartanair", write_tartanair, "depth_left"),
+        ("tum", write_tum, "depth*"),
+    ],
+    ids=lambda form: form[1].__name__,
+)
+def test_frames_are_listed_without_depth_files(form, mesh, tmp_path) -> None:
+    name, write, depth = form
+    frames = [down.frame(k) for k in range(3)]
+    names = write(tmp_path / "scene", frames)
+    for path in (tmp_path / "scene").glob(depth):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    fx, fy, cx, cy = down.K.fx, down.K.fy, down.K.cx, down.K.cy
+    camera = {} if name == "scannet" else {"intrinsics": [fx, fy, cx, cy]}
+    options = {
+        "root": tmp_path / "scene",
+        "surface": mesh,
+        "casts": False,
+        "intrinsics_size": (down.W, down.H),
+    } | camera
+    if name == "tum":
+        options["max_difference"] = 0.06
+    scene = open_dataset(name, options).scene("scene")
+    assert (len(scene), scene.missing(1)) == (len(names), [])
+    np.testing.assert_allclose(scene.depth(1), frames[1].depth, atol=2e-5)
+    with pytest.raises(DataError):
+        open_dataset(name, {"root": tmp_path / "scene"}).scene("scene")
 
 
 # --- what the images say ----------------------------------------------------------------------------------------------

@@ -1,4 +1,9 @@
-"""Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time."""
+"""Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time.
+
+Where a voxel's evidence is says `next` of its record: `ALONE`, of one class, in the record itself; from 0 on, more of
+it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row `DENSE - next`. Then the
+record holds the dominant class as its label, and the sum of p log2 p as its value.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,13 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared.beliefs import js_term, plogp
+from semstab.backends.shared.beliefs import js_term, observe_row, plogp
 from semstab.backends.shared.hashing import PARTITIONS, mix
 from semstab.backends.shared.prefetch import AHEAD, touch
 from semstab.model.results import RECURRENT
 from semstab.runtime.compiled import parallel, serial
+
+ALONE, DENSE = -1, -2
 
 SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
 
@@ -67,11 +74,36 @@ def rehash(old, new):
 
 
 @serial
+def begin(record, key, label, frame):
+    """A voxel that no frame has seen before."""
+    record.key, record.label, record.next = key, label, ALONE
+    record.value = record.drift_sum = record.self_sum = record.frame_entropy_sum = 0.0
+    record.pixels = record.op = 0
+    record.first_frame = record.last_frame = frame
+
+
+@serial
+def observe_dense(record, evidence, sums, pixels, out):
+    """Add one observation to a voxel with a dense row; see `observe_row`."""
+    observe_row(evidence, sums, pixels, record.op, record.label, np.float64(record.value), out)
+    record.label, record.value = np.uint16(out[4]), out[7]
+
+
+@serial
+def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out):
+    for e in range(first, last):
+        s[label[e]] = weight[e]
+    observe_dense(record, evidence, s, pixels, out)
+    for e in range(first, last):
+        s[label[e]] = 0.0
+
+
+@serial
 def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
     """Add one observation to a voxel that disagrees with itself, or with the frame.
 
-    s is work space (K,), all 0. Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, and
-    the dominant class before and after.
+    s is work space with room for K values, all 0. Leaves in `out` the change of VSS, that of the entropy in bits, the
+    drift in bits, and the dominant class before and after.
     """
     for e in range(first, last):
         s[label[e]] = weight[e] / pixels
@@ -136,7 +168,7 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
 
 @parallel
 def update(
-    key, pixels, start, label, weight, bounds, frame, K, row, slot, base, slots, records, nodes, ranges, sums,
+    key, pixels, start, label, weight, bounds, frame, row, slot, base, slots, records, nodes, dense, ranges, sums,
     drift_of, dominant_before, dominant_after,
 ):  # fmt: skip
     """Add the frame's observations; sums (PARTITIONS, 4): changes of VSS and entropy, drift, recurrent voxels.
@@ -144,8 +176,8 @@ def update(
     row, the last three: see `Changes`.
     """
     for p in nb.prange(PARTITIONS):
-        s = np.zeros(K)
-        out = np.zeros(5)
+        s = np.zeros(dense.shape[1])
+        out = np.zeros(8)
         own = ranges[p]
         vss = entropy = drift = 0.0
         reached = 0
@@ -154,34 +186,28 @@ def update(
             following = records[max(row[min(v + AHEAD // 2, bounds[p + 1] - 1)], 0)].next
             if following >= 0:
                 touch(nodes, np.int64(following))
+            elif following <= DENSE:
+                touch(dense.reshape(-1), np.int64(DENSE - following) * dense.shape[1])
             first, last = start[v], start[v + 1]
             r = row[v]
             if r < 0:
                 r = base[p] - r - 1
                 row[v] = r
                 slots[p, slot[v]].row = r
-                new = records[r]
-                new.key = key[v]
-                new.pixels = 0
-                new.drift_sum = 0.0
-                new.self_sum = 0.0
-                new.frame_entropy_sum = 0.0
-                new.value = 0.0
-                new.next = -1
-                new.op = 0
-                new.first_frame = frame
-                new.last_frame = frame
-                new.label = label[first]
+                begin(records[r], key[v], label[first], frame)
             record = records[r]
             op = record.op
-            if last - first == 1 and record.next < 0 and record.label == label[first]:
+            if last - first == 1 and record.next == ALONE and record.label == label[first]:
                 record.value += 1.0
                 record.self_sum += 1.0
                 vss += 1.0 if op == 0 else 0.0
                 drift_of[v] = 0.0
                 dominant_before[v] = dominant_after[v] = record.label
             else:
-                _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
+                if record.next <= DENSE:
+                    _observe_dense(record, dense[DENSE - record.next], s, label, weight, first, last, pixels[v], out)
+                else:
+                    _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
                 vss += out[0]
                 entropy += out[1]
                 drift += out[2]
@@ -204,10 +230,13 @@ def update(
 
 
 @parallel
-def unchain(records, nodes, order, evidence):
+def unchain(records, nodes, dense, order, evidence):
     """Evidence (n, K) of the records in that order."""
     for i in nb.prange(order.shape[0]):
         record = records[order[i]]
+        if record.next <= DENSE:
+            evidence[i] = dense[DENSE - record.next, : evidence.shape[1]]
+            continue
         evidence[i, record.label] = record.value
         at = np.int64(record.next)
         while at >= 0:
@@ -216,10 +245,13 @@ def unchain(records, nodes, order, evidence):
 
 
 @parallel
-def count_chain(records, nodes, order, count):
-    """How many classes the records in that order have seen: count[1:] of (n + 1,)."""
+def count_chain(records, nodes, dense, order, count):
+    """How many classes the records in that order have evidence of: count[1:] of (n + 1,)."""
     for i in nb.prange(order.shape[0]):
         at = np.int64(records[order[i]].next)
+        if at <= DENSE:
+            count[i + 1] = np.count_nonzero(dense[DENSE - at])
+            continue
         count[i + 1] = 1
         while at >= 0:
             count[i + 1] += 1
@@ -227,11 +259,18 @@ def count_chain(records, nodes, order, count):
 
 
 @parallel
-def read_chain(records, nodes, order, starts, label, weight):
+def read_chain(records, nodes, dense, order, starts, label, weight):
     """Evidence of the records in that order as entries, starts (n + 1,) being the first of each, ascending by class."""
     for i in nb.prange(order.shape[0]):
         last = starts[i]
         record = records[order[i]]
+        if record.next <= DENSE:
+            row = dense[DENSE - record.next]
+            for k in range(row.shape[0]):
+                if row[k] != 0.0:
+                    label[last], weight[last] = k, row[k]
+                    last += 1
+            continue
         label[last], weight[last] = record.label, record.value
         at = np.int64(record.next)
         while at >= 0:

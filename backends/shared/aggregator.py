@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import numba as nb
 import numpy as np
@@ -13,12 +13,14 @@ from semstab.backends.shared.association import INDEX_LIMIT, check_frame, voxel_
 from semstab.backends.shared.entries import find_entries
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
-from semstab.backends.shared.merging import HALVES, compact, group, merge_scores, scatter, sort_labels, sum_scores
-from semstab.backends.shared.observed import Observed, WorkSpace
-from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.merging import compact, group, scatter, sort_labels
+from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
+from semstab.backends.shared.pixel_keys import columns_of, frame_terms
+from semstab.backends.shared.scores import Scores
 from semstab.backends.shared.tiles import Tiles
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, fixed
+from semstab.model.labels import fixed
 
 BANDS = 64
 MIN_BAND_ROWS = 8
@@ -34,7 +36,6 @@ class _Found:
     """The entries (distinct pairs of voxel and label) of each band of `rows` rows; a band has `room` for them.
 
     key, label, count  (bands * room,) packed voxel, class and pixels of each
-    where              (H * W,) entry of each pixel within its band, where the evidence is soft
     entries            (bands,) how many there are
     spread             (bands, PARTITIONS) of them by partition
     """
@@ -44,45 +45,53 @@ class _Found:
     key: Int64
     label: npt.NDArray[np.uint16]
     count: npt.NDArray[np.int32]
-    where: npt.NDArray[np.int32]
     entries: Int64
     spread: Int64
 
 
 class Aggregator:
-    """Turns frames into observations; keeps its work space from frame to frame."""
+    """Turns frames into observations, of the voxels of an extent where one is given; keeps its work space."""
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
+        self.within = within
         self.origin: Int64 | None = None
         self._band_room = FIRST_ROOM
         self._space = WorkSpace()
-        self._tiles = Tiles(voxel_size, num_classes)
+        self._tiles = Tiles(voxel_size, num_classes, within)
+        self._scores = Scores(voxel_size, num_classes, within)
 
-    def observe(self, frame: Frame) -> Observed:
+    def observe(self, frame: Frame) -> Observed | ObservedScores:
         """The frame's observations; the first frame's camera sets the origin.
 
         Raises DataError for a label outside the classes, or a voxel out of reach of the packed keys.
         """
         origin = self._origin_at(frame) if self.origin is None else self.origin
-        seen = None if frame.scores is not None else self._tiles.observe(frame, origin)
-        if seen is None:  # soft evidence, or a frame that reaches too far for tiles
-            seen = self._merged(frame, self._found(frame, origin))
+        seen = self._seen(frame, origin)
         self.origin = origin
         return seen
+
+    def _seen(self, frame: Frame, origin: Int64) -> Observed | ObservedScores:
+        if frame.labels is not None:
+            seen = self._tiles.observe(frame, origin)
+            return self._merged(self._found(frame, origin)) if seen is None else seen
+        soft = self._scores.observe(frame, origin)
+        if soft is None:  # a pixel out of reach: does it have a prediction?
+            depth = np.where(frame.valid, frame.depth, np.float32(0))
+            soft = self._scores.observe(dataclasses.replace(frame, depth=depth), origin)
+        if soft is None:
+            raise out_of_reach(frame, origin, self.voxel_size)
+        return soft
 
     def _found(self, frame: Frame, origin: Int64) -> _Found:
         """The entries of each band of rows, with more room for them where the first attempt had too little."""
         space, (H, W) = self._space, frame.shape
         rows = max(MIN_BAND_ROWS, -(-H // BANDS))
         bands = -(-H // rows)
-        soft = frame.scores is not None
         camera = frame.intrinsics
         ray_x = (np.arange(W) - camera.cx) / camera.fx
         ray_y = (np.arange(H) - camera.cy) / camera.fy
-        labels = np.where(frame.valid, np.uint8(0), np.uint8(IGNORE_8BIT)) if soft else frame.labels
-        where = space.room("where", H * W if soft else 1, dtype=np.int32)
         threads = nb.get_num_threads()
         rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
         row_keys = space.room("row_keys", threads, 2, W)
@@ -97,20 +106,20 @@ class Aggregator:
             highest = np.full(bands, -1, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             find_entries(
-                fixed(frame.depth), fixed(labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-                rays, margin, IGNORE_8BIT if soft else frame.ignore_id, soft, rows, room, row_keys, row_changes,
-                row_runs, slots, key, label, count, where, entries, lost, highest, spread,
+                fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
+                columns_of(self.within, origin), rays, margin, frame.ignore_id, rows, room, row_keys, row_changes,
+                row_runs, slots, key, label, count, entries, lost, highest, spread,
             )  # fmt: skip
             if highest.max() >= self.num_classes:
                 check_frame(frame, self.num_classes)
             if lost.any():
                 raise out_of_reach(frame, origin, self.voxel_size)
             if entries.min() >= 0:
-                return _Found(rows, room, key, label, count, where, entries, spread)
+                return _Found(rows, room, key, label, count, entries, spread)
             self._band_room *= 4
 
-    def _merged(self, frame: Frame, at: _Found) -> Observed:
-        space, K = self._space, self.num_classes
+    def _merged(self, at: _Found) -> Observed:
+        space = self._space
         total = int(at.entries.sum())
         offset = np.zeros((PARTITIONS, len(at.entries)), dtype=np.int64)
         offset.reshape(-1)[1:] = np.cumsum(at.spread.T.reshape(-1))[:-1]
@@ -126,28 +135,19 @@ class Aggregator:
         bounds = np.concatenate([[0], np.cumsum(found)])
         n = int(bounds[-1])
         keys, pixels = space.room("keys", n), space.room("pixels", n)
-        if frame.scores is None:
-            out_label = space.room("out_label", total, dtype=np.uint16)
-            out_weight = space.room("out_weight", total, dtype=np.float64)
-            kept = np.zeros(PARTITIONS, dtype=np.int64)
-            sort_labels(at.label, at.count, order, edges, voxel, merged_size, found, out_label, out_weight, kept)
-            entry_bounds = np.concatenate([[0], np.cumsum(kept)])
-            m = int(entry_bounds[-1])
-            start = space.room("start", n + 1)
-            labels, weight = space.room("labels", m, dtype=np.uint16), space.room("weight", m, dtype=np.float64)
-            compact(
-                edges, bounds, entry_bounds, merged_key, merged_pixels, merged_size, out_label, out_weight,
-                keys, pixels, start, labels, weight,
-            )  # fmt: skip
-            return Observed(keys, pixels, start, labels, weight, bounds)
-        base = np.concatenate([[0], np.cumsum(at.entries)])
-        sums = np.zeros((total, K))
-        where = at.where[: frame.depth.size].reshape(frame.shape)
-        sum_scores(_readable(frame.scores), HALVES, where, at.rows, base, sums)
-        weights = np.zeros((n, K))
-        merge_scores(order, edges, voxel, bounds, at.room, base, sums, merged_key, merged_pixels, keys, pixels, weights)
-        start = np.arange(n + 1, dtype=np.int64) * K
-        return Observed(keys, pixels, start, np.tile(np.arange(K, dtype=np.uint16), n), weights.reshape(-1), bounds)
+        out_label = space.room("out_label", total, dtype=np.uint16)
+        out_weight = space.room("out_weight", total, dtype=np.float64)
+        kept = np.zeros(PARTITIONS, dtype=np.int64)
+        sort_labels(at.label, at.count, order, edges, voxel, merged_size, found, out_label, out_weight, kept)
+        entry_bounds = np.concatenate([[0], np.cumsum(kept)])
+        m = int(entry_bounds[-1])
+        start = space.room("start", n + 1)
+        labels, weight = space.room("labels", m, dtype=np.uint16), space.room("weight", m, dtype=np.float64)
+        compact(
+            edges, bounds, entry_bounds, merged_key, merged_pixels, merged_size, out_label, out_weight,
+            keys, pixels, start, labels, weight,
+        )  # fmt: skip
+        return Observed(keys, pixels, start, labels, weight, bounds)
 
     def index_of(self, key: Int64) -> Int64:
         """Voxel indices (n, 3) of packed keys."""
@@ -161,11 +161,6 @@ class Aggregator:
             voxel_index(frame.T_wc[:3, 3:], self.voxel_size, frame)
             raise out_of_reach(frame, origin, self.voxel_size)
         return origin.astype(np.int64)
-
-
-def _readable(scores: Any) -> Any:
-    """Half-precision scores as their bits."""
-    return fixed(scores).view(np.uint16) if scores.dtype == np.float16 else fixed(scores)
 
 
 def slots_for(entries: int) -> int:

@@ -9,12 +9,12 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import mix, partition_of
-from semstab.backends.shared.pixel_keys import keys_of_row
+from semstab.backends.shared.pixel_keys import keep_columns, keys_of_row
 from semstab.runtime.compiled import parallel, serial
 
 
 @serial
-def _runs(keys, labels, soft, changes, starts):
+def _runs(keys, labels, changes, starts):
     """First pixels of the runs of equal key and label in a row, closed by the row's length; returns how many runs.
 
     Two loops without branches, of which the first one vectorises: a run ends where nobody can predict it.
@@ -22,7 +22,7 @@ def _runs(keys, labels, soft, changes, starts):
     W = keys.shape[0]
     changes[0] = 1
     for u in range(1, W):
-        changes[u] = (keys[u] != keys[u - 1]) | ((labels[u] != labels[u - 1]) & (not soft))
+        changes[u] = (keys[u] != keys[u - 1]) | (labels[u] != labels[u - 1])
     n = 0
     for u in range(W):
         starts[n] = u
@@ -33,14 +33,14 @@ def _runs(keys, labels, soft, changes, starts):
 
 @parallel
 def find_entries(
-    depth, labels, ray_x, ray_y, T, size, origin, rays, margin, ignore, soft, rows, room, row_keys,
-    row_changes, row_runs, slots, key, label, count, where, entries, lost, highest, spread,
+    depth, labels, ray_x, ray_y, T, size, origin, columns, rays, margin, ignore, rows, room, row_keys,
+    row_changes, row_runs, slots, key, label, count, entries, lost, highest, spread,
 ):  # fmt: skip
     """Distinct (voxel, label) pairs of each band with their pixel counts, in order of appearance.
 
     Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
     """
-    H, W = depth.shape
+    H = depth.shape[0]
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
@@ -58,10 +58,12 @@ def find_entries(
             lost[band] += keys_of_row(
                 depth[v], labels[v], ray_x, ray_y[v], T, size, ox, oy, oz, ignore, rays, margin, keys
             )
-            runs = _runs(keys, labels[v], soft, changes, starts)
+            if columns.shape[0]:
+                keep_columns(keys, columns)
+            runs = _runs(keys, labels[v], changes, starts)
             n, mask = _enter_row(
-                labels[v], labels[v - 1], soft, keys, keys_above, runs, starts, runs_above, above, found, found_above,
-                slot, mask, key_of, label_of, count_of, n, where[v * W : (v + 1) * W],
+                labels[v], labels[v - 1], keys, keys_above, runs, starts, runs_above, above, found, found_above,
+                slot, mask, key_of, label_of, count_of, n,
             )  # fmt: skip
             if n < 0:
                 break
@@ -76,8 +78,8 @@ def find_entries(
 
 @serial
 def _enter_row(
-    labels, labels_above, soft, keys, keys_above, runs, starts, runs_above, above, found, found_above,
-    slot, mask, key, label, count, n, where,
+    labels, labels_above, keys, keys_above, runs, starts, runs_above, above, found, found_above,
+    slot, mask, key, label, count, n,
 ):  # fmt: skip
     """Enter the runs of a row; returns the band's entries then, -1 where it has no room, and the mask of its table.
 
@@ -89,13 +91,13 @@ def _enter_row(
         k = keys[u]
         e = np.int64(-1)
         if k >= 0:
-            lab = np.int64(0) if soft else np.int64(labels[u])
+            lab = np.int64(labels[u])
             if runs_above > 0:
                 while above[j + 1] <= u:
                     j += 1
-                if keys_above[u] == k and (soft or labels_above[u] == labels[u]):
+                if keys_above[u] == k and labels_above[u] == labels[u]:
                     e = np.int64(found_above[j])
-                elif keys_above[end - 1] == k and (soft or labels_above[end - 1] == labels[u]):
+                elif keys_above[end - 1] == k and labels_above[end - 1] == labels[u]:
                     while above[j + 1] < end:
                         j += 1
                     e = np.int64(found_above[j])
@@ -116,8 +118,6 @@ def _enter_row(
                     _refill(slot, mask, key, label, n)
             count[e] += end - u
         found[i] = e
-        if soft:
-            where[u:end] = e
     return n, mask
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numba.core import types
-from numba.extending import overload
 
 from semstab.backends.shared.hashing import PARTITIONS, mix, partition_of
-from semstab.runtime.compiled import compiled, parallel
+from semstab.backends.shared.prefetch import AHEAD, touch
+from semstab.runtime.compiled import parallel
 
 
 @parallel
@@ -37,6 +36,9 @@ def group(key, count, order, edges, voxel, out_key, out_pixels, out_size, found)
         slot = np.full(mask + 1, -1, dtype=np.int32)
         n = 0
         for i in range(low, high):
+            soon = order[min(i + AHEAD, high - 1)]
+            touch(key, soon)
+            touch(count, soon)
             k = key[order[i]]
             at = np.int64(mix(k) & np.uint64(mask))
             while slot[at] >= 0 and out_key[low + slot[at]] != k:
@@ -104,58 +106,3 @@ def compact(
             out_label[entry_bounds[p] + e] = label[low + e]
             out_weight[entry_bounds[p] + e] = weight[low + e]
     start[bounds[PARTITIONS]] = entry_bounds[PARTITIONS]
-
-
-def _value(score, halves):
-    """A score as a number; of half precision by its bits, since compiled code knows no such type."""
-
-
-@overload(_value)
-def _value_of(score, halves):  # noqa: ARG001 - it says by types what `_value` is
-    if isinstance(score, types.Integer):
-        return lambda score, halves: halves[score]
-    return lambda score, halves: np.float64(score)
-
-
-HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float64)
-"""The value of each half-precision number, by its bits."""
-
-
-@compiled(fastmath={"reassoc", "contract"})
-def _add_scores(scores, halves, values, sums):
-    """Add the scores (K,) of a pixel, scaled to sum 1."""
-    total = 0.0
-    for k in range(scores.shape[0]):
-        values[k] = _value(scores[k], halves)
-        total += values[k]
-    scale = 1.0 / total
-    for k in range(scores.shape[0]):
-        sums[k] += values[k] * scale
-
-
-@parallel
-def sum_scores(scores, halves, where, rows, base, sums):
-    """Add each pixel's normalised scores to its entry."""
-    H, W, K = scores.shape
-    for band in nb.prange(base.shape[0] - 1):
-        values = np.empty(K)
-        for v in range(band * rows, min(H, (band + 1) * rows)):
-            for u in range(W):
-                if where[v, u] >= 0:
-                    _add_scores(scores[v, u], halves, values, sums[base[band] + where[v, u]])
-
-
-@parallel
-def merge_scores(order, edges, voxel, bounds, stride, base, sums, key, pixels, out_key, out_pixels, weights):
-    """Add up the entries of each voxel."""
-    K = sums.shape[1]
-    for p in nb.prange(PARTITIONS):
-        low, first = edges[p], bounds[p]
-        for v in range(bounds[p + 1] - first):
-            out_key[first + v] = key[low + v]
-            out_pixels[first + v] = pixels[low + v]
-        for i in range(low, edges[p + 1]):
-            band = order[i] // stride
-            e = base[band] + order[i] - band * stride
-            for k in range(K):
-                weights[first + voxel[i], k] += sums[e, k]

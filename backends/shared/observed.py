@@ -31,6 +31,42 @@ class Observed:
     bounds: Int64
 
 
+@dataclass(frozen=True, eq=False)
+class ObservedScores:
+    """The observations of a frame as dense rows, grouped by partition; valid until the next frame is observed.
+
+    key     (n,) int64 packed voxel index, relative to the origin
+    pixels  (n,) int64 pixels in the voxel
+    row     (n,) int64 place of each voxel's first sum in `sums`
+    sums    float64, the sums of the voxels' normalised scores, K in a row; s_bar = sums / pixels
+    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
+    K       number of classes
+    """
+
+    key: Int64
+    pixels: Int64
+    row: Int64
+    sums: npt.NDArray[np.float64]
+    bounds: Int64
+    K: int
+
+    def rows(self, some: slice = np.s_[:]) -> npt.NDArray[np.float64]:
+        """The sums (n, K) of some voxels."""
+        sums: npt.NDArray[np.float64] = self.sums[self.row[some, None] + np.arange(self.K)]
+        return sums
+
+    def sparse(self) -> Observed:
+        """The same by entries, of which there are none for classes without evidence."""
+        sums = self.rows()
+        voxel, label = np.nonzero(sums)
+        start = np.searchsorted(voxel, np.arange(len(self.key) + 1))
+        return Observed(self.key, self.pixels, start, label.astype(np.uint16), sums[voxel, label], self.bounds)
+
+
+LINE = 64
+"""Bytes of a line of the cache: a vector that lies across two of them takes twice the time."""
+
+
 class WorkSpace:
     """Arrays that are kept from frame to frame, by name."""
 
@@ -41,5 +77,12 @@ class WorkSpace:
         """An array of that shape with whatever is in it."""
         size = int(np.prod(shape))
         if name not in self._arrays or len(self._arrays[name]) < size:
-            self._arrays[name] = np.empty(max(size, 1), dtype=dtype)
+            self._arrays[name] = _aligned(max(size, 1), np.dtype(dtype))
         return self._arrays[name][:size].reshape(shape)
+
+
+def _aligned(size: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """An array that begins with a line of the cache."""
+    room = np.empty(size * dtype.itemsize + LINE, dtype=np.uint8)
+    start = -room.ctypes.data % LINE
+    return room[start : start + size * dtype.itemsize].view(dtype)

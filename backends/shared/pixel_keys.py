@@ -82,6 +82,25 @@ def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, 
     return lost
 
 
+@serial
+def keep_columns(keys, columns):
+    """Take out, with -1, the keys outside of columns: lowest and highest but one of the first two coordinates."""
+    mask = 2 * HALF - 1
+    for u in range(keys.shape[0]):
+        i, j = keys[u] >> 42, (keys[u] >> 21) & mask
+        inside = (i >= columns[0]) & (i < columns[1]) & (j >= columns[2]) & (j < columns[3])
+        keys[u] = keys[u] if inside else -1
+
+
+def columns_of(within, origin):
+    """What `keep_columns` takes, of an extent or None: (4,), as packed keys count, or (0,) where all are kept."""
+    if within is None:
+        return np.zeros(0, dtype=np.int64)
+    (x0, y0), (x1, y1) = within.low, within.high
+    edges = np.array([x0, x1, y0, y1]) - np.repeat(origin[:2], 2) + HALF
+    return np.clip(edges, 0, 2 * HALF).astype(np.int64)
+
+
 def frame_terms(ray_x, T, size):
     """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of `keys_fused`.
 

@@ -72,6 +72,15 @@ def _words_of_row(depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, 
 
 
 @serial
+def _keep_columns(words, columns, corner):
+    """Take out the words outside of columns, given as packed keys count."""
+    for u in range(words.shape[0]):
+        i, j = ((words[u] >> 48) & 0xFFFF) + corner[0], ((words[u] >> 32) & 0xFFFF) + corner[1]
+        inside = (i >= columns[0]) & (i < columns[1]) & (j >= columns[2]) & (j < columns[3])
+        words[u] = words[u] if inside else -1
+
+
+@serial
 def _from_corner(key, corner):
     mask = 2 * HALF - 1
     return (key >> 42) - corner[0], ((key >> 21) & mask) - corner[1], (key & mask) - corner[2]
@@ -132,8 +141,8 @@ def _flush(table, table_count, word, count, n):
 
 @parallel
 def find_words(
-    depth, labels, ray_x, ray_y, T, size, origin, corner, rays, margin, ignore, room, row_word, row_keys, row_changes,
-    run_word, run_end, run, tables, table_counts, word, count, partition, entries, lost, spread, low, high,
+    depth, labels, ray_x, ray_y, T, size, origin, corner, columns, rays, margin, ignore, room, row_word, row_keys,
+    row_changes, run_word, run_end, run, tables, table_counts, word, count, partition, entries, lost, spread, low, high,
 ):  # fmt: skip
     """Entries of each band of ROWS rows: words with counts, some of them twice; their extent and spread by partition.
 
@@ -152,6 +161,8 @@ def find_words(
                 depth[y], labels[y], ray_x, ray_y[y], T, size, origin, corner, ignore, rays, margin, row_keys[thread],
                 row_word[thread],
             )  # fmt: skip
+            if columns.shape[0]:
+                _keep_columns(row_word[thread], columns, corner)
             _runs_of_row(row_word[thread], row_changes[thread], run_word[thread, v], run_end[thread, v])
             of_run[v] = begin[v] = 0
         own_word = word[band * room : (band + 1) * room]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.keys import HALF
 from semstab.backends.shared.observed import Observed, WorkSpace
-from semstab.backends.shared.pixel_keys import BLOCK, frame_terms
+from semstab.backends.shared.pixel_keys import BLOCK, columns_of, frame_terms
 from semstab.backends.shared.tile_loops import (
     COLUMNS,
     NEAR,
@@ -22,6 +22,7 @@ from semstab.backends.shared.tile_loops import (
     merge_words,
     scatter_words,
 )
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 
@@ -53,9 +54,10 @@ class _Found:
 class Tiles:
     """Observes labels; keeps its work space from frame to frame."""
 
-    def __init__(self, voxel_size: float, num_classes: int) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
+        self.within = within
         self._band_room = FIRST_ROOM
         self._space = WorkSpace()
 
@@ -81,8 +83,9 @@ class Tiles:
             low, high = np.zeros((bands, 4), dtype=np.int64), np.full((bands, 4), -1)
             find_words(
                 fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-                corner, rays, margin, frame.ignore_id, room, space.room("row_word", threads, W),
-                space.room("row_keys", threads, BLOCK), space.room("row_changes", threads, W, dtype=np.uint8),
+                corner, columns_of(self.within, origin), rays, margin, frame.ignore_id, room,
+                space.room("row_word", threads, W), space.room("row_keys", threads, BLOCK),
+                space.room("row_changes", threads, W, dtype=np.uint8),
                 space.room("run_word", threads, ROWS, W + 1),
                 space.room("run_end", threads, ROWS, W + 1, dtype=np.int32),
                 space.room("run", threads, 2, ROWS), tables, space.room("table_count", threads, TABLE, dtype=np.int32),

@@ -7,15 +7,18 @@ import sys
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
+from semstab.cli.comparing import compare
 from semstab.cli.conforming import conform
 from semstab.cli.data import check, convert, predict
 from semstab.cli.exporting import export, relabel
+from semstab.cli.gating import commit, gate
 from semstab.cli.interrupt import interruptible
 from semstab.cli.listing import list_
 from semstab.cli.options import say
+from semstab.cli.remedying import remedies
 from semstab.cli.running import run, study, view
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 from semstab.runtime.process import settle
@@ -23,8 +26,28 @@ from semstab.runtime.process import settle
 INTERRUPTED = 130
 
 
+def _without_kind(options: list[Any]) -> list[Any]:
+    """A flag takes no value: the help says no kind of it, as typer does."""
+    for option in options:
+        if getattr(option, "is_flag", False):
+            option.metavar = ""
+    return options
+
+
+class Command(TyperCommand):
+    """A command whose flags are shown as such."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Its parameters, and --help."""
+        return _without_kind(super().get_params(ctx))
+
+
 class Group(TyperGroup):
     """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The options that stand before the command, and --help."""
+        return _without_kind(super().get_params(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put `run` in front of bare options."""
@@ -85,19 +108,18 @@ def _version(value: bool) -> None:
 @app.callback()
 def root(
     version: Annotated[
-        bool, typer.Option("--version", metavar="", callback=_version, is_eager=True, help="Say the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
     ] = False,
 ) -> None:
     """Options that stand before the command."""
 
 
-for command, name in ((run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert")):
-    app.command(name)(command)
-app.command("export")(export)
-app.command("relabel")(relabel)
-app.command("conform")(conform)
-app.command("view")(view)
-app.command("list")(list_)
+for command, name in (
+    (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
+    (remedies, "remedies"), (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"),
+    (conform, "conform"), (view, "view"), (list_, "list"),
+):  # fmt: skip
+    app.command(name, cls=Command)(command)
 
 
 def main() -> None:

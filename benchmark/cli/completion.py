@@ -38,6 +38,12 @@ def _models(_: Any) -> Iterable[str]:
     return backbones.REGISTRY.entries()
 
 
+def _filters(_: Any) -> Iterable[str]:
+    from semstab.predict.filters import REGISTRY
+
+    return REGISTRY.entries()
+
+
 def _taxonomies(_: Any) -> Iterable[str]:
     from semstab.model.labels import shipped_taxonomies
 
@@ -73,5 +79,6 @@ def _sources(ctx: Any) -> Iterable[str]:
 
 
 backends, datasets, models = _beginning(_backends), _beginning(_datasets), _beginning(_models)
+filters = _beginning(_filters)
 taxonomies, studies = _beginning(_taxonomies), _beginning(_studies)
 scenes, label_sources = _beginning(_scenes), _beginning(_sources)

@@ -17,6 +17,7 @@ from semstab.cli.options import (
     DatasetName,
     DatasetOptions,
     DatasetSettings,
+    Filters,
     Frames,
     Quiet,
     Scenes,
@@ -66,7 +67,8 @@ def predict(
     mapping: Annotated[
         str | None, typer.Option(help="strict, or lenient: near classes count as well.", show_default="strict")
     ] = None,
-    scores: Annotated[bool, typer.Option("--scores", metavar="", help="Also keep soft scores.")] = False,
+    filters: Filters = None,
+    scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
     top_k: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")
     ] = None,
@@ -75,9 +77,7 @@ def predict(
         typer.Option("--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.options.KEY=VALUE."),
     ] = None,
     options: DatasetOptions = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", metavar="", help="Replace predictions of other settings.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a segmentation model over images; label maps go where `run` and `study` read them. Goes on where it was."""
@@ -98,7 +98,7 @@ def predict(
         chosen["dataset"].setdefault("options", {}).update(of_dataset)
     elif of_dataset:
         raise ConfigError("--option says how a dataset is read; choose one with --data or --dataset")
-    said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores}
+    said = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
     command.run(
         predictor={"backbone": backbone, **{key: value for key, value in said.items() if value is not None}},
         options=of_model,

@@ -12,6 +12,9 @@ from semstab.cli.options import Quiet
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
 Backbone = Annotated[str | None, typer.Option("--backbone", "-m", help="Label source; needed where there are several.")]
+CommitFile = Annotated[
+    Path | None, typer.Option("--commit", metavar="FILE", help="Only labels that `semstab-bench commit` vouches for.")
+]
 Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map; the run's first backend by default.")]
 
 
@@ -28,6 +31,7 @@ def export(
     ] = None,
     min_op: Annotated[int, typer.Option(min=1, help="Only voxels that so many frames saw.")] = 1,
     classes: Annotated[list[str] | None, typer.Option("--class", help="Only voxels of this class; repeatable.")] = None,
+    commit: CommitFile = None,
     cell: Annotated[int, typer.Option(min=1, help="Edge of a cell of .tif, in voxels.")] = 1,
     asprs: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML 'CLASS: CODE' for .las and .laz.")] = None,
     onto: Annotated[
@@ -46,7 +50,7 @@ def export(
     unit = {"scene": scene, "backbone": backbone, "backend": backend}
     written = write(
         run, to, **unit, measures=measure, min_op=min_op, classes=classes or (),
-        cell=cell, asprs=asprs, onto=onto, radius=radius,
+        commit=commit, cell=cell, asprs=asprs, onto=onto, radius=radius,
     )  # fmt: skip
     console = Console(quiet=quiet)
     for file in written:
@@ -66,6 +70,7 @@ def relabel(
     category: Annotated[
         list[str] | None, typer.Option(help="Keep pixels of voxels of this category alone; repeatable.")
     ] = None,
+    commit: CommitFile = None,
     leave_own_out: Annotated[
         bool, typer.Option("--leave-own-out", help="What the other frames say, without the frame's own vote.")
     ] = False,
@@ -78,8 +83,10 @@ def relabel(
     from semstab.convert.display import frame_bar
     from semstab.outputs.relabel import Belief
     from semstab.outputs.relabel import relabel as write
+    from semstab.statistics.commit import Commit
 
-    belief = Belief(min_op, min_psa, tuple(category or ()), leave_own_out)
+    thresholds = None if commit is None else Commit.load(commit)
+    belief = Belief(min_op, min_psa, tuple(category or ()), leave_own_out, thresholds)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(
             run, out, belief=belief, scene=scene, backbone=backbone, backend=backend, name=name, overwrite=overwrite,

@@ -9,19 +9,20 @@ if TYPE_CHECKING:
 
 
 def list_() -> None:
-    """Backends, datasets, backbones, taxonomies and studies, each with 'ready' or what to install."""
+    """Backends, datasets, backbones, filters, taxonomies and studies, each with 'ready' or what to install."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     from semstab import backbones, backends, datasets
     from semstab.model.labels import LabelSpace, shipped_taxonomies
+    from semstab.predict import filters
     from semstab.settings import load_study, shipped_studies
 
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "what it is"):
         table.add_column(name)
-    for registry in (backends.REGISTRY, datasets.REGISTRY, backbones.REGISTRY):
+    for registry in (backends.REGISTRY, datasets.REGISTRY, backbones.REGISTRY, filters.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
             table.add_row(registry.kind, name, _ready(registry, name), escape(entry.summary))
     for name in shipped_taxonomies():

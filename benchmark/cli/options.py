@@ -53,6 +53,15 @@ Classes = Annotated[
     str | None,
     typer.Option(metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them."),
 ]
+Filters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--filter",
+        metavar="NAME:NUMBER",
+        help="What steadies the labels: ema:0.6, vote:5, ... (`list`); repeatable, in this order.",
+        autocompletion=completion.filters,
+    ),
+]
 VoxelSize = Annotated[
     float | None, typer.Option(help="Edge of a voxel, metres.", show_default="what `check` suggests; city: 0.2")
 ]
@@ -60,7 +69,7 @@ Frames = Annotated[
     str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.", show_default="all")
 ]
 TrustGeometry = Annotated[
-    bool, typer.Option("--trust-geometry", metavar="", help="Fuse also where depth and poses contradict each other.")
+    bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
 ]
 Rerun = Annotated[
     str | None,
@@ -75,7 +84,15 @@ Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.
 Scheduler = Annotated[
     str | None, typer.Option(metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar="", help="Print nothing but errors.")]
+TileSize = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N|off",
+        help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse what does not fit in memory.",
+        show_default="where a map would not fit",
+    ),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 
 
 def selection(

@@ -18,6 +18,7 @@ from semstab.cli.options import (
     DataFolder,
     DatasetName,
     DatasetOptions,
+    Filters,
     Frames,
     Jobs,
     Quiet,
@@ -25,6 +26,7 @@ from semstab.cli.options import (
     Rerun,
     Scenes,
     Scheduler,
+    TileSize,
     TrustGeometry,
     VoxelSize,
     chosen,
@@ -42,6 +44,15 @@ if TYPE_CHECKING:
 
 
 DISAGREE = 3
+
+Models = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--predict",
+        metavar="NAME[,KEY=VALUE...]",
+        help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
+    ),
+]
 
 
 def run(
@@ -92,28 +103,20 @@ def run(
     ] = None,
     options: DatasetOptions = None,
     trust_geometry: TrustGeometry = False,
-    events: Annotated[
-        bool | None, typer.Option("--events", metavar="", help="Also write the log of observations.")
-    ] = None,
+    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
     statistics: Annotated[
         bool | None,
-        typer.Option(
-            "--statistics", metavar="", help="Also test drift, judge by ground truth, compare backbones; takes longer."
-        ),
+        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: Rerun = None,
     report: Report = "on",
     jobs: Jobs = 1,
     scheduler: Scheduler = None,
-    predict: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[,KEY=VALUE...]",
-            help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
-        ),
-    ] = None,
+    tile_size: TileSize = None,
+    predict: Models = None,
     classes: Classes = None,
+    filters: Filters = None,
     quiet: Quiet = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
@@ -128,14 +131,15 @@ def run(
         "events": events,
         "statistics": statistics,
         "check_geometry": False if trust_geometry else None,
+        "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
     }
     content = chosen(named, with_options(settings, options), dataset, data, frames, seed)
     if check in ("none", "off"):
         content["check"] = None
-    resolved = _load(config, content, predict or [], classes)
+    resolved = _load(config, content, predict or [], classes, filters or [])
     if device is not None:
         resolved = _on_device(resolved, device)
-    _execute(resolved, out or _default_out(), _executor(jobs, scheduler), rerun, report, quiet)
+    execute(resolved, out or _default_out(), executor_of(jobs, scheduler), rerun, report, quiet)
 
 
 def study(
@@ -170,7 +174,7 @@ def study(
     )
     if only is not None:
         config = config.only(only)
-    _execute(config, out or Path("studies") / slug(config.name), _executor(jobs, scheduler), rerun, report, quiet)
+    execute(config, out or Path("studies") / slug(config.name), executor_of(jobs, scheduler), rerun, report, quiet)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
@@ -195,12 +199,14 @@ def _why_no_recording(run: Path) -> str:
     return f"{run}: was not recorded (a study is only where it is asked for); {shown}start it again with --rerun FILE"
 
 
-def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
+def execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
     """Run it, say what was found, and end with the exit code that this calls for."""
     from rich.console import Console
 
     from semstab.api import run_study
     from semstab.outputs.progress import ProgressBar, failure_lines
+    from semstab.outputs.remedies import remedies
+    from semstab.outputs.remedies_text import print_remedies
     from semstab.outputs.terminal import print_summary
 
     if report not in ("on", "off"):
@@ -215,7 +221,9 @@ def _execute(config: Config, out: Path, executor: Executor, rerun: str | None, r
             say(f"error: {line}")
         if not quiet:
             console = Console()
-            if result.select():
+            if remedies(result):
+                print_remedies(result, console)
+            elif result.select():
                 print_summary(result, console)
             for line in _where(result, out, recording, report):
                 console.print(line, soft_wrap=True, markup=False, highlight=False)
@@ -249,7 +257,8 @@ def _where(result: Result, out: Path, recording: list[Recording], report: str) -
         yield f"recording: semstab-bench view {out if file == out / 'recording.rrd' else file}"
 
 
-def _executor(jobs: int, scheduler: str | None) -> Executor:
+def executor_of(jobs: int, scheduler: str | None) -> Executor:
+    """Where the work is done: here, in processes of this machine, on a cluster."""
     import logging
 
     from semstab.engine import DaskCluster, InProcess, LocalProcesses
@@ -263,19 +272,20 @@ def _executor(jobs: int, scheduler: str | None) -> Executor:
     return cluster
 
 
-def _load(path: Path | None, overrides: dict[str, Any], predict: list[str], classes: str | None) -> Config:
-    """The configuration; with models whose predictions take the place of the dataset's labels."""
-    if not predict:
-        if classes is not None:
-            raise ConfigError("--classes names what a model predicts; say which one with --predict")
-        from semstab.settings import load_config
+def _load(
+    path: Path | None, overrides: dict[str, Any], predict: list[str], classes: str | None, filters: list[str]
+) -> Config:
+    """The configuration; with models whose predictions take the place of the dataset's labels, or filters over them."""
+    from semstab.settings import filtered_config, load_config, predicted_config
 
-        return load_config(path, overrides)
-    from semstab.predict.predictor import parse_predictor
-    from semstab.settings import predicted_config
+    if predict:
+        from semstab.predict.predictor import parse_predictor
 
-    options = {} if classes is None else {"classes": classes}
-    return predicted_config([parse_predictor(text, options) for text in predict], path, overrides)
+        options = {} if classes is None else {"classes": classes}
+        return predicted_config([parse_predictor(text, options, filters) for text in predict], path, overrides)
+    if classes is not None:
+        raise ConfigError("--classes names what a model predicts; say which one with --predict")
+    return filtered_config(filters, path, overrides) if filters else load_config(path, overrides)
 
 
 def _on_device(config: Config, device: str) -> Config:

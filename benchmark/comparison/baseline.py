@@ -38,6 +38,7 @@ class Kept:
     image_space: ImageSpace
     georeference: Georeference | None
     up: tuple[float, float, float] | None
+    seed: int | None
     flicker: Mapping[int, float]
 
 
@@ -59,6 +60,7 @@ class _Scene:
     image_space: ImageSpace
     georeference: Georeference | None
     up: tuple[float, float, float] | None
+    seed: int | None
     frames: tuple[int, ...]
     flicker: tuple[float, ...]
 
@@ -75,7 +77,16 @@ def save_baseline(baseline: Baseline, path: str | Path, most: int) -> None:
     Raises DataError where even the coarsest are too many.
     """
     scenes = tuple(
-        _Scene(name, own.summary, own.image_space, own.georeference, own.up, (*own.flicker,), (*own.flicker.values(),))
+        _Scene(
+            name,
+            own.summary,
+            own.image_space,
+            own.georeference,
+            own.up,
+            own.seed,
+            (*own.flicker,),
+            (*own.flicker.values(),),
+        )
         for name, own in baseline.scenes.items()
     )
     content = {"kind": KIND, "schema": SCHEMA, **to_json(_Content(baseline.backbone, scenes))}
@@ -115,7 +126,12 @@ def load_baseline(path: str | Path) -> Baseline:
                 raise DataError(f"{path}: the sums of {scene.name} are damaged; write the summary again") from error
     kept = {
         own.name: Kept(
-            own.summary, own.image_space, own.georeference, own.up, dict(zip(own.frames, own.flicker, strict=False))
+            own.summary,
+            own.image_space,
+            own.georeference,
+            own.up,
+            own.seed,
+            dict(zip(own.frames, own.flicker, strict=False)),
         )
         for own in content.scenes
     }

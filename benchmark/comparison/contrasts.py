@@ -17,8 +17,11 @@ from semstab.comparison.quantities import (
     FLICKER,
     HEADLINES,
     IN_SUMS,
+    IOU,
     ONE_AGAINST_ALL,
+    PRECISION,
     REACHED,
+    RECALL,
     quantities,
 )
 from semstab.metrics import macro_mean
@@ -28,6 +31,7 @@ from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Q
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
 from semstab.statistics.comparison import LEAST_VOXELS
+from semstab.statistics.correctness import ACCURACY, MIOU
 from semstab.statistics.differences import holm
 from semstab.statistics.sampling import (
     InfluenceSums,
@@ -45,6 +49,12 @@ from semstab.statistics.sampling import (
     value,
 )
 from semstab.statistics.sampling.influence import columns_of, functional
+
+FORGIVING, DECIDED = (REACHED, ALPHA_BETWEEN), (ACCURACY, MIOU, RECALL, PRECISION, IOU)
+"""Measures that forgive what a score leaves open, and those of the fused labels alone."""
+
+OF_ANY_SIZE = (REACHED, *DECIDED)
+"""Measures that hardly depend on the size of voxels."""
 
 LEVEL = 0.05
 """Corrected p-value below which a difference is claimed."""
@@ -104,19 +114,29 @@ def _said(row: Contrast, p_holm: float, sign: float) -> Contrast:
 
 
 def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Contrast]:
+    before, after = base.sums.without_truth(), other.sums.without_truth()
     for quantity in IN_SUMS:
-        sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
-        yield from _row(quantity, sums[0], sums[number], common)
-    if _same_ceiling(base, other):
-        yield from _row(REACHED, base.sums.without_truth(), other.sums.without_truth(), common)
-    if common.basis != "flights":
-        yield _coverage(base.sums, other.sums)
-    if base.flicker and other.flicker:
+        if _comparable(quantity, common):
+            yield from _row(quantity, common.sums[0], common.sums[number], common)
+    if _comparable(REACHED, common) and _same_ceiling(base, other):
+        yield from _row(REACHED, before, after, common)
+    if common.basis != "flights" and not common.sizes_differ:
+        yield _coverage(before, after)
+    if base.flicker and (base.flicker.keys() == other.flicker.keys() or common.same_frames is False):
         yield _flicker(base.flicker, other.flicker, paired=common.same_frames is not False)
     done = {quantity.key for quantity in (*HEADLINES, *IN_SUMS)}
     for quantity in quantities():
-        if isinstance(quantity, Measure) and quantity.key not in done and common.tables:
+        if isinstance(quantity, Measure) and quantity.key not in done and common.tables and not common.mixed:
             yield _of_voxels(quantity, common.tables[0], common.tables[number], common.sums[0].edge)
+
+
+def _comparable(quantity: Quantity, common: Common) -> bool:
+    """Whether voxels of all sizes, other frames, and labels and scores gain alike by it, where they are compared."""
+    if (common.sizes_differ and quantity not in OF_ANY_SIZE) or (common.frames_differ and quantity is REACHED):
+        return False
+    if not common.mixed:
+        return True
+    return quantity not in FORGIVING if common.basis == "looks" else quantity in DECIDED
 
 
 def _row(
@@ -131,8 +151,6 @@ def _row(
 
 def _difference(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None, common: Common) -> Interval:
     question, number = _question(key, k, base, other), functional(key, k)
-    if base.truth != other.truth:
-        base, other = base.without_truth(), other.without_truth()
     if common.basis == "flights":
         return unpaired(estimate(other, key, k, question), estimate(base, key, k, question))
     if _same(base, other, key, k):
@@ -220,11 +238,10 @@ def _with_p_value(found: Interval) -> Interval:
 
 def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str], number: int) -> Iterator[Contrast]:
     for quantity in ONE_AGAINST_ALL:
-        sums = common.whole if quantity is ALPHA_BETWEEN else common.sums
-        before, after = sums[0], sums[number]
+        before, after = common.sums[0], common.sums[number]
         if quantity is REACHED:
             before, after = base.sums.without_truth(), other.sums.without_truth()
-        if quantity is REACHED and not _same_ceiling(base, other):
+        if not _comparable(quantity, common) or (quantity is REACHED and not _same_ceiling(base, other)):
             continue
         for k, name in enumerate(names):
             if _enough(before, k):
@@ -239,7 +256,7 @@ def _enough(sums: InfluenceSums, k: int) -> bool:
 
 def _of_places(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
     labels = class_of_places(common)
-    wanted = [quantity for quantity in BY_CLASS if quantity not in ONE_AGAINST_ALL]
+    wanted = [each for each in BY_CLASS if each not in ONE_AGAINST_ALL and _comparable(each, common)]
     for k, name in enumerate(names):
         where = labels == k
         if np.count_nonzero(where) < LEAST_VOXELS:

@@ -30,6 +30,7 @@ class Entry:
     where   the folder or the file that it is of
     record  what its folder has of it; None of a small summary, which holds no voxels
     up      the scene's up axis, where it is known
+    seed    of a simulated scene
     """
 
     where: Path
@@ -37,6 +38,7 @@ class Entry:
     image_space: ImageSpace
     georeference: Georeference | None
     up: tuple[float, float, float] | None
+    seed: int | None
     record: Record | None
     read_sums: Callable[[], InfluenceSums]
     read_flicker: Callable[[], Flicker]
@@ -108,7 +110,7 @@ def open_contender(named: str | Path) -> Contender:
 def shared_scenes(contenders: Sequence[Contender]) -> tuple[str, ...]:
     """The scenes that all have, in the order of the first one.
 
-    Raises DataError where there is none, or where the classes of one differ.
+    Raises DataError where there is none, where one was simulated with other seeds, or its classes differ.
     """
     first, *others = contenders
     scenes = tuple(scene for scene in first.scenes if all(scene in other.scenes for other in others))
@@ -120,6 +122,7 @@ def shared_scenes(contenders: Sequence[Contender]) -> tuple[str, ...]:
         )
     for scene in scenes:
         for other in others:
+            _require_same_scene(first.scenes[scene], other.scenes[scene])
             _require_same_classes(first.scenes[scene], other.scenes[scene])
     return scenes
 
@@ -127,7 +130,7 @@ def shared_scenes(contenders: Sequence[Contender]) -> tuple[str, ...]:
 def save_summary(contender: Contender, path: str | Path, most: int = 1_000_000) -> None:
     """Write all that a later comparison needs but voxels into one file of at most so many bytes."""
     kept = {
-        scene: Kept(own.summary, own.image_space, own.georeference, own.up, dict(own.flicker))
+        scene: Kept(own.summary, own.image_space, own.georeference, own.up, own.seed, dict(own.flicker))
         for scene, own in contender.scenes.items()
     }
     sums = {scene: own.sums for scene, own in contender.scenes.items()}
@@ -168,6 +171,7 @@ def _entry(folder: Path, result: Result, record: Record) -> Entry:
         record.image_space,
         result.georeference.get(scene),
         result.up.get(scene),
+        _seed(result),
         record,
         lambda: _sums(folder, record),
         lambda: _flicker(record.series),
@@ -200,12 +204,25 @@ def _of_baseline(path: Path, found: Baseline, backbone: str | None) -> Contender
     backbone = _backbone(path, [found.backbone], backbone)
     scenes = {
         scene: Entry(
-            path, own.summary, own.image_space, own.georeference, own.up, None,
+            path, own.summary, own.image_space, own.georeference, own.up, own.seed, None,
             functools.partial(found.sums.__getitem__, scene), functools.partial(dict, own.flicker),
         )
         for scene, own in found.scenes.items()
     }  # fmt: skip
     return Contender(backbone, path, backbone, scenes)
+
+
+def _seed(result: Result) -> int | None:
+    seed = result.manifest.get("seed")
+    return seed if isinstance(seed, int) else None
+
+
+def _require_same_scene(one: Entry, other: Entry) -> None:
+    if one.seed != other.seed:
+        raise DataError(
+            f"{one.where} and {other.where}: {one.unit.scene} was simulated with the seeds {one.seed} and {other.seed},"
+            " which make other scenes; run both with one --seed"
+        )
 
 
 def _require_same_classes(one: Entry, other: Entry) -> None:

@@ -30,8 +30,16 @@ NEAR = 1e-3
 FEW = 0.1
 """A part of a map's voxels below which it is said how few are in common."""
 
-BY_CUBES = "its numbers are compared by sums in the same cubes of space, each map with all its voxels, but not voxel by"
-BY_CUBES += " voxel: no list of places, no change of a voxel"
+BY_CUBES = (
+    "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
+)
+BY_CUBES += " left out: the places that got worse"
+OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size (alpha, PSA, VSS, SBD, coverage, ECE)"
+
+
+LOOKS_DECIDED = "labels stand beside scores: each look is reduced to its largest class; the share of the ceiling and"
+LOOKS_DECIDED += " alpha between frames, which forgive what a score leaves open, are left out"
+NOT_DECIDED = "labels stand beside scores, and common looks are not known: of agreement nothing can be compared"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,19 +47,21 @@ class Common:
     """Runs on a scene, as far as they can be held against each other.
 
     sums    of each run, of the common places; for `cubes` and `flights` of its whole map
-    whole   the same of soft scores, where `sums` has looks reduced to their largest class
+    mixed   whether labels stand beside scores
     tables  of the common places; none for `cubes` and `flights`
     logs    of these tables, where looks are in common
     label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
     looks   what the common looks are
-    maps    the whole maps, and truth that of the ground truth, where there are voxels
+    maps    where there are voxels: the whole maps if they were made of the same frames and are all of labels or all of
+            scores, else `tables`; and truth, the map of the ground truth
+    sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on looks
     same_frames  whether frames are paired; None where the sums tell
     """
 
     basis: Basis
     remarks: tuple[str, ...]
     sums: tuple[InfluenceSums, ...]
-    whole: tuple[InfluenceSums, ...]
+    mixed: bool = False
     tables: tuple[VoxelTable, ...] = ()
     logs: tuple[Events, ...] = ()
     label: Int64 | None = None
@@ -60,6 +70,8 @@ class Common:
     truth: VoxelTable | None = None
     coverage: tuple[MapCoverage, ...] = ()
     same_frames: bool | None = None
+    sizes_differ: bool = False
+    frames_differ: bool = False
 
     def among(self, where: npt.NDArray[np.bool_]) -> tuple[InfluenceSums, ...]:
         """The sums of some of the common places (n,)."""
@@ -71,11 +83,20 @@ class Common:
 
 def pair(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
+    found = _paired(entries, names)
+    mixed = len({entry.summary.reduced is None for entry in entries}) > 1
+    told = (LOOKS_DECIDED if found.basis == "looks" else NOT_DECIDED,) if mixed else ()
+    return replace(found, mixed=mixed, remarks=(*found.remarks, *told))
+
+
+def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     if remark := _other_frame_of_reference(entries):
         return _apart(entries, remark)
-    if remark := _other_voxels(entries):
-        own = tuple(entry.sums for entry in entries)
-        return Common("cubes", (remark,), own, own)
+    if len(sizes := {entry.summary.table.voxel_size for entry in entries}) > 1:
+        remark = OTHER_SIZES.format(sizes=" and ".join(f"{size:g} m" for size in sorted(sizes)))
+        return replace(_of_whole_maps("cubes", remark, entries), sizes_differ=True)
+    if remark := _no_voxels(entries):
+        return _of_whole_maps("cubes", remark, entries)
     records = [entry.with_voxels("a comparison by voxels") for entry in entries]
     maps = {name: record.table() for name, record in zip(names, records, strict=True)}
     covered = coverage(maps)
@@ -84,7 +105,7 @@ def pair(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     truth = _truth(records)
     found = _by_looks(records, maps, truth) or _by_voxels(maps, truth)
     remarks = (*found.remarks, *_remarks(covered))
-    return replace(found, remarks=remarks, maps=tuple(maps.values()), truth=truth, coverage=covered)
+    return replace(found, remarks=remarks, maps=found.maps or tuple(maps.values()), truth=truth, coverage=covered)
 
 
 # --- What is in common ------------------------------------------------------------------------------------------------
@@ -101,11 +122,14 @@ def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable], truth: Vox
     if not any(table.op.max(initial=0) >= 2 for table in tables):
         return None
     label = None if truth is None else join_truth(tables[0], truth).label
-    sums, whole = (
-        tuple(_sums(log.table(), log, label) for log in logs.values()) for logs in (shared.logs, shared.whole)
-    )
     logs = tuple(shared.logs.values())
-    return Common("looks", (), sums, whole, tables, logs, label, shared.found)
+    sums = tuple(_sums(table, log, label) for table, log in zip(tables, logs, strict=True))
+    remarks = _fewer_frames(there)
+    alike = not (remarks or shared.found.decided)
+    maps_apart = () if alike else tables
+    return Common(
+        "looks", remarks, sums, False, tables, logs, label, shared.found, maps_apart, frames_differ=bool(remarks)
+    )
 
 
 def _by_voxels(maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common:
@@ -114,13 +138,23 @@ def _by_voxels(maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common:
     label = None if truth is None else join_truth(tables[0], truth).label
     sums = tuple(_sums(table, None, label) for table in tables)
     remark = "the runs made other looks, of other frames: they are paired on voxels alone, for this map"
-    return Common("voxels", (remark,), sums, sums, tables, (), label, same_frames=False)
+    return Common("voxels", (remark,), sums, False, tables, (), label, same_frames=False)
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:
-    own = tuple(entry.sums for entry in entries)
     remark = f"{reason}: nothing can be paired; each map's own numbers stand beside each other"
-    return Common("flights", (remark,), own, own, same_frames=False)
+    return replace(_of_whole_maps("flights", remark, entries), same_frames=False)
+
+
+def _of_whole_maps(basis: Basis, remark: str, entries: Sequence[Entry]) -> Common:
+    """The sums of the runs' folders; of right and wrong only where all have them."""
+    sums = tuple(entry.sums for entry in entries)
+    without = [entry.where for entry in entries if not entry.sums.truth]
+    if 0 < len(without) < len(entries):
+        sums = tuple(own.without_truth() for own in sums)
+        untold = f"{without[0]} holds no ground truth (run it with --statistics): nothing about right and wrong"
+        return Common(basis, (remark, untold), sums)
+    return Common(basis, (remark,), sums)
 
 
 def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> InfluenceSums:
@@ -148,6 +182,19 @@ def _same_frames(looks: Sequence[Looks]) -> bool:
     return True
 
 
+def _fewer_frames(looks: Sequence[Looks]) -> tuple[str, ...]:
+    """Where not all of a run's frames are in the others."""
+    frames = [{view.frame for view in own.views} for own in looks]
+    both = len(frozenset.intersection(*map(frozenset, frames)))
+    listed = " and ".join(str(len(own)) for own in frames)
+    if both == max(map(len, frames)):
+        return ()
+    return (
+        f"of {listed} frames the {both} that all have are compared; the share of the ceiling and"
+        " flicker, which are of all, are left out",
+    )
+
+
 def _truth(records: Sequence[Record]) -> VoxelTable | None:
     """The map of the ground truth, of the first run that fused it."""
     files = [record.truth_file for record in records if record.truth_file is not None and record.truth_file.is_file()]
@@ -171,12 +218,8 @@ def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
     return ""
 
 
-def _other_voxels(entries: Sequence[Entry]) -> str:
+def _no_voxels(entries: Sequence[Entry]) -> str:
     """Why there are no voxels to pair; empty where there are."""
-    sizes = [entry.summary.table.voxel_size for entry in entries]
-    if len(set(sizes)) > 1:
-        listed = " and ".join(f"{size:g} m" for size in dict.fromkeys(sizes))
-        return f"voxels of {listed}: {BY_CUBES}"
     for entry in entries:
         if entry.record is None:
             return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"

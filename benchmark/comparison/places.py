@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +43,7 @@ SHARE, MOST_FRAMES = 0.8, 8
 class Changes:
     """Voxel by voxel, of those that both maps saw twice or more; 0 in a place's column: in none.
 
-    index   (n, 3), voxel_size metres
+    table   (n,) the base's voxels
     change  (n,) agreement between frames, the run's less the base's
     label   (n,) the class that both maps together give
     place   (n,) number of the place that got worse
@@ -51,8 +51,7 @@ class Changes:
     wrong_place  (n,) number of the place that is wrong now
     """
 
-    index: npt.NDArray[np.int32]
-    voxel_size: float
+    table: VoxelTable
     change: Float64
     label: Int64
     place: Int64
@@ -69,10 +68,16 @@ class Changes:
         """How many got better by as much."""
         return int(np.count_nonzero(self.change >= WORSE))
 
-    def columns(self) -> dict[str, npt.NDArray[np.generic]]:
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
         """By name, as a file has them."""
-        ix, iy, iz = self.index.T
-        found = {"ix": ix, "iy": iy, "iz": iz, "change": self.change, "place": self.place.astype(np.int32)}
+        table = self.table
+        found: dict[str, npt.NDArray[Any]] = {
+            "ix": table.ix,
+            "iy": table.iy,
+            "iz": table.iz,
+            "change": self.change,
+            "place": self.place.astype(np.int32),
+        }
         if self.right is not None and self.wrong_place is not None:
             found |= {"right_change": self.right.astype(np.int8), "wrong_place": self.wrong_place.astype(np.int32)}
         return found
@@ -89,9 +94,7 @@ class Worse:
 
 def worse_places(common: Common, truth: VoxelTable | None, number: int) -> Worse:
     """Of a run against the base; the frames to blame are known where the looks were kept."""
-    decided = common.looks is not None and common.looks.decided  # labels beside scores: their maps do not compare
-    own = common.tables if decided else common.maps
-    maps = (own[0], own[number])
+    maps = (common.maps[0], common.maps[number])
     rows = shared_rows(*maps)
     again = (maps[0].op[rows[0]] >= 2) & (maps[1].op[rows[1]] >= 2)
     base, other = (table.rows(kept[again]) for table, kept in zip(maps, rows, strict=True))
@@ -112,7 +115,7 @@ def worse_places(common: Common, truth: VoxelTable | None, number: int) -> Worse
         listed += _places(
             "truth", wrong_place, wrong_rivals, -right.astype(float), index, base.voxel_size, true, names, looks
         )
-    changes = Changes(index, base.voxel_size, change, label, place, right, wrong_place)
+    changes = Changes(base, change, label, place, right, wrong_place)
     blamed = () if looks is None else _blamed(looks.among(place > 0, label))
     return Worse(tuple(listed), blamed, changes)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from semstab.model.measures import ENTROPY, SBD, VSS, Quantity, measures
+from collections.abc import Mapping, Sequence
+
+from semstab.model.measures import ENTROPY, VSS, Quantity, measures
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 
@@ -35,10 +37,13 @@ def quantities() -> tuple[Quantity, ...]:
     return (*HEADLINES, *(measure for measure in measures() if measure is not VSS))
 
 
+def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
+    """The same by their keys."""
+    return {quantity.key: quantity for quantity in chosen}
+
+
 IN_SUMS = (ALPHA_BETWEEN, ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
 """Of these the sums by frame and place tell all."""
 
 ONE_AGAINST_ALL = (VERDICT, ALPHA_BETWEEN, ALPHA, RECALL, PRECISION, IOU)
 """By class: of that class against all others; the rest is of the places of that class."""
-
-__all__ = ["BY_CLASS", "HEADLINES", "IN_SUMS", "ONE_AGAINST_ALL", "SBD", "VERDICT", "quantities"]

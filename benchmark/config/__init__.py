@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
@@ -44,6 +44,9 @@ SHARED = "shared_taxonomy"
 
 BACKENDS = "backends"
 """The base units fused by the other backends."""
+
+LEAST_TILE = 8
+"""Voxels along the edge of the smallest tiles."""
 
 SAMPLE = "sample"
 """The check that follows a random set of voxels, not all of them."""
@@ -139,6 +142,9 @@ class Config(Settings):
         description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
         " other; keeps every observation, fuses the ground truth too",
     )
+    frame_quality: bool = Field(
+        False, description="also judge each frame's labels: right, foreseen, late; `remedies` does"
+    )
     critical_classes: list[str] = Field(
         default_factory=list,
         description="classes that the verdict depends on; all that have enough places where none is named",
@@ -152,6 +158,12 @@ class Config(Settings):
         le=1e9,
         exclude=True,
         description="memory that maps may take, GB; what is free where not given; not kept",
+    )
+    tile_size: int | Literal["off"] | None = Field(
+        None,
+        exclude=True,
+        description="edge of a tile, voxels, a power of 2: maps are fused tile by tile; where not given, only those"
+        " that would not fit, in tiles of a chosen size; off: such a map is refused; not kept",
     )
     check_geometry: bool = Field(
         True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
@@ -220,6 +232,18 @@ class Config(Settings):
     def _regions_are_not_fused(cls, value: list[str], info: ValidationInfo) -> list[str]:
         if both := [name for name in value if name in (info.data.get("backbones") or ())]:
             raise ValueError(f"'{both[0]}' is named among the backbones too; use one of the two")
+        return value
+
+    @field_validator("tile_size", mode="before")
+    @classmethod
+    def _off_is_no_switch(cls, value: Any) -> Any:
+        return "off" if value is False else value  # YAML reads the bare word so
+
+    @field_validator("tile_size")
+    @classmethod
+    def _a_power_of_two(cls, value: int | str | None) -> int | str | None:
+        if isinstance(value, int) and (value < LEAST_TILE or value & (value - 1)):
+            raise ValueError(f"use a power of 2 from {LEAST_TILE}, or off")
         return value
 
     @field_validator("strata")

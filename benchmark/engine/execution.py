@@ -19,11 +19,14 @@ from semstab.engine.evaluation import comparison
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
+from semstab.engine.sizing import Sizing, sized
+from semstab.engine.tiled_unit import TiledUnit
+from semstab.engine.tiling.partition import Tiling
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan, must_agree
 from semstab.engine.work.executors import Executor, InProcess
-from semstab.engine.work.jobs import Job, Request, split
+from semstab.engine.work.jobs import Job, Outcome, Request, split
 from semstab.engine.work.passes import lend
-from semstab.errors import DataError
+from semstab.errors import ConfigError, DataError
 from semstab.metrics import compare
 from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
 from semstab.model.results import Agreement, VoxelAdvice
@@ -152,8 +155,23 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
         with watch("check"):
             found.geometry, found.advice = _checked(plan.config, missing, told)
     with folder.started() as start, lend(start, plan.scenes):
-        _work_off(plan, folder, start, executor, told, found, missing)
+        with watch("sizing"):
+            sizing = sized(plan.config, missing, folder.path, executor.width)
+        for line in sizing.remarks:
+            told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
+        _refuse(sizing, missing, found, executor, told)
+        fitting = [each for each in missing if each.identity not in sizing.refused]
+        _work_off(plan, folder, start, executor, told, found, fitting, sizing.tilings)
     return found
+
+
+def _refuse(sizing: Sizing, missing: Sequence[Planned], found: _Found, executor: Executor, told: Observers) -> None:
+    """Those that do not fit fail, and the others go on."""
+    for each in missing:
+        if (error := sizing.refused.get(each.identity)) is not None:
+            found.errors[each.identity] = error
+            found.causes.setdefault(error, ConfigError(error))
+            _tell_done(each, error, executor, told)
 
 
 def _work_off(
@@ -164,28 +182,52 @@ def _work_off(
     told: Observers,
     found: _Found,
     missing: Sequence[Planned],
+    tilings: Mapping[str, Tiling],
 ) -> None:
     """What is missing, kept as it finishes."""
     units = {each.identity: each for each in missing}
+    whole = [each for each in missing if each.identity not in tilings]
+    in_tiles = {
+        each.identity: TiledUnit(each, tilings[each.identity], folder)
+        for each in missing
+        if isinstance(each, PlannedUnit) and each.identity in tilings
+    }
     factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
-    jobs = split(_jobs(plan.config, folder.path, start, missing, factories), executor.width)
+    requests = [request for tiled in in_tiles.values() for request in tiled.missing()]
+    jobs = split(_jobs(plan.config, folder.path, start, whole, factories), executor.width)
+    jobs += _portion_jobs(plan.config, folder.path, start, requests, units)
+    kept = (tiled.take(None) for tiled in in_tiles.values())
     with contextlib.closing(executor.run(jobs, told)) as finished:
-        for outcome in (outcome for _, outcomes in finished for outcome in outcomes):
-            each = units[outcome.identity]
-            if outcome.content is not None:
-                content = dataclasses.replace(outcome.content, advice=found.advice.get(each.unit.scene))
-                outcome = dataclasses.replace(outcome, content=content)  # noqa: PLW2901
-                with found.watch("keep"):
-                    folder.save(outcome)
-                found.contents[outcome.identity] = content
-            else:
-                found.errors[outcome.identity] = outcome.error or ""
-                folder.save_trace(outcome)
-                if outcome.cause is not None:
-                    found.causes.setdefault(outcome.error or "", outcome.cause)
+        done = (outcome for _, outcomes in finished for outcome in outcomes)
+        for outcome in itertools.chain((outcome for outcome in kept if outcome is not None), done):
+            each, tiled = units[outcome.identity], in_tiles.get(outcome.identity)
+            ended: Outcome | None = outcome
             for stage, seconds in outcome.seconds.items():
                 found.watch.seconds[stage] += seconds
-            _tell_done(each, outcome.error, executor, told)
+            if tiled is not None and outcome.portion is not None:
+                told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
+                ended = tiled.take(outcome)
+            if ended is not None and ended.identity not in found.errors:
+                _keep(folder, found, each, ended)
+                if tiled is not None and ended.content is not None:
+                    _tell_assembled(tiled, ended.content, told)
+                _tell_done(each, ended.error, executor, told, counted=tiled is not None)
+
+
+def _keep(folder: Folder, found: _Found, each: Planned, outcome: Outcome) -> None:
+    """A finished unit, or why it failed."""
+    if outcome.content is not None:
+        content = dataclasses.replace(outcome.content, advice=found.advice.get(each.unit.scene))
+        with found.watch("keep"):
+            folder.save(dataclasses.replace(outcome, content=content))
+            if isinstance(each, PlannedUnit):
+                folder.clear(each, content.files)
+        found.contents[outcome.identity] = content
+        return
+    found.errors[outcome.identity] = outcome.error or ""
+    folder.save_trace(outcome)
+    if outcome.cause is not None:
+        found.causes.setdefault(outcome.error or "", outcome.cause)
 
 
 def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers) -> None:
@@ -197,8 +239,14 @@ def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers)
             told.tell(lambda observer, task=task, summaries=summaries: observer.group_kept(task, summaries))  # type: ignore[misc]
 
 
-def _tell_done(each: Planned, error: str | None, executor: Executor, told: Observers) -> None:
-    if executor.elsewhere or not isinstance(each, PlannedUnit):
+def _tell_assembled(tiled: TiledUnit, content: UnitContent, told: Observers) -> None:
+    summary, planned = content.summary, tiled.planned
+    if planned.kept and summary is not None:
+        told.tell(lambda observer: observer.unit_assembled(planned.task, summary))
+
+
+def _tell_done(each: Planned, error: str | None, executor: Executor, told: Observers, *, counted: bool = False) -> None:
+    if not counted and (executor.elsewhere or not isinstance(each, PlannedUnit)):
         what = f"{each.unit.scene} · {each.unit.backbone}"
         told.tell(lambda observer: observer.advanced(each.frames, what))
     told.tell(lambda observer: observer.unit_done(each, error))
@@ -238,6 +286,17 @@ def _jobs(
     return [
         Job(scene, backbone, tuple(requests), start, folder, config.threads, memory, tuple(observers))
         for (scene, backbone), requests in sequences.items()
+    ]
+
+
+def _portion_jobs(
+    config: Config, folder: Path, start: str, requests: Sequence[Request], units: Mapping[str, Planned]
+) -> list[Job]:
+    """A job each, so that no two maps are in memory at once."""
+    memory = None if config.memory_gb is None else config.memory_gb * GB
+    named = [(units[request.identity].unit, request) for request in requests]
+    return [
+        Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory) for unit, request in named
     ]
 
 

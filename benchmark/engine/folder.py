@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import glob
 import hashlib
 import logging
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import yaml
 
 from semstab.config import Config, read_yaml
 from semstab.datasets.formats.disk import file_digest
+from semstab.engine.tiling.portion import PORTIONS, Finished
+from semstab.engine.tiling.sights import SIGHTS
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.jobs import Outcome, shared_marker
 from semstab.errors import ConfigError, DataError
@@ -55,7 +59,7 @@ LAYOUT = "# semstab, folder layout 3"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, PORTIONS, SIGHTS, "tables", "figures")
 """Folders into which files are written."""
 
 
@@ -117,6 +121,33 @@ class Folder:
                 temporary.write_bytes(file)
         key = unit_key(outcome.identity, outcome.content.input)
         write_json(self.path / UNITS / f"{key}.json", outcome.content)
+        shutil.rmtree(self.path / PORTIONS / key, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            (self.path / PORTIONS).rmdir()  # where nothing of other units is left
+
+    def save_portion(self, outcome: Outcome) -> None:
+        """Keep a finished portion of a unit in tiles; its own file comes last, and says that the others are there."""
+        for name, file in outcome.files.items():
+            with atomic_path(self.path / name) as temporary:
+                temporary.write_bytes(file)
+
+    def portion(self, key: str, name: str) -> Finished | None:
+        """What an earlier start left of a portion, if its files are there as they were."""
+        try:
+            found = Finished.load(self.path / PORTIONS / key / f"{name}.npz")
+        except (OSError, ValueError, LookupError, EOFError, BadZipFile, DataError):
+            return None
+        return found if self._are_whole(found.about.files) else None
+
+    def clear(self, planned: PlannedUnit, keep: Collection[str]) -> None:
+        """Remove what was left of a unit's voxels, a file or tiles, but for these files."""
+        slug = planned.unit.slug
+        tiles = self.path.glob(f"{VOXELS}/{glob.escape(slug)}/*.parquet")
+        for file in (self.path / f"{VOXELS}/{slug}.parquet", *tiles):
+            if planned.kept and file.relative_to(self.path).as_posix() not in keep:
+                file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            (self.path / VOXELS / slug).rmdir()  # where it is empty
 
     def save_trace(self, outcome: Outcome) -> None:
         """Keep where a unit's error was raised, for who mends it: failures.log of this start."""
@@ -127,13 +158,15 @@ class Folder:
     def record(self, planned: PlannedUnit, content: UnitContent) -> Record:
         """The record of a unit from the content of its file."""
         assert content.summary is not None
+        voxels = f"{VOXELS}/{planned.unit.slug}" + ("" if _in_tiles(planned.unit, content) else ".parquet")
         truth = self.path / f"{TRUTH}/{planned.unit.slug}.parquet"
         return Record(
             key=unit_key(planned.identity, content.input),
             variation=planned.variation,
             summary=content.summary,
             image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
-            voxels_file=self.path / VOXELS / f"{planned.unit.slug}.parquet" if planned.kept else None,
+            quality=content.quality if planned.image_space else None,
+            voxels_file=self.path / voxels if planned.kept else None,
             truth_file=truth if planned.image_space and f"{TRUTH}/{truth.name}" in content.files else None,
         )
 
@@ -150,7 +183,8 @@ class Folder:
         """A name for this start, by which workers know the folder while the block lasts."""
         start = uuid.uuid4().hex
         for name in WRITTEN:
-            remove_leftovers(self.path / name)
+            for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
+                remove_leftovers(folder)
         shutil.rmtree(self.path / RECORDING_PARTS, ignore_errors=True)
         (self.path / FAILURES).unlink(missing_ok=True)
         marker = shared_marker(self.path, start)
@@ -168,22 +202,30 @@ class Folder:
                 not planned.judged or (content.summary is not None and content.summary.statistics is not None)
             )
             has = has and (content.checked is not None or not planned.sampled)
-            wanted = self._wanted(planned)
+            wanted = self._wanted(planned, content)
         else:
             has, wanted = content.regions is not None, []
-        paths = {name: self.path / name for name in wanted}
-        return has and all(
-            path.exists() and file_digest(path).hex() == content.files.get(name) for name, path in paths.items()
-        )
+        return has and self._are_whole({name: content.files.get(name) for name in wanted})
 
-    def _wanted(self, planned: PlannedUnit) -> list[str]:
+    def _are_whole(self, files: Mapping[str, str | None]) -> bool:
+        """Whether files are there, with these digests."""
+        paths = {self.path / name: digest for name, digest in files.items()}
+        return all(path.exists() and file_digest(path).hex() == digest for path, digest in paths.items())
+
+    def _wanted(self, planned: PlannedUnit, content: UnitContent) -> list[str]:
         unit: Unit = planned.unit
-        wanted = [f"{VOXELS}/{unit.slug}.parquet", f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
+        voxels = _in_tiles(unit, content) or [f"{VOXELS}/{unit.slug}.parquet"]
+        wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
         if planned.kept and planned.judged:
             wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and planned.logged:
             wanted.append(f"{EVENTS}/{unit.slug}.parquet")
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
+
+
+def _in_tiles(unit: Unit, content: UnitContent) -> list[str]:
+    """The files of the unit's tiles, where it has any."""
+    return [name for name in content.files if name.startswith(f"{VOXELS}/{unit.slug}/")]
 
 
 def unit_key(identity: str, digest: str) -> str:

@@ -37,6 +37,9 @@ class Observer:
     def group_kept(self, task: Task, summaries: Sequence[UnitSummary]) -> None:
         """These base units of a backbone on a scene were found finished."""
 
+    def remarked(self, line: str) -> None:
+        """Something is done otherwise than usual: a map that would not fit is fused in tiles."""
+
     def group_started(self, task: Task, config: Config) -> None:
         """The task's frames are fused from now on, by those of its backends that are not kept; `config` is a unit's."""
 
@@ -48,6 +51,12 @@ class Observer:
 
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """A frame went into the maps of all units of the task."""
+
+    def frame_seen(self, task: Task, frame: Frame) -> None:
+        """A frame of a map in tiles was looked at; the tiles are fused by themselves."""
+
+    def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
+        """All tiles of a unit's map are in the folder, and measured."""
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """All frames went into a unit's map, which is measured and written next."""

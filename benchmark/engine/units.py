@@ -323,14 +323,14 @@ def _check_count(variation: Variation, task: Task) -> None:
 
 def identity(config: Config, task: Task) -> str:
     """Hash of the settings that a unit's numbers depend on, beside its input."""
-    mapping = task.mapping
+    mapping, beside = task.mapping, task.scene.filtering(task.backbone)
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
         "frames": task.indices,
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    return _hash(config, content)
+    return _hash(config, content | ({"beside": beside.model} if config.frame_quality else {}))
 
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:

@@ -3,6 +3,7 @@
 from semstab.metrics.agreement import compare
 from semstab.metrics.category import CATEGORIES, CATEGORY_COLORS, CategoryThresholds, categories, category_shares
 from semstab.metrics.flicker import CompensatedFlicker, compensated_flicker, flicker_percent
+from semstab.metrics.frame_quality import FrameJudge
 from semstab.metrics.regions import RegionChange, matched_region_flicker
 from semstab.metrics.summary import macro_mean, pool, split_last, strata, summarise
 from semstab.metrics.video import SelfConsistency, VideoConsistency
@@ -13,6 +14,7 @@ __all__ = [
     "CATEGORY_COLORS",
     "CategoryThresholds",
     "CompensatedFlicker",
+    "FrameJudge",
     "RegionChange",
     "SelfConsistency",
     "VideoConsistency",

@@ -6,11 +6,12 @@ import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.measures import Float64, Int32, Measure, MeasureMeans, chunks, dominant, mean, measures
+from semstab.model.measures import Float64, Int32, MeasureMeans, chunks, dominant, mean, measures
 from semstab.model.results import RECURRENT, Means, TableSummary
 from semstab.model.voxels import VoxelTable
 
@@ -30,66 +31,104 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     edges are the strata's upper bounds of OP, ascending; a last stratum holds what lies above. Each mean runs over the
     voxels where its measure is defined; over no voxel it is NaN.
     """
-    K, names = table.K, table.classes or tuple(str(k) for k in range(table.K))
-    by_stratum, by_class, by_recurrence = _Sums(len(edges) + 1), _Sums(K), _Sums(2)
-    steps = [edges[-1], *(step for step in STEPS if step > edges[-1])]
-    by_step = _Sums(len(steps) + 1)
-    for rows in chunks(table):
-        values = {measure: measure.of(rows) for measure in measures()}
-        by_stratum.add(values, rows.op, np.searchsorted(edges, rows.op))
-        by_step.add(values, rows.op, np.searchsorted(steps, rows.op))
-        by_class.add(values, rows.op, dominant(rows))
-        by_recurrence.add(values, rows.op, (rows.op >= RECURRENT).astype(np.int64))
-    observations = int(table.op.sum(dtype=np.int64))
-    return TableSummary(
-        K=K,
-        voxel_size=table.voxel_size,
-        points=int(table.pixels.sum()),
-        observations=observations,
-        voxels=len(table),
-        mean_op=observations / len(table) if len(table) else math.nan,
-        means=by_stratum.of(slice(None)),
-        strata=tuple(by_stratum.means(name, g, len(table)) for g, (name, _, _) in enumerate(strata(edges))),
-        recurrent=by_recurrence.means(f"OP>={RECURRENT}", 1, len(table)),
-        classes=tuple(by_class.means(name, k, len(table)) for k, name in enumerate(names)),
-        well_seen=tuple(
-            by_step.means(name, g, len(table))
-            for g, (name, _, _) in enumerate(strata(steps))
-            if g and by_step.voxels[g]
-        ),
-    )
+    return TableSums.of(table, edges).summary(table.voxel_size, table.classes, edges)
 
 
-class _Sums:
-    """Sums of every measure over groups of voxels, which come in parts."""
+@dataclass(frozen=True, eq=False)
+class TableSums:
+    """What a map's summary is made of; that of a map in parts is their sum.
 
-    def __init__(self, groups: int) -> None:
-        self.voxels = np.zeros(groups, np.int64)
-        self.total = {measure: np.zeros(groups) for measure in measures()}
-        self.defined = {measure: np.zeros(groups, np.int64) for measure in measures()}
-        self.often = {measure: np.zeros(groups, np.int64) for measure in measures() if measure.lowest_op > 1}
+    total    (3,) points, observations, voxels
+    stratum, kind, recurrence, step  sums of every measure by stratum, by dominant class, of the voxels below OP 3 and
+             the recurrent ones, and by finer strata beyond the last edge: see `_by_group`
+    """
 
-    def add(self, values: Mapping[Measure, Float64], op: Int32, group: npt.NDArray[np.int64]) -> None:
-        """Values (n,) of each measure for voxels of these OP and groups (n,)."""
-        G = len(self.voxels)
-        self.voxels += np.bincount(group, minlength=G)
-        for measure, value in values.items():
-            known = ~np.isnan(value)
-            self.total[measure] += np.bincount(group[known], weights=value[known], minlength=G)
-            self.defined[measure] += np.bincount(group[known], minlength=G)
-        for measure, count in self.often.items():
-            count += np.bincount(group[op >= measure.lowest_op], minlength=G)  # noqa: PLW2901 - in place
+    total: Float64
+    stratum: Float64
+    kind: Float64
+    recurrence: Float64
+    step: Float64
 
-    def of(self, groups: slice) -> MeasureMeans:
-        """The means over some groups together."""
-        counts = {measure: int(self.defined[measure][groups].sum()) for measure in self.total}
-        value = {m.key: float(self.total[m][groups].sum()) / n if n else math.nan for m, n in counts.items()}
-        return MeasureMeans(value, {m.key: int(count[groups].sum()) for m, count in self.often.items()})
+    @classmethod
+    def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
+        """Those of a table."""
+        steps = _steps(edges)
+        groups = (len(edges) + 1, table.K, 2, len(steps) + 1)
+        sums = [np.zeros((1 + 3 * len(measures()), n)) for n in groups]
+        for rows in chunks(table):
+            values = [measure.of(rows) for measure in measures()]
+            group = (
+                np.searchsorted(edges, rows.op),
+                dominant(rows),
+                (rows.op >= RECURRENT).astype(np.int64),
+                np.searchsorted(steps, rows.op),
+            )
+            for own, of in zip(sums, group, strict=True):
+                own += _by_group(values, rows.op, of, own.shape[1])  # noqa: PLW2901 - in place
+        total = [table.pixels.sum(), table.op.sum(dtype=np.int64), len(table)]
+        return cls(np.array(total, dtype=np.float64), *sums)
 
-    def means(self, name: str, group: int, voxels: int) -> Means:
-        """Those of one group, as a share of so many voxels."""
-        n = int(self.voxels[group])
-        return Means(name, n / voxels if voxels else math.nan, n, self.of(slice(group, group + 1)))
+    def arrays(self) -> dict[str, Float64]:
+        """All of it by name, as `read` takes it."""
+        return {f"table {name}": value for name, value in vars(self).items()}
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, Float64]) -> TableSums:
+        """From its arrays, among others."""
+        return cls(**{field.name: arrays[f"table {field.name}"] for field in dataclasses.fields(cls)})
+
+    def __add__(self, other: TableSums) -> TableSums:
+        return TableSums(*(own + more for own, more in zip(vars(self).values(), vars(other).values(), strict=True)))
+
+    def summary(self, voxel_size: float, classes: Sequence[str], edges: Sequence[int] = STRATA) -> TableSummary:
+        """What is reported; the edges are those of the sums."""
+        points, observations, voxels = (int(value) for value in self.total)
+        K = self.kind.shape[1]
+        names = classes or tuple(str(k) for k in range(K))
+
+        def means(name: str, sums: Float64, group: int) -> Means:
+            n = int(sums[0, group])
+            return Means(name, n / voxels if voxels else math.nan, n, _means(sums[:, group]))
+
+        return TableSummary(
+            K=K,
+            voxel_size=voxel_size,
+            points=points,
+            observations=observations,
+            voxels=voxels,
+            mean_op=observations / voxels if voxels else math.nan,
+            means=_means(self.stratum.sum(axis=1)),
+            strata=tuple(means(name, self.stratum, g) for g, (name, _, _) in enumerate(strata(edges))),
+            recurrent=means(f"OP>={RECURRENT}", self.recurrence, 1),
+            classes=tuple(means(name, self.kind, k) for k, name in enumerate(names)),
+            well_seen=tuple(
+                means(name, self.step, g)
+                for g, (name, _, _) in enumerate(strata(_steps(edges)))
+                if g and self.step[0, g]
+            ),
+        )
+
+
+def _steps(edges: Sequence[int]) -> list[int]:
+    return [edges[-1], *(step for step in STEPS if step > edges[-1])]
+
+
+def _by_group(values: Sequence[Float64], op: Int32, group: npt.NDArray[np.int64], groups: int) -> Float64:
+    """(1 + 3 M, groups) of values (n,) of M measures: voxels, then of each measure its sum, how often it is defined,
+    and how often OP is high enough for it."""
+    rows = [np.bincount(group, minlength=groups)]
+    for measure, value in zip(measures(), values, strict=True):
+        known, often = ~np.isnan(value), op >= measure.lowest_op
+        rows.append(np.bincount(group[known], weights=value[known], minlength=groups))
+        rows += [np.bincount(group[where], minlength=groups) for where in (known, often)]
+    return np.stack(rows).astype(np.float64)
+
+
+def _means(sums: Float64) -> MeasureMeans:
+    """The mean of every measure from its sums (1 + 3 M,)."""
+    of = dict(zip(measures(), sums[1:].reshape(-1, 3), strict=True))
+    value = {measure.key: float(total) / n if n else math.nan for measure, (total, n, _) in of.items()}
+    return MeasureMeans(value, {m.key: int(often) for m, (_, _, often) in of.items() if m.lowest_op > 1})
 
 
 def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:

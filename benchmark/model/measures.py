@@ -90,8 +90,8 @@ class Quantity:
 
     @property
     def word(self) -> str:
-        """The title within a sentence: 'VSS', 'entropy'."""
-        return self.title if self.title.isupper() else f"{self.title[0].lower()}{self.title[1:]}"
+        """The title within a sentence: 'VSS', 'IoU', 'entropy'."""
+        return f"{self.title[0].lower()}{self.title[1:]}" if self.title[1:].islower() else self.title
 
     @property
     def symbol(self) -> str:

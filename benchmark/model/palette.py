@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,12 @@ PALETTE: tuple[Color, ...] = (
     (51, 34, 136), (136, 204, 238), (68, 170, 153), (17, 119, 51), (153, 153, 51), (221, 204, 119), (204, 102, 119),
     (136, 34, 85), (170, 68, 153),
 )  # fmt: skip
+
+GLOW: tuple[Color, ...] = ((150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230))
+"""What the recording shows drift in, from little to much: no class is given a colour of this fire."""
+
+CLEAR = 45.0
+"""Distance in RGB that classes keep from it; Tol's colours do."""
 
 LEVELS = tuple(range(0, 256, 17))
 """Of each channel of the colours that are chosen from."""
@@ -45,8 +52,9 @@ def palette(K: int) -> tuple[Color, ...]:
     chosen = [*PALETTE[:K]]
     grid = np.stack(np.meshgrid(LEVELS, LEVELS, LEVELS, indexing="ij"), axis=-1).reshape(-1, 3)
     candidates, places = grid, _places(grid)
-    light = (places[:, 0] >= LIGHTNESS[0]) & (places[:, 0] <= LIGHTNESS[1])
-    candidates, places = candidates[light], places[light]
+    fit = (places[:, 0] >= LIGHTNESS[0]) & (places[:, 0] <= LIGHTNESS[1])
+    fit &= np.linalg.norm(grid[:, None] - between(GLOW, 4 * len(GLOW)), axis=2).min(axis=1) >= CLEAR
+    candidates, places = candidates[fit], places[fit]
     if len(chosen) < K:
         own = _places(np.array(chosen))
         nearest = np.min([_distance(places, one) for one in own], axis=0)
@@ -55,6 +63,12 @@ def palette(K: int) -> tuple[Color, ...]:
         chosen.append((int(candidates[best, 0]), int(candidates[best, 1]), int(candidates[best, 2])))
         nearest = np.minimum(nearest, _distance(places, places[best]))
     return tuple(chosen)
+
+
+def between(colors: Sequence[Color], n: int) -> Float64:
+    """(n, 3) colours from the first to the last, evenly along the line through all of them."""
+    at = np.linspace(0, len(colors) - 1, n)
+    return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in np.transpose(colors)], axis=1)
 
 
 def _places(colors: npt.NDArray[np.integer]) -> Float64:

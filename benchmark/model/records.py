@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,6 +77,36 @@ class ImageSpace:
 
 
 @dataclass(frozen=True)
+class FrameQuality:
+    """What the labels of single frames are worth, as filters left them; shares are 0 to 1, NaN where undefined.
+
+    model, filters  whose labels they are, and what was done to them ('ema:0.6+threshold:0.5'; '' for nothing)
+    coverage      labelled pixels for one that the model labels
+    foresight     of the pixels that the next frame sees again, those whose label the model gives that place then.
+                  No filter saw that frame: what it only repeats does not count for it
+    accuracy      of the labelled pixels, those that are right; miou the mean over classes of intersection over union
+    stable_wrong  of the pixels seen again, those that keep a label that is wrong
+    lag           frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
+                  changes: the pixels that it was counted on
+    milliseconds  of CPU time that the filters took for a frame, in the median
+    accuracy_by_frame, foresight_by_frame  the same of each frame, and of each pair
+    """
+
+    model: str
+    filters: str = ""
+    coverage: float = math.nan
+    foresight: float = math.nan
+    accuracy: float = math.nan
+    miou: float = math.nan
+    stable_wrong: float = math.nan
+    lag: float = math.nan
+    changes: int = 0
+    milliseconds: float = 0.0
+    accuracy_by_frame: tuple[float, ...] = ()
+    foresight_by_frame: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
 class Record:
     """One finished unit.
 
@@ -84,7 +114,8 @@ class Record:
     summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
                 what `semstab.statistics` says of the map
     image_space of the 'base' units; all NaN elsewhere
-    voxels_file file of its voxel table, for the 'base' and 'backends' units; None elsewhere, and without a folder
+    quality     of the labels of single frames, where `frame_quality` asked for it
+    voxels_file file of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None elsewhere
     truth_file  file of the ground truth's voxels of the same frames, where the statistics fused it
     """
 
@@ -92,6 +123,7 @@ class Record:
     variation: Variation
     summary: UnitSummary = field(metadata=INLINE)
     image_space: ImageSpace = ImageSpace()
+    quality: FrameQuality | None = None
     voxels_file: Path | None = None
     truth_file: Path | None = None
 
@@ -112,24 +144,44 @@ class Record:
         return VoxelTable.load(self.voxels_file)
 
     @property
+    def in_tiles(self) -> bool:
+        """Whether its voxels are a folder of tiles."""
+        return self.voxels_file is not None and self.voxels_file.is_dir()
+
+    def tiles(self) -> Iterator[VoxelTable]:
+        """Its voxels, tile by tile; of a map in one file all of them."""
+        if self.voxels_file is None:
+            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
+        return VoxelTable.iter_tiles(self.voxels_file)
+
+    @property
     def series(self) -> Path | None:
         """File of its time series, beside that of its voxels."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / FRAMES / f"{self.unit.slug}.csv"
+        return self._beside(FRAMES, ".csv")
 
     @property
     def looks_file(self) -> Path | None:
         """File of its sampled looks, which is there where the statistics judged its map."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / LOOKS / self.voxels_file.name
+        return self._beside(LOOKS)
 
     @property
     def events_file(self) -> Path | None:
         """File of its log of observations, which is there where it was asked for and its backend keeps one."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / EVENTS / self.voxels_file.name
+        return self._beside(EVENTS)
 
     @property
     def influence_file(self) -> Path | None:
         """File of its sums by frame and cube of space, which is there where its map was judged."""
-        return None if self.voxels_file is None else self.voxels_file.parents[1] / INFLUENCE / self.voxels_file.name
+        return self._beside(INFLUENCE)
+
+    def _beside(self, folder: str, suffix: str = ".parquet") -> Path | None:
+        return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"
+
+
+def voxels_of(folder: Path, unit: Unit) -> Path:
+    """Where a run's folder has the voxels of a unit: in a file, or in a folder of tiles."""
+    tiles = folder / VOXELS / unit.slug
+    return tiles if tiles.is_dir() else folder / VOXELS / f"{unit.slug}.parquet"
 
 
 class Tables:
@@ -179,6 +231,7 @@ class UnitContent:
     input: str
     summary: UnitSummary | None = None
     image_space: ImageSpace | None = None
+    quality: FrameQuality | None = None
     up: tuple[float, float, float] | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None
@@ -295,15 +348,16 @@ class Result:
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
-        """The summary table, in a notebook."""
+        """The summary table and the verdicts, in a notebook."""
         rows: list[list[tabular.Cell]] = []
         for run in self.runs:
             table, unit = run.table, run.unit
             means = (tabular.number(table[measure], measure.digits[0]) for measure in measures())
             seen = tabular.number(table.mean_op, 2), *means, tabular.number(100 * table.recurrent.share, 2)
-            rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen])
+            verdict = "" if run.statistics is None else run.statistics.verdict.level
+            rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen, verdict])
         titles = [measure.title for measure in measures()]
-        headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %"]
+        headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
         return tabular.as_html(self.name, headers, rows)
 
     @property

@@ -421,7 +421,7 @@ class MapStatistics:
     blocks: BlockCut
     verdict: StabilityVerdict
     agreement: FrameAgreement
-    flipping: Flipping
+    flipping: Flipping | None
     judged: Judged
     reach: Reach | None
     correlogram: Correlogram | None

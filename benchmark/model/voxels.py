@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from semstab.model import parquet, tabular
 from semstab.model.evidence import Evidence
 from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.model.measures import MeasureMeans, dominant, measures
+from semstab.runtime.memory import available_bytes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,6 +26,9 @@ Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 Types = dict[str, type[np.generic]]
+
+BYTES_A_VOXEL = 200
+"""Of a table that is put together from tiles: twice what it takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +133,9 @@ class VoxelTable:
         path: str | Path,
         extra: Mapping[str, npt.NDArray[Any]] | None = None,
         computed: Mapping[str, Callable[[VoxelTable], npt.NDArray[Any]]] | None = None,
+        tile: parquet.Tile | None = None,
     ) -> None:
-        """Write Parquet, atomically, some rows after the others.
+        """Write Parquet, atomically, some rows after the others; as a tile of a larger map, where one is named.
 
         `extra` columns (n,), and what is `computed` from the rows that are written, go along for other programs and are
         not read back.
@@ -143,11 +148,54 @@ class VoxelTable:
             return own | made | {name: values[some] for name, values in (extra or {}).items()}
 
         parts = map(columns, self.evidence.chunks())
-        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)
 
     @classmethod
     def load(cls, path: str | Path) -> VoxelTable:
-        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        """Read what `save` wrote, a file or a folder of tiles, all of it.
+
+        Raises DataError where a file is missing, damaged or of another kind, or a map in tiles is larger than memory.
+        """
+        files = parquet.files_of(path)
+        if len(files) > 1:
+            _require_memory(Path(path), files)
+        return cls.joined([cls._read(file) for file in files])
+
+    @classmethod
+    def iter_tiles(cls, path: str | Path) -> Iterator[VoxelTable]:
+        """The tiles of a map one after the other, by x and y; of a map in one file that file."""
+        return map(cls._read, parquet.files_of(path))
+
+    @classmethod
+    def columns(cls, path: str | Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+        """Single columns (n,) by name, also measures and what else the file has, in the order of `load`.
+
+        Raises DataError where one is not there.
+        """
+        files, sorting = parquet.files_of(path), tuple(_INDEX_TYPES)
+        wanted = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
+        parts = [parquet.columns(file, wanted) for file in files]
+        found = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+        order = _sorted(found) if len(files) > 1 else slice(None)
+        return {name: found[name][order] for name in names}
+
+    @classmethod
+    def joined(cls, parts: Sequence[VoxelTable]) -> VoxelTable:
+        """One table of the voxels of several that share none."""
+        if len(parts) == 1:
+            return parts[0]
+        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _INDEX_TYPES}
+        order = _sorted(index)
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in _VOXEL_TYPES
+            if name != "evidence"
+        }
+        evidence = Evidence.joined([part.evidence for part in parts]).take(order)
+        return replace(parts[0], **columns, evidence=evidence)
+
+    @classmethod
+    def _read(cls, path: Path) -> VoxelTable:
         with parquet.reading(path):
             return cls(**parquet.read(path, _VOXEL_TYPES))
 
@@ -286,6 +334,22 @@ _EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.floa
 def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
     """Voxel indices (n, 3) as the columns ix, iy, iz."""
     return dict(zip(_INDEX_TYPES, index.T.astype(np.int32), strict=True))
+
+
+def _sorted(index: Mapping[str, npt.NDArray[Any]]) -> Int64:
+    """The order of voxels by ix, iy, iz."""
+    order: Int64 = np.lexsort([index[name] for name in reversed(_INDEX_TYPES)])
+    return order
+
+
+def _require_memory(path: Path, files: Sequence[Path]) -> None:
+    """Raise DataError where a map in tiles does not fit into the memory that is free."""
+    voxels, free = parquet.rows_in(files), available_bytes()
+    if (needed := voxels * BYTES_A_VOXEL) > free:
+        raise DataError(
+            f"{path}: {voxels / 1e6:.3g} million voxels in {len(files)} tiles take {needed / 1e9:.2g} GB at once, and"
+            f" {free / 1e9:.2g} GB are free; take them tile by tile (VoxelTable.iter_tiles, or DuckDB on its files)"
+        )
 
 
 def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:

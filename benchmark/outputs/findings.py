@@ -321,9 +321,12 @@ def _beyond_op(reference: Level, level: Level, sign: int = 1) -> float:
 
 def _way(estimate: Estimate, positive: str, negative: str) -> str:
     """Which way it goes and how far; with the interval, of the same sign."""
-    if estimate.value < 0:
-        return f"{negative} by {-estimate.value:.4f} ({-estimate.high:.4f} to {-estimate.low:.4f})"
-    return f"{positive} by {estimate.value:.4f} ({estimate.low:.4f} to {estimate.high:.4f})"
+    value, low, high = (round(end, 4) + 0.0 for end in (estimate.value, estimate.low, estimate.high))
+    if value == 0:
+        return f"neither {positive} nor {negative} ({low:.4f} to {high:.4f})"
+    if value < 0:
+        return f"{negative} by {-value:.4f} ({0.0 - high:.4f} to {0.0 - low:.4f})"
+    return f"{positive} by {value:.4f} ({low:.4f} to {high:.4f})"
 
 
 def _vss(level: Level) -> float:

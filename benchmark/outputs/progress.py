@@ -52,6 +52,10 @@ class ProgressBar(Observer):
         if verdict.state == "unclear":
             self.notes.append(f"{task.scene.name}: {verdict.text}")
 
+    def remarked(self, line: str) -> None:
+        """Say it at once."""
+        self.bar.console.print(line, style="dim", soft_wrap=True, markup=False)
+
     def advanced(self, frames: int, what: str) -> None:
         """So many frames further."""
         self.bar.update(self.work, advance=frames, description=what[:40])

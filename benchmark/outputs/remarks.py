@@ -43,18 +43,22 @@ def _name(run: UnitSummary, result: Result) -> str:
 
 def _size(scene: str, found: VoxelAdvice, scenes: int) -> str:
     """Where the voxel size lies."""
-    where = f"{scene}: " if scenes > 1 and not found.chosen else ""
+    where = f"{scene}: voxels" if scenes > 1 and not found.chosen else ""
     if found.chosen:
         return (
-            f"voxels of {found.voxel_size:g} m: the smallest in which half of the points fall again when another frame"
+            f"Voxels of {found.voxel_size:g} m: the smallest in which half of the points fall again when another frame"
             " sees them (semstab-bench check); --voxel-size takes another"
         )
-    text = f"{where}voxels of {found.voxel_size:g} m: {found.stays:.0%} of the points fall into the same one again"
+    text = (
+        f"{where or 'Voxels'} of {found.voxel_size:g} m: {found.stays:.0%} of the points fall into the same one again"
+    )
     if found.suggested is None:
         return f"{text} when another frame sees them, in none of any size half of them: are depth and poses right?"
     text += " when another frame sees them"
     if found.voxel_size < found.suggested:
         return f"{text}, so that noise tears places apart; check suggests {found.suggested:g} m"
+    if found.voxel_size == found.suggested:
+        return f"{text}; check suggests the same"
     if found.voxel_size > COARSE * found.suggested:
         return f"{text}; {found.suggested:g} m would do, and tell apart what these blur"
     return f"{text}; check suggests {found.suggested:g} m"
@@ -74,7 +78,7 @@ def _soft_and_hard(runs: Sequence[UnitSummary], result: Result) -> Iterator[str]
     if not mixed(runs):
         return
     yield (
-        "hard labels and soft scores do not compare by VSS, entropy or alpha: scores spread their evidence. Compare the"
+        "Hard labels and soft scores do not compare by VSS, entropy or alpha: scores spread their evidence. Compare the"
         " labels with the scores reduced to each pixel's likeliest class:"
     )
     for run in runs:

@@ -101,7 +101,7 @@ def _agreement(found: MapStatistics) -> list[Row]:
         ("Fleiss' kappa", found.agreement.kappa, ""),
         ("Krippendorff's alpha", found.agreement.alpha, ""),
         ("VSS", found.agreement.vss, ""),
-        ("places that flip", found.flipping.share, _between(found.flipping)),
+        *([] if found.flipping is None else [("places that flip", found.flipping.share, _between(found.flipping))]),
         ("two looks differ within a frame", found.agreement.within, ""),
         ("  and between frames", found.agreement.between, ""),
         ("alpha between frames", found.agreement.alpha_between, ""),

@@ -24,6 +24,9 @@ NOTHING = "-"
 HARDLY_ANY = 0.1
 """A share of voxels seen once below which they need no remark."""
 
+FUSION_STAGES = ("association", "update")
+"""Parts of fusion; frames are decoded beside it, and waited for where that takes longer."""
+
 RARE = 100
 """Voxels below which a class is too rare to be called the worst."""
 
@@ -48,9 +51,9 @@ def print_summary(result: Result, console: Console) -> None:
         console.print(_agreement_table(told))
     if drawn:
         console.print(f"{_drawn(drawn)}\n", highlight=False, markup=False)
-    console.print(_stages_line(shown))
+    console.print(_stages_line(shown), highlight=False)
     for text in _statistics(result):
-        console.print(text, highlight=False, markup=False)
+        console.print(text, highlight=False, markup=False, soft_wrap="\n" in text.rstrip())  # tables keep their lines
     for text in remarks(result):
         console.print(f"- {text}", highlight=False, markup=False)
     console.print()
@@ -98,7 +101,7 @@ def _once(run: UnitSummary) -> int:
     return sum(row.voxels for row in run.table.strata if row.name == "OP=1")
 
 
-def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
+def narrow_table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
     """A table that fits 80 columns: no lines between columns, headers of two lines."""
     table = Table(
         title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True
@@ -112,7 +115,7 @@ def _table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
 
 def _scene_table(runs: Sequence[UnitSummary]) -> Table:
     numbers = ("voxels", "mean\nOP", *_headers(), "flicker\n%", "OP>=3\n%")
-    table = _table(escape(_title(runs)), ("scene",), numbers)
+    table = narrow_table(escape(_title(runs)), ("scene",), numbers)
     for backbone, rows in _by_backbone(runs):
         table.add_row(escape(backbone), style="bold")
         for run in rows:
@@ -136,7 +139,7 @@ def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
 
 def _strata_table(runs: Sequence[UnitSummary]) -> Table:
     title = "by observation persistence" + (", all scenes pooled" if len(_scenes(runs)) > 1 else "")
-    table = _table(title, ("persistence",), ("voxels", "%", *_headers()))
+    table = narrow_table(title, ("persistence",), ("voxels", "%", *_headers()))
     for backbone, rows in _by_backbone(runs):
         table.add_row(escape(backbone), style="bold")
         voxels = sum(run.table.voxels for run in rows)
@@ -164,23 +167,27 @@ def _headers() -> list[str]:
 
 
 def _stages_line(runs: Sequence[UnitSummary]) -> str:
-    """Mean milliseconds a frame by stage, of those that are known; decoding goes on beside them in worker threads."""
+    """Mean milliseconds a frame: of fusion, with its parts where they are known, and of what is done beside it."""
     means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
-    decode = means.pop("decode")
-    known = [f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)]
+    known = {stage: f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)}
+    parts = ", ".join(known.pop(stage) for stage in FUSION_STAGES if stage in known)
     fusion = _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1)
-    return f"ms a frame: fusion {fusion} ({', '.join(known)}); beside them decode {_number(decode, 1)}\n"
+    beside = "".join(f", {text}" for text in known.values())
+    return f"ms a frame: fusion {fusion}{f' ({parts})' if parts else ''}{beside}\n"
 
 
 def _class_table(result: Result) -> Table:
     """Classes that there are, by how well frames agree on them, the worst first; rare ones at the end."""
-    title = "by class, the least steady first" + (", all scenes pooled" if len(result.scenes) > 1 else "")
+    maps = {backbone: result.select(backbone=backbone) for backbone in result.backbones}
+    seen = {name: [row for row in pooled(records).classes if row.voxels] for name, records in maps.items()}
+    title = "by class, the least steady first"
+    if any(row.voxels < RARE for there in seen.values() for row in there):
+        title += f", those of fewer than {RARE} voxels last"
+    title += ", all scenes pooled" if len(result.scenes) > 1 else ""
     known = any(_class_alphas(result.select()).values())
-    table = _table(title, ("class",), ("voxels", "%", *_headers(), *(["alpha\n↑"] if known else [])))
-    for backbone in result.backbones:
-        records = result.select(backbone=backbone)
-        alphas = _class_alphas(records)
-        there = [row for row in pooled(records).classes if row.voxels]
+    table = narrow_table(title, ("class",), ("voxels", "%", *_headers(), *(["alpha\n↑"] if known else [])))
+    for backbone, there in seen.items():
+        alphas = _class_alphas(maps[backbone])
         there.sort(key=lambda row: (row.voxels < RARE, alphas.get(row.name, 1.0), row[VSS]))
         table.add_row(escape(backbone), style="bold")
         for row in there[:MOST_CLASSES]:
@@ -204,7 +211,7 @@ def _class_alphas(records: Sequence[Record]) -> dict[str, float]:
 def _sweep_table(result: Result, sweep: Sweep) -> Table:
     """What a sweep came to: of all voxels, of the recurrent ones, how many these are, and how far frames agree."""
     numbers = (f"{VSS.word}\nall", f"{VSS.word}\nOP>=3", "OP>=3\n%", "alpha\n↑")
-    table = _table(sweep.title, (sweep.header,), numbers)
+    table = narrow_table(sweep.title, (sweep.header,), numbers)
     for backbone in result.backbones:
         found = levels(result, sweep.name, backbone)
         if found:
@@ -226,7 +233,7 @@ def _named(result: Result) -> list[UnitSummary]:
 def _backends_table(runs: Sequence[UnitSummary]) -> Table:
     numbers = ("voxels", "mean\nOP", *_headers()[:2], "OP>=3\n%", "ms a\nframe")
     title = "fusion backends, the same frames" + (", all scenes" if len(_scenes(runs)) > 1 else "")
-    table = _table(title, ("backend",), numbers)
+    table = narrow_table(title, ("backend",), numbers)
     for backbone, rows in _by_backbone(runs):
         table.add_row(escape(backbone), style="bold")
         for name in dict.fromkeys(run.unit.backend for run in rows):
@@ -241,7 +248,7 @@ def _compared_table(compared: Sequence[Agreement]) -> Table:
     """How backends differ that associate pixels and voxels in another way: mean differences of a voxel of both."""
     symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures() if not measure.lowest_op > 1}}
     numbers = ("first\nonly", "other\nonly", "label\ndiffers", *(f"mean\nΔ{s}" for s in symbols.values()))
-    table = _table("backends that differ by design, voxel by voxel", ("scene, backbone",), numbers)
+    table = narrow_table("backends that differ by design, voxel by voxel", ("scene, backbone",), numbers)
     for pair in dict.fromkeys(row.backends for row in compared):
         table.add_row(escape("\n".join(pair)), style="bold")
         for row in (row for row in compared if row.backends == pair):
@@ -257,7 +264,7 @@ def _agreement_table(agreement: Sequence[Agreement]) -> Table:
     numbers = ("voxels\nin one", *(f"Δ{symbol}" for symbol in symbols.values()), "")
     short = [f"{measure.symbol} {measure.word}" for measure in measures() if measure.short]
     title = f"agreement: largest differences of a voxel ({', '.join([*short, 'e evidence'])})"
-    table = _table(title, ("scene, backbone",), numbers)
+    table = narrow_table(title, ("scene, backbone",), numbers)
     for pair in dict.fromkeys(row.backends for row in agreement):
         table.add_row(escape(" · ".join(pair)), style="bold")
         for row in (row for row in agreement if row.backends == pair):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,20 +44,21 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 
     A pixel with valid depth is back-projected, moved into the other camera and projected; there the nearest pixel's
     depth must be valid and differ from the point's distance z along the optical axis by at most depth_tolerance * z,
-    else the point is occluded. Labels do not matter. The frames may differ in size and intrinsics.
+    else the point is occluded; of infinity, that is not looked at. Labels do not matter. The frames may differ in size
+    and intrinsics.
 
-    Raises ConfigError where the tolerance is not above 0 and below 1.
+    Raises ConfigError where the tolerance is not above 0 and below 1, and not infinity.
     """
     from semstab.pixels.warp_kernel import look_up
 
-    if not 0 < depth_tolerance < 1:
+    if not 0 < depth_tolerance < 1 and depth_tolerance != math.inf:
         raise ConfigError(f"depth_tolerance = {depth_tolerance:g}: use a share of the distance, above 0 and below 1")
     H, W = frame.shape
     K, camera = frame.intrinsics, other.intrinsics
     rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
     pixel = np.empty((H, W), dtype=np.int32)
     look_up(
-        fixed(frame.depth), rays, _motion(frame, other), fixed(other.depth),
+        fixed(frame.depth), rays, motion(frame, other), fixed(other.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
     )  # fmt: skip
     return Correspondence(pixel)
@@ -73,7 +75,7 @@ def warp(
     return found.bring(values, fill), found.visible
 
 
-def _motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
+def motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
     """(3, 4) from the frame's camera axes to the other's; exact for large coordinates, which cancel first."""
     R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
     t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]

@@ -41,3 +41,48 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
             at_u, at_v = int(column), int(row)
             if abs(float(other_depth[at_v, at_u]) - z) <= tolerance * z:
                 out[v, u] = at_v * W + at_u
+
+
+@serial
+def blend(
+    depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, tolerance: float, values: Any, out: Any
+) -> None:
+    """For each pixel of a view the linear mean of those of the other view's four nearest pixels that see the same
+    surface and hold something; arguments as of `look_up`, and
+
+    values  (H', W', K) of the other view's pixels, 0 or more, all 0 where they hold nothing
+    out     (H, W, K) zeros, is filled; 0 where there is nothing
+    """
+    ray_x, ray_y = rays
+    fx, fy, cx, cy = camera
+    H, W, K = values.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            d = float(depth[v, u])
+            if not 0.0 < d < math.inf:
+                continue
+            x, y = ray_x[u] * d, ray_y[v] * d
+            z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * d + motion[2, 3]
+            if not z > 0.0:
+                continue
+            to_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * d + motion[0, 3]
+            to_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * d + motion[1, 3]
+            column, row = fx * (to_x / z) + cx, fy * (to_y / z) + cy
+            if not (-0.5 <= column < W - 0.5 and -0.5 <= row < H - 0.5):
+                continue
+            left, top = math.floor(column), math.floor(row)
+            total = 0.0
+            for at_v in range(top, top + 2):
+                for at_u in range(left, left + 2):
+                    share = (1.0 - abs(column - at_u)) * (1.0 - abs(row - at_v))
+                    inside = 0 <= at_v < H and 0 <= at_u < W
+                    if not inside or share <= 0.0 or not abs(float(other_depth[at_v, at_u]) - z) <= tolerance * z:
+                        continue
+                    held = 0.0
+                    for k in range(K):
+                        held += values[at_v, at_u, k]
+                        out[v, u, k] += share * values[at_v, at_u, k]
+                    total += share * held
+            if total > 0.0:
+                for k in range(K):
+                    out[v, u, k] /= total

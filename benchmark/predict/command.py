@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from semstab.backbones import Backbone
 from semstab.config import DatasetConfig, FrameSelection, validated
-from semstab.datasets import options_model
+from semstab.datasets import Scene, options_model
 from semstab.errors import ConfigError
+from semstab.predict.images import ImageSequence
 from semstab.predict.jobs import Job, file_job, scene_jobs
-from semstab.predict.predictor import PredictorConfig, load_predictor
+from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, SequenceReport, predict_sequence
+from semstab.predict.stored import NAME as STORED
 from semstab.predict.terminal import PredictionBar, print_report
 
 
@@ -45,8 +49,9 @@ def run(
         raise ConfigError("--top-k says how many scores a pixel keeps; add --scores, or leave it out")
     config = validated(PredictorConfig, {**predictor, "options": options}).resolved()
     selection = validated(FrameSelection, frames)
-    jobs = _jobs(images, dataset, scenes, selection, out)
-    backbone = load_predictor(config)
+    jobs = _jobs(images, dataset, scenes, selection, out, config.looks_at)
+    load = _loader(config)
+    load(jobs[0])  # what is wrong with it is said before the first image is read
     sequence_options = SequenceOptions(
         config.label_name, config.scores, top_k=top_k, batch=batch, overwrite=overwrite, command=sys.argv
     )
@@ -54,15 +59,34 @@ def run(
     reports = []
     try:
         for job in jobs:
-            reports.append(predict_sequence(job.sequence, backbone, job.indices, job.out, sequence_options, [bar]))
+            sequence, backbone = load(job)
+            reports.append(predict_sequence(sequence, backbone, job.indices, job.out, sequence_options, [bar]))
     finally:
         bar.close()
     for report in reports:
         print_report(report, Console(quiet=quiet, markup=False))
-    if dataset is not None and backbone.label_space is not None:
+    if dataset is not None and load(jobs[0])[1].label_space is not None:
         hint = _next_command(config, dataset, scenes, selection, out, several=len(jobs) > 1)
         Console(quiet=quiet).print(hint, soft_wrap=True, highlight=False, markup=False)
     return reports
+
+
+def _loader(config: PredictorConfig) -> Callable[[Job], tuple[ImageSequence, Backbone]]:
+    """What gives the images of a job and who predicts on them: one model for all, or each scene's own labels."""
+    if config.backbone != STORED:
+        backbone = load_predictor(config)
+        return lambda job: (job.sequence, backbone)
+
+    @functools.cache
+    def of_scene(job: Job) -> tuple[ImageSequence, Backbone]:
+        if not isinstance(job.sequence, Scene) or not job.sequence.labels_like_depth:
+            raise ConfigError(
+                f"{job.sequence.name}: its own labels are filtered inside a run (--filter, no --predict), or on disk"
+                " once `convert` has made a posed folder of it"
+            )
+        return stored_labels(config, job.sequence)
+
+    return of_scene
 
 
 def _next_command(
@@ -106,9 +130,10 @@ def _jobs(
     scenes: list[str] | None,
     frames: FrameSelection,
     out: Path | None,
+    looks_at: Mapping[str, Any],
 ) -> list[Job]:
     if images is None and dataset is not None:
-        return scene_jobs(dataset, scenes, frames, out)
+        return scene_jobs(dataset, scenes, frames, out, looks_at)
     if images is None or dataset is not None:
         raise ConfigError("say what to predict on: --images GLOB, or --data FOLDER, or --dataset NAME")
     return [file_job(images, frames, out)]

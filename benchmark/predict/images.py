@@ -70,13 +70,20 @@ class Picture:
 def picture(sequence: ImageSequence, index: int, backbone: Backbone) -> Picture:
     """What the backbone is shown of an index. Raises DataError that names the file, and as `geometry_of`."""
     pixels = sequence.image(index)
-    geometry, digest = geometry_of(sequence, index, pixels, backbone), image_digest(pixels)
+    geometry = geometry_of(sequence, index, pixels, backbone)
+    return Picture(index, sequence.image_name(index), pixels, geometry, shown_digest(pixels, geometry))
+
+
+def shown_digest(pixels: Image, geometry: Sequence[Frame]) -> str:
+    """A hash of an image, and of what else is shown of it."""
+    digest = image_digest(pixels)
     for frame in geometry:
         seen = hashlib.blake2b(repr((digest, frame.intrinsics)).encode(), digest_size=16)
-        seen.update(np.ascontiguousarray(frame.depth).data)
-        seen.update(np.ascontiguousarray(frame.T_wc).data)
+        labels = frame.labels if frame.scores is None else frame.scores
+        for array in (frame.depth, frame.T_wc, labels):
+            seen.update(np.ascontiguousarray(array).data)
         digest = seen.hexdigest()
-    return Picture(index, sequence.image_name(index), pixels, geometry, digest)
+    return digest
 
 
 def geometry_of(sequence: ImageSequence, index: int, pixels: Image, backbone: Backbone) -> tuple[Frame, ...]:

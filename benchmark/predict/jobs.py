@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from semstab.config import DatasetConfig, FrameSelection
 from semstab.datasets import Scene, open_dataset
@@ -12,6 +13,9 @@ from semstab.datasets.selection import select_frames
 from semstab.errors import ConfigError
 from semstab.predict.images import ImageSequence
 from semstab.predict.sources import ImageFiles, chosen
+
+IMAGES: Mapping[str, Any] = {"color": True}
+"""What of a frame must be there where a model looks at images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +36,15 @@ def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
 
 
 def scene_jobs(
-    dataset: DatasetConfig, scenes: Sequence[str] | None, frames: FrameSelection, out: Path | None
+    dataset: DatasetConfig,
+    scenes: Sequence[str] | None,
+    frames: FrameSelection,
+    out: Path | None,
+    looks_at: Mapping[str, Any] = IMAGES,
 ) -> list[Job]:
     """The scenes of a dataset; predictions go into the scene's own folder, into `out`, or of several into out/SCENE.
+
+    `looks_at` says what of a frame must be there, as for `select_frames`.
 
     Raises ConfigError for a dataset without folders of its own where there is no `out`, and for a scene or frames that
     are not there.
@@ -44,7 +54,7 @@ def scene_jobs(
     jobs = []
     for name in names:
         scene = opened.scene(name)
-        indices = _some(select_frames(scene, frames, color=True).indices, scene)
+        indices = _some(select_frames(scene, frames, **looks_at).indices, scene)
         jobs.append(Job(scene, indices, _place(scene, out if out is None or len(names) == 1 else out / name)))
     return jobs
 

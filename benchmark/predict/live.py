@@ -6,26 +6,30 @@ import dataclasses
 import hashlib
 import json
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field, field_validator
 
-from semstab.backbones import Backbone, Image, Prediction, ask
+from semstab.backbones import Backbone, Image, Prediction, ask, create
 from semstab.config import DatasetConfig, FrameSelection, Settings
-from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset, resolved
+from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
 from semstab.datasets.selection import select_frames
 from semstab.datasets.views.resampling import Labels, Scores
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
-from semstab.predict.images import first_images, geometry_of
+from semstab.predict.filters import parse
+from semstab.predict.filters.filtered import Filtered
+from semstab.predict.images import ImageSequence, first_images, geometry_of
 from semstab.predict.in_order import InOrder, size_of
-from semstab.predict.predictor import PredictorConfig, load_predictor
-from semstab.runtime.registry import Entry
+from semstab.predict.predictor import PredictorConfig, completed, stored_labels
+from semstab.predict.stored import NAME as STORED
+from semstab.predict.stored import StoredSequence
 
 NAME = "predicted"
 
@@ -45,23 +49,28 @@ class PredictedOptions(Settings):
         default_factory=dict, description="frames of single scenes, instead of `frames`"
     )
 
+    remedies: list[str] = Field(
+        default_factory=list, description="filters, each put over each of the backbones and named beside it"
+    )
+    kept: Path | None = Field(None, description="folder in which predictions of models are kept; in memory by default")
+
     @field_validator("dataset")
     @classmethod
     def _with_every_option(cls, value: DatasetConfig) -> DatasetConfig:
         return resolved(value)
 
+    @field_validator("remedies")
+    @classmethod
+    def _filters_with_numbers(cls, value: list[str]) -> list[str]:
+        return ["+".join(str(parse(text)) for text in remedy.split("+")) for remedy in value]
+
     @field_validator("backbones")
     @classmethod
     def _names_of_their_own(cls, value: list[PredictorConfig]) -> list[PredictorConfig]:
-        names = [source_name(predictor) for predictor in value]
+        names = [predictor.source_name for predictor in value]
         if repeated := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two backbones are called '{repeated[0]}'; give one a name")
         return [predictor.resolved() for predictor in value]
-
-
-def source_name(predictor: PredictorConfig) -> str:
-    """The label source that a predictor is: as in folders, one that gives scores is 'NAME-scores'."""
-    return f"{predictor.label_name}-scores" if predictor.scores else predictor.label_name
 
 
 class PredictedDataset(Dataset):
@@ -75,9 +84,10 @@ class PredictedDataset(Dataset):
 
     def __init__(self, options: PredictedOptions) -> None:
         self._dataset = open_dataset(options.dataset.name, options.dataset.options)
-        self._configs = {source_name(predictor): predictor for predictor in options.backbones}
+        self._configs = {predictor.source_name: predictor for predictor in _with_remedies(options)}
         self._options = options
         self._loaded: dict[str, Backbone] = {}
+        self._models: dict[str, Backbone] = {}
         self._shown_by: dict[str, object] = {}
         self.lock = threading.RLock()
 
@@ -101,13 +111,22 @@ class PredictedDataset(Dataset):
             raise ConfigError(f"backbone '{source}' does not predict here; there is {', '.join(self._configs)}")
         with self.lock:
             if source not in self._loaded:
-                self._loaded[source] = load_predictor(self._configs[source])
+                config = self._configs[source]
+                self._loaded[source] = completed(config, self._shared(config), self._options.kept)
             return self._loaded[source]
 
-    def frames_of(self, scene: Scene) -> list[int]:
-        """What sequential backbones are shown of a scene: the selected frames that have image, depth and pose."""
+    def _shared(self, config: PredictorConfig) -> Backbone:
+        """The model itself, loaded once for all that is put around it, unless it remembers what it was shown."""
+        what = json.dumps([config.backbone, config.options], sort_keys=True)
+        model = self._models.get(what) or create(config.backbone, **config.options)
+        if not getattr(model, "sequential", False):
+            self._models[what] = model
+        return model
+
+    def frames_of(self, scene: Scene, source: str) -> list[int]:
+        """What a sequential backbone is shown of a scene: the selected frames that have what it looks at."""
         selection = self._options.scene_frames.get(scene.name, self._options.frames)
-        return select_frames(scene, selection, color=True).indices
+        return select_frames(scene, selection, **self._configs[source].looks_at).indices
 
     def claim(self, source: str, who: object) -> bool:
         """Whether the model was last shown a sequence by somebody else; from now on it is `who` that shows."""
@@ -140,6 +159,7 @@ class PredictedScene(Scene):
         self._room = KEPT_BYTES
         self._lock = dataset.lock
         self._in_order: dict[str, InOrder] = {}
+        self._of_labels: dict[str, tuple[StoredSequence, Backbone]] = {}
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -156,9 +176,20 @@ class PredictedScene(Scene):
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Files that the frame lacks; it needs its colour where a model is among the sources."""
-        predicted = any(source in self.backbones for source in sources)
-        stored = [source for source in sources if source == GROUND_TRUTH]
-        return self._inner.missing(index, stored, color=color or predicted)
+        wanted = [self._dataset.predictors[source].looks_at for source in sources if source in self.backbones]
+        stored = [*{source: None for each in wanted for source in each["sources"]}]
+        truth = [source for source in sources if source == GROUND_TRUTH]
+        return self._inner.missing(index, [*stored, *truth], color=color or any(each["color"] for each in wanted))
+
+    def filtering(self, backbone: str) -> Filtering:
+        """What was done to a label source before it is read."""
+        if backbone == GROUND_TRUTH:
+            return Filtering(backbone)
+        known, one = self._dataset.predictors, self._dataset.predictors[backbone]
+        same = (name for name, other in known.items() if other.model_copy(update={"name": None}) == one.unfiltered)
+        model = self._fitted.get(backbone)
+        took = model.seconds if isinstance(model, Filtered) else []
+        return Filtering(next(same, backbone), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -195,7 +226,7 @@ class PredictedScene(Scene):
         if backbone == GROUND_TRUTH:
             space: LabelSpace | None = self._inner.label_space(GROUND_TRUTH)
         else:
-            space = self._dataset.model(backbone).label_space
+            space = self._unfitted(backbone).label_space
         if space is None:
             raise ConfigError(f"backbone '{backbone}' finds regions without classes, which cannot be fused")
         return space
@@ -204,11 +235,16 @@ class PredictedScene(Scene):
         """The frame with what the model says about its image. Raises what the inner scene and the model raise."""
         if backbone == GROUND_TRUTH:
             return self._inner.frame(index, backbone, color=color)
-        image = self._inner.image(index)
+        sequence = self._sequence(backbone)
+        image = sequence.image(index)
         prediction = self._predict(index, backbone, image)
         labels = prediction.labels if prediction.scores is None else None
-        frame = self._inner.predicted(index, labels=labels, scores=prediction.scores)
-        self._digests[index] = _digest(image, frame)
+        frame = sequence.predicted(index, labels=labels, scores=prediction.scores)
+        assert frame is not None
+        if sequence is self._inner:
+            self._digests[index] = _digest(image, frame)
+        else:
+            image = self._inner.color(index) if color else image  # type: ignore[assignment]
         shown = self._inner.color(index) if color and self._inner.on_photographs else image
         return dataclasses.replace(frame, color=shown if color else None)
 
@@ -222,8 +258,13 @@ class PredictedScene(Scene):
         with self._lock:
             model = self._model(backbone)
             shown = self._ordered(backbone, model).shown_for(indices) if model.sequential else None
-        about = [model.identity(), self._dataset.predictors[backbone].scores, *([] if shown is None else [shown])]
+        config = self._dataset.predictors[backbone]
+        about = [model.identity(), config.scores, *([] if shown is None else [shown])]
         digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
+        if config.backbone == STORED:
+            digest.update(self._inner.digest(shown or indices, config.options["source"]).encode())
+            if not config.wants_color:
+                return digest.hexdigest()
         for index in shown or indices:
             if index not in self._digests:
                 image = self._inner.image(index)
@@ -240,7 +281,7 @@ class PredictedScene(Scene):
                 return self._ordered(backbone, model).at(index)
             if (backbone, index) in self._kept:
                 return self._kept[backbone, index]
-            geometry = geometry_of(self._inner, index, image, model)
+            geometry = geometry_of(self._sequence(backbone), index, image, model)
             scores = self._dataset.predictors[backbone].scores
             (prediction,) = ask(model, [image], scores=scores, geometry=geometry)
             if (size := size_of(prediction)) <= self._room:
@@ -250,19 +291,52 @@ class PredictedScene(Scene):
 
     def _ordered(self, backbone: str, model: Backbone) -> InOrder:
         if backbone not in self._in_order:
+            while len(self._in_order) > 1:  # what the others remember takes memory, and their turn is over
+                over = next(iter(self._in_order))
+                del self._in_order[over], self._fitted[over]
             scores = self._dataset.predictors[backbone].scores
-            shown = self._dataset.frames_of(self._inner)
+            shown = self._dataset.frames_of(self._inner, backbone)
             self._in_order[backbone] = InOrder(
-                model, self._inner, shown, scores, partial(self._dataset.claim, backbone)
+                model, self._sequence(backbone), shown, scores, partial(self._dataset.claim, backbone)
             )
         return self._in_order[backbone]
 
     def _model(self, backbone: str) -> Backbone:
         """The model, fitted to this sequence's first images."""
         if backbone not in self._fitted:
-            model = self._dataset.model(backbone)
+            model = self._unfitted(backbone)
             self._fitted[backbone] = model.fit(first_images(self._inner, model.fit_frames))
         return self._fitted[backbone]
+
+    def _unfitted(self, backbone: str) -> Backbone:
+        """The model as it is loaded; the scene's own labels are a model of this scene alone."""
+        return self._stored(backbone)[1] if self._takes_stored(backbone) else self._dataset.model(backbone)
+
+    def _sequence(self, backbone: str) -> ImageSequence:
+        """What the model is shown."""
+        return self._stored(backbone)[0] if self._takes_stored(backbone) else self._inner
+
+    def _takes_stored(self, backbone: str) -> bool:
+        config = self._dataset.predictors.get(backbone)
+        return config is not None and config.backbone == STORED
+
+    def _stored(self, backbone: str) -> tuple[StoredSequence, Backbone]:
+        with self._lock:
+            if backbone not in self._of_labels:
+                self._of_labels[backbone] = stored_labels(self._dataset.predictors[backbone], self._inner)
+            return self._of_labels[backbone]
+
+
+def _with_remedies(options: PredictedOptions) -> Iterator[PredictorConfig]:
+    """The backbones, each followed by itself behind each of the remedies."""
+    for predictor in options.backbones:
+        yield predictor
+        for remedy in options.remedies:
+            filters = remedy.split("+")
+            name = (
+                None if predictor.name is None else "-".join([predictor.name, *(f.replace(":", "-") for f in filters)])
+            )
+            yield predictor.model_copy(update={"filters": [*predictor.filters, *filters], "name": name})
 
 
 def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
@@ -271,12 +345,3 @@ def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
     for array in (image, frame.depth, frame.T_wc):
         digest.update(np.ascontiguousarray(array).data)
     return digest.digest()
-
-
-REGISTRY.register(
-    NAME,
-    Entry(
-        "semstab.predict.live:PredictedDataset",
-        "another dataset with labels that models make while it is fused: `run --predict`",
-    ),
-)

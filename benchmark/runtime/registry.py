@@ -1,7 +1,7 @@
 """What can be named on the command line: a table from name to class, imported on first use.
 
 Built-in entries are one line each; other packages add theirs with the entry point groups
-`semstab.backends`, `semstab.datasets` and `semstab.backbones`.
+`semstab.backends`, `semstab.datasets`, `semstab.backbones` and `semstab.filters`.
 """
 
 from __future__ import annotations
@@ -32,10 +32,6 @@ class Registry:
     def __init__(self, kind: str, builtin: Mapping[str, Entry]) -> None:
         self.kind = kind
         self.builtin = dict(builtin)
-
-    def register(self, name: str, entry: Entry) -> None:
-        """Name a class of a layer above, which does so itself when it is imported."""
-        self.builtin[name] = entry
 
     def entries(self) -> dict[str, Entry]:
         """Every known entry by name; a built-in name is not replaced by a plug-in's."""

@@ -7,7 +7,7 @@ probability that a class drawn from s_t equals one drawn from s_u.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -176,23 +176,31 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
 
     Without events only one-hot evidence tells how the frames agree on a class: NaN where other evidence is there.
     """
+    return class_agreement_of(class_sums(table, events), table.classes)
+
+
+def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
+    """(7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2."""
     again, of = table.op >= 2, np.repeat(np.arange(len(table)), np.diff(table.evidence.starts))
     used = again[of]  # classes that nobody saw in a voxel are no disagreement there
     k, e, squares = table.evidence.label[used], table.evidence.weight[used], _squares(table, events)[used]
     T = table.op[of][used].astype(np.float64)
     disagreement = 2 * ((T - 1) * e - e**2 + squares) / (T * (T - 1))
     voxels, n = np.count_nonzero(again), table.op[again].sum(dtype=np.float64)
+    columns = (e, e / T, disagreement, T * disagreement, squares)
+    sums = [np.bincount(k, weights=values, minlength=table.K) for values in columns]
+    return np.stack([*sums, np.full(table.K, voxels), np.full(table.K, n)]).astype(np.float64)
 
-    def by_class(values: Float64) -> Float64:
-        return np.bincount(k, weights=values, minlength=table.K).astype(np.float64)
 
-    total = by_class(e)
+def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[ClassAgreement, ...]:
+    """Kappa and alpha of each class, from `class_sums`."""
+    total, shares, apart, weighted, squares, voxels, n = sums
     with np.errstate(invalid="ignore", divide="ignore"):
-        p = by_class(e / T) / voxels
-        kappa = _beyond_chance(1 - by_class(disagreement) / voxels, 1 - 2 * p * (1 - p))
-        expected = 2 * ((n - 1) * total - total**2 + by_class(squares)) / (n * (n - 1))
-        alpha = _beyond_chance(1 - by_class(T * disagreement) / n, 1 - expected)
-    names = table.classes or tuple(str(k) for k in range(table.K))
+        p = shares / voxels
+        kappa = _beyond_chance(1 - apart / voxels, 1 - 2 * p * (1 - p))
+        expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
+        alpha = _beyond_chance(1 - weighted / n, 1 - expected)
+    names = classes or tuple(str(k) for k in range(len(total)))
     rows = zip(names, total, kappa, alpha, strict=True)
     return tuple(ClassAgreement(name, *(float(value) for value in values)) for name, *values in rows)
 

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics import strata
 from semstab.metrics.matching import require_same_map
-from semstab.metrics.summary import STRATA
-from semstab.model.measures import MeasureMeans, dominant, mean, measures, sbd, vss
+from semstab.metrics.summary import STRATA, TableSums
+from semstab.model.measures import dominant, mean
+from semstab.model.results import TableSummary
 from semstab.model.statistics import (
     BeyondCoin,
     BlockCut,
+    ClassAgreement,
     CorrectnessStatistics,
     DriftStatistics,
     DriftTests,
@@ -32,14 +33,11 @@ from semstab.model.statistics import (
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
-    alpha_columns,
     alpha_of,
     between_of,
     class_agreement,
-    disagreement,
-    kappa_columns,
+    class_agreement_of,
     kappa_of,
-    psa,
     ratio_of,
 )
 from semstab.statistics.ceiling import losses
@@ -62,11 +60,19 @@ from semstab.statistics.drift import (
     voxel_drift,
 )
 from semstab.statistics.flipping import flipping
-from semstab.statistics.looks import Sample, correlogram, reach_of
-from semstab.statistics.sampling import InfluenceSums, Places, influence_sums, judged_of
+from semstab.statistics.looks import Sample, correlogram, reach_from
+from semstab.statistics.map_sums import (
+    BY_STRATUM,
+    Maps,
+    MapSums,
+    maps_of,
+    mean_columns,
+    place_sums,
+    stratum_sums,
+)
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, judged_of, with_sample
 from semstab.statistics.scene_drift import scene_drift
 from semstab.statistics.steady import steady
-from semstab.statistics.uncertainty import decompose
 from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
@@ -74,7 +80,6 @@ FALSE_DISCOVERIES = 0.05
 """Rate at which trending voxels are named."""
 
 Float64 = npt.NDArray[np.float64]
-Maps = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +141,13 @@ def analyse(
     if events is not None:
         require_same_map(table, events)
     again = table.op >= 2
-    means = _Means(again, Places(table.index[again], table.voxel_size))
-    maps: Maps = {"psa": psa(table), "stable": steady(table)}
+    drift = None if events is None else voxel_drift(table, events, seed=seed)
+    maps = maps_of(table, expected_sbd(table) if drift is None else drift.null)
+    places = Places(table.index[again], table.voxel_size)
+    means = _Means(place_sums(table, maps, places), places, again)
     known = None if truth is None else join_truth(table, truth)
-    agreement = _agreement(table, events, means, maps)
-    drift = _drift(table, events, means, maps, seed)
-    uncertainty = _uncertainty(table, means, maps)
+    agreement = _agreement(means, class_agreement(table, events))
+    by_log = None if drift is None or events is None else _by_log(table, events, drift, means, maps, seed)
     right = None if known is None else _correctness(table, known, means, maps, edges)
     sums = influence_sums(
         table,
@@ -149,120 +155,169 @@ def analyse(
         None if known is None else known.label,
         sample=None if sample is None else sample.shared(),
         sbd_excess=maps["sbd_excess"],
-        edge=means.places.edge,
+        edge=places.edge,
     )
-    judged = judged_of(sums)
-    flips_at = flipping(table, maps["stable"], means.places)
-    repeats = int(np.count_nonzero(again))
-    repeated = Repeated(repeats, repeats / len(table) if len(table) else math.nan)
-    reach = None if sample is None else reach_of(sample, table, sums, critical=critical)
-    said = verdict(
-        name or "backbone",
-        judged=judged,
-        reach=reach,
-        flips=flips_at,
-        voxels=repeated.voxels,
-        share=repeated.share,
-        blocks=means.places.count,
-    )
-    summary = MapStatistics(
-        schema=SCHEMA,
-        name=name,
-        seed=seed,
-        K=table.K,
-        voxel_size=table.voxel_size,
-        voxels=len(table),
-        observations=int(table.op.sum(dtype=np.int64)),
-        repeated=repeated,
-        blocks=BlockCut(means.places.count, judged.alpha.block_size),
-        verdict=said,
+    stable = steady(table)
+    about = _About(name, seed, critical, TableSums.of(table, edges).summary(table.voxel_size, table.classes, edges))
+    summary = _concluded(
+        about,
+        means,
+        sums,
+        sample,
         agreement=agreement,
-        flipping=flips_at,
-        judged=judged,
-        reach=reach,
-        correlogram=None if sample is None else correlogram(sample),
-        drift=drift,
-        uncertainty=uncertainty,
+        flipping=flipping(table, stable, places),
+        drift=_drift(means, by_log),
+        strata=_strata(about.table, stratum_sums(table, maps, edges)),
         geometry=None if limit is None else losses(table, limit, seed=seed),
         correctness=right,
         fusion_rules=None if events is None else _fusion_rules(table, events, known),
-        strata=_strata(table, maps, edges),
-        beyond_coin=_beyond_coin(table, means, maps),
     )
-    return Analysis(summary, maps, sums)
+    return Analysis(summary, {**maps, "stable": stable}, sums)
+
+
+def analyse_sums(
+    sums: MapSums,
+    *,
+    voxel_size: float,
+    classes: tuple[str, ...] = (),
+    sample: Sample | None = None,
+    name: str = "",
+    seed: int = 0,
+    edges: Sequence[int] = STRATA,
+    critical: Sequence[str] = (),
+) -> tuple[MapStatistics, InfluenceSums]:
+    """What `analyse` says of a map without log and ground truth, from its sums, which may be those of its parts."""
+    about = _About(name, seed, critical, sums.table.summary(voxel_size, classes, edges))
+    means = _Means(sums.places)
+    influence = sums.influence if sample is None else with_sample(sums.influence, sample.shared())
+    summary = _concluded(
+        about,
+        means,
+        influence,
+        sample,
+        agreement=_agreement(means, class_agreement_of(sums.classes, classes)),
+        drift=_drift(means),
+        strata=_strata(about.table, sums.strata),
+    )
+    return summary, influence
 
 
 # --- Sections ---------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _About:
+    """Of a map: what the verdict calls it and depends on, the seed of what is drawn, its means."""
+
+    name: str
+    seed: int
+    critical: Sequence[str]
+    table: TableSummary
+
+
 class _Means:
-    """Means over the voxels with OP >= 2, with their intervals for this map."""
+    """Means over the voxels with OP >= 2, with their intervals for this map; more of them for a table at hand."""
 
-    def __init__(self, again: npt.NDArray[np.bool_], places: Places) -> None:
-        self.again = again
+    def __init__(
+        self, sums: PlaceSums, places: Places | None = None, again: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        self.sums = sums
         self.places = places
+        self.again = again
 
-    def mean(self, values: Float64, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
-        """Of values (n,) where they are defined."""
-        own = values[self.again]
-        defined = ~np.isnan(own)
-        return self.places.estimate(np.stack([np.where(defined, own, 0.0), defined], axis=1), ratio_of, bounds)
+    def mean(self, name: str, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
+        """Of values by name, where they are defined."""
+        return self.sums.estimate(name, ratio_of, bounds)
+
+    def agreement(self, name: str, statistic: Callable[[Float64], Float64]) -> Interval:
+        """Agreement beyond chance."""
+        return self.sums.estimate(name, statistic, (-1.0, 1.0), "agreement")
+
+    def of(self, values: Float64, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
+        """The mean of values (n,) of the table's voxels, where they are defined."""
+        return self.function(mean_columns(values), ratio_of, bounds)
 
     def function(
-        self,
-        columns: Float64,
-        statistic: Callable[[Float64], Float64],
-        bounds: tuple[float, float] = (0.0, 1.0),
+        self, columns: Float64, statistic: Callable[[Float64], Float64], bounds: tuple[float, float] = (0.0, 1.0)
     ) -> Interval:
-        """Of a statistic of the sums of columns (m, C) of the m voxels with OP >= 2."""
-        return self.places.estimate(columns, statistic, bounds)
-
-    def of_table(
-        self,
-        table: VoxelTable,
-        columns: Callable[[VoxelTable], Float64],
-        statistic: Callable[[Float64], Float64],
-    ) -> Interval:
-        """Of agreement beyond chance by the sums of the columns (m, C) that are made of these voxels.
-
-        The first column is agreement itself, the second its weight.
-        """
-        return self.places.estimate_of(table, np.flatnonzero(self.again), columns, statistic, (-1.0, 1.0), "agreement")
+        """Of a statistic of the sums of columns (n, C) of the table's voxels."""
+        assert self.places is not None
+        assert self.again is not None
+        return self.places.estimate(columns[self.again], statistic, bounds)
 
 
-def _agreement(table: VoxelTable, events: Events | None, means: _Means, maps: Maps) -> FrameAgreement:
-    T = table.op[means.again].astype(np.float64)
-    parts = dict(zip(("disagreement_within", "disagreement_between"), disagreement(table), strict=True))
-    within, between = (T * part[means.again] for part in parts.values())
-    maps |= parts
+def _concluded(
+    about: _About,
+    means: _Means,
+    sums: InfluenceSums,
+    sample: Sample | None,
+    **sections: Any,
+) -> MapStatistics:
+    """All of it, from what was found section by section."""
+    judged, table, count = judged_of(sums), about.table, len(means.sums.cell)
+    repeats = int(means.sums["psa"][1])
+    repeated = Repeated(repeats, repeats / table.voxels if table.voxels else math.nan)
+    reach = None if sample is None else reach_from(sample.by, means.sums["kappa"][2:], sums, critical=about.critical)
+    said = verdict(
+        about.name or "backbone",
+        judged=judged,
+        reach=reach,
+        flips=sections.get("flipping"),
+        voxels=repeated.voxels,
+        share=repeated.share,
+        blocks=count,
+    )
+    return MapStatistics(
+        schema=SCHEMA,
+        name=about.name,
+        seed=about.seed,
+        K=table.K,
+        voxel_size=table.voxel_size,
+        voxels=table.voxels,
+        observations=table.observations,
+        repeated=repeated,
+        blocks=BlockCut(count, judged.alpha.block_size),
+        verdict=said,
+        judged=judged,
+        reach=reach,
+        correlogram=None if sample is None else correlogram(sample),
+        uncertainty=EntropyParts(means.mean("entropy"), means.mean("entropy_within"), means.mean("entropy_between")),
+        beyond_coin=BeyondCoin(means.sums.estimate("coin", _less, (-1.0, 1.0)), means.mean("steadier", (-1.0, 1.0))),
+        **({"flipping": None, "geometry": None, "correctness": None, "fusion_rules": None} | sections),
+    )
+
+
+def _agreement(means: _Means, classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
     return FrameAgreement(
-        psa=means.mean(maps["psa"]),
-        kappa=means.of_table(table, kappa_columns, kappa_of),
-        alpha=means.of_table(table, alpha_columns, alpha_of),
-        vss=means.mean(vss(table)),
-        within=means.function(np.stack([within, T], axis=1), ratio_of, (0.0, 1.0)),
-        between=means.function(np.stack([between, T], axis=1), ratio_of, (0.0, 1.0)),
-        alpha_between=means.of_table(table, alpha_columns, between_of),
-        each_place=means.of_table(table, lambda some: alpha_columns(some, np.ones(len(some))), between_of),
-        classes=class_agreement(table, events),
+        psa=means.mean("psa"),
+        kappa=means.agreement("kappa", kappa_of),
+        alpha=means.agreement("alpha", alpha_of),
+        vss=means.mean("vss"),
+        within=means.mean("within"),
+        between=means.mean("between"),
+        alpha_between=means.agreement("alpha", between_of),
+        each_place=means.agreement("each_place", between_of),
+        classes=classes,
     )
 
 
-def _drift(table: VoxelTable, events: Events | None, means: _Means, maps: Maps, seed: int) -> DriftStatistics:
-    """Against its null; without events only for one-hot evidence, and without tests."""
-    drift = None if events is None else voxel_drift(table, events, seed=seed)
-    null = expected_sbd(table) if drift is None else drift.null
-    maps |= {"sbd_null": null, "sbd_excess": sbd(table) - null}
-    known = ~np.isnan(null)
-    tested = None if drift is None or events is None else _tests(table, events, drift, means, maps, seed)
+def _drift(means: _Means, by_log: tuple[DriftTests, FlipRates] | None = None) -> DriftStatistics:
+    """Against its null; without a log only for one-hot evidence, and without tests."""
+    tests, changes = by_log or (None, None)
     return DriftStatistics(
-        voxels=int(known.sum()),
-        sbd=means.mean(np.where(known, sbd(table), np.nan)),
-        null=means.mean(null),
-        excess=means.mean(maps["sbd_excess"], (-1.0, 1.0)),
-        tests=tested,
-        flips=None if events is None else _flips(events, means, maps),
+        voxels=int(means.sums["null"][1]),
+        sbd=means.mean("sbd"),
+        null=means.mean("null"),
+        excess=means.mean("excess", (-1.0, 1.0)),
+        tests=tests,
+        flips=changes,
     )
+
+
+def _by_log(
+    table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, maps: Maps, seed: int
+) -> tuple[DriftTests, FlipRates]:
+    return _tests(table, events, drift, means, maps, seed), _flips(events, means, maps)
 
 
 def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, maps: Maps, seed: int) -> DriftTests:
@@ -276,7 +331,7 @@ def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, 
     }
     scene = scene_drift(table, events, drift, seed=seed)
     one_way, by_chance, all_of_it = trend_columns(table, drift).T
-    excess = np.stack([one_way - by_chance, all_of_it], axis=1)[means.again]
+    excess = np.stack([one_way - by_chance, all_of_it], axis=1)
     return DriftTests(
         sbd_p=scene.p_value,
         trend=scene.trend,
@@ -295,10 +350,10 @@ def _flips(events: Events, means: _Means, maps: Maps) -> FlipRates:
     changes = flips(events)
     maps |= {"flip_rate": changes.rate, "frames_since_flip": changes.since}
     return FlipRates(
-        rate=means.mean(changes.rate),
-        null=means.mean(changes.null),
-        excess=means.mean(changes.rate - changes.null, (-1.0, 1.0)),
-        frames_since=means.mean(changes.since, (0.0, math.inf)),
+        rate=means.of(changes.rate),
+        null=means.of(changes.null),
+        excess=means.of(changes.rate - changes.null, (-1.0, 1.0)),
+        frames_since=means.of(changes.since, (0.0, math.inf)),
     )
 
 
@@ -307,21 +362,15 @@ def _discoveries(q: Float64) -> int:
         return int(np.count_nonzero(q <= FALSE_DISCOVERIES))
 
 
-def _uncertainty(table: VoxelTable, means: _Means, maps: Maps) -> EntropyParts:
-    parts = decompose(table)
-    maps |= {"entropy_within": parts.within, "entropy_between": parts.between}
-    return EntropyParts(means.mean(parts.total), means.mean(parts.within), means.mean(parts.between))
-
-
 def _correctness(
     table: VoxelTable, truth: Truth, means: _Means, maps: Maps, edges: Sequence[int]
 ) -> CorrectnessStatistics:
     maps |= {"true_label": truth.label, "stable_wrong": stable_wrong(table, truth)}
     right = np.where(truth.known, dominant(table) == truth.label, np.nan)
-    counted = truth.known & means.again
-    everywhere = Places(table.index, table.voxel_size, means.places.edge)
+    counted = truth.known & (table.op >= 2)
+    everywhere = Places(table.index, table.voxel_size, means.sums.edge)
     return CorrectnessStatistics(
-        accuracy=means.mean(right),
+        accuracy=means.of(right),
         strata=by_stratum(table, truth, edges),
         reliability=reliability(table.evidence.take(counted), truth.label[counted]),
         quadrants=quadrants(table, truth, everywhere),
@@ -340,36 +389,20 @@ def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tup
     return tuple(rows)
 
 
-def _beyond_coin(table: VoxelTable, means: _Means, maps: Maps) -> BeyondCoin:
-    """PSA does not depend on OP for a coin, nor does SBD on the order."""
-    op, agreement = table.op[means.again], maps["psa"][means.again]
-    excess = np.where(table.op > 2, maps["sbd_excess"], np.nan)
-    groups = [np.stack([agreement * where, where], axis=1) for where in (op == 2, op > 2)]
-    return BeyondCoin(
-        means.function(np.concatenate(groups, axis=1), _less, (-1.0, 1.0)), means.mean(-excess, (-1.0, 1.0))
-    )
-
-
 def _less(sums: Float64) -> Float64:
     """A ratio less another, (...,) from sums (..., 4)."""
     return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
 
 
-def _strata(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> tuple[StratumStatistics, ...]:
-    values = {measure: measure.of(table) for measure in measures()}
-    rows = []
-    for name, low, high in strata(edges):
-        where = (table.op >= low) & (table.op <= high)
-        rows.append(
-            StratumStatistics(
-                name,
-                int(np.count_nonzero(where)),
-                MeasureMeans.over(values, table.op, where),
-                psa=mean(maps["psa"][where]),
-                sbd_null=mean(maps["sbd_null"][where]),
-                sbd_excess=mean(maps["sbd_excess"][where]),
-                entropy_within=mean(maps["entropy_within"][where]),
-                entropy_between=mean(maps["entropy_between"][where]),
-            )
+def _strata(table: TableSummary, sums: Float64) -> tuple[StratumStatistics, ...]:
+    with np.errstate(invalid="ignore"):
+        values = dict(zip(BY_STRATUM, sums[::2] / sums[1::2], strict=True))
+    return tuple(
+        StratumStatistics(
+            stratum.name,
+            stratum.voxels,
+            stratum.means,
+            **{name: float(value[g]) for name, value in values.items()},
         )
-    return tuple(rows)
+        for g, stratum in enumerate(table.strata)
+    )

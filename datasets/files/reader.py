@@ -88,6 +88,20 @@ class FileDataset(Dataset, Generic[Options]):
             return None
         return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs")
 
+    def depth_files(self, folder: Path, before: str, after: str, *, instead: Iterable[str]) -> dict[str, Path]:
+        """The depth images of a folder by name, as `files_named` finds them.
+
+        instead  names of frames, by their poses or images, which a surface gives depth where no depth image is there
+        """
+        there = files_named(folder, before, after)
+        if self.options.surface is None:
+            return there
+        return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
+
+    def has_depth(self, folder: Path) -> bool:
+        """Whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
+        return self.options.surface is not None or folder.is_dir()
+
     def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
         """By label source, a table (65536,) from the ids of its files to those of its taxonomy, where they differ."""
         return {}
@@ -135,6 +149,11 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
     fitting = (entry for entry in entries if entry.startswith(before) and entry.endswith(after))
     names = (entry[len(before) : len(entry) - len(after)] for entry in fitting if not entry.startswith("."))
     return {name: folder / f"{before}{name}{after}" for name in sorted(names, key=natural) if name}
+
+
+def images_named(folder: Path, before: str = "", after: str = "") -> list[str]:
+    """The names of a folder's colour images 'BEFORE name AFTER.png', or of another kind."""
+    return [name for suffix in COLOR_SUFFIXES for name in files_named(folder, before, f"{after}{suffix}")]
 
 
 def frames_of(

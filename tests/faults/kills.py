@@ -95,6 +95,10 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
     common = ["--data", str(wall), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
     return {
         "run": (lambda out: [*common, "--out", str(out)], of_run),
+        "tiles": (
+            lambda out: [*common, "--tile-size", "8", "--jobs", "2", "--rerun", "off", "--out", str(out)],
+            of_run,
+        ),
         "study": (lambda out: ["study", str(study), "--report", "off", "--quiet", "--out", str(out)], of_run),
         "predict": (
             lambda out: ["predict", "-m", "colour-clusters", "--data", str(flight), "--out", str(out), "--quiet"],

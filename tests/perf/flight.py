@@ -15,13 +15,13 @@ import semstab
 ALTITUDE, PITCH, STEP, WRONG = 45.0, np.radians(50), 1.5, 0.02
 
 
-def frame(index: int, width: int, height: int, K: int) -> semstab.Frame:
-    """Frame `index` of the flight, labels in 0..K-1."""
+def frame(index: int, width: int, height: int, K: int, at: tuple[float, float] | None = None) -> semstab.Frame:
+    """Frame `index` of the flight, labels in 0..K-1; taken over another place where one is given, metres."""
     f = width / (2 * np.tan(np.radians(30)))
     v, u = np.mgrid[:height, :width]
     R = np.array([[1, 0, 0], [0, -np.sin(PITCH), np.cos(PITCH)], [0, -np.cos(PITCH), -np.sin(PITCH)]])
     ray = np.stack([(u - width / 2) / f, (v - height / 2) / f, np.ones((height, width))], axis=-1) @ R.T
-    start = np.array([0.2 * index, STEP * index, ALTITUDE])
+    start = np.array([*(at or (0.2 * index, STEP * index)), ALTITUDE])
     z = ALTITUDE / -ray[..., 2]
     for _ in range(2):  # relief, near enough: where the ray meets the height of where it was before
         x, y = (start[axis] + ray[..., axis] * z for axis in (0, 1))

@@ -6,6 +6,7 @@ import concurrent.futures as cf
 import contextlib
 import dataclasses
 import importlib
+import importlib.metadata
 import multiprocessing
 import os
 from collections.abc import Generator, Sequence
@@ -157,12 +158,24 @@ class DaskCluster:
     def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """As they finish. The scheduler gives the job of a worker that died to another one."""
         with self._client:
+            self._require_same_version()
             futures = {self._client.submit(_run_settled, job, pure=False): job for job in jobs}
             try:
                 for future in _distributed().as_completed(list(futures), loop=self._client.loop):
                     yield futures[future], _outcomes(future, futures[future])
             finally:
                 self._client.cancel(list(futures))
+
+    def _require_same_version(self) -> None:
+        """Raise ConfigError where a worker's semstab is missing, or another one."""
+        own = importlib.metadata.version("semstab")
+        try:
+            there = self._client.run(importlib.metadata.version, "semstab")
+        except importlib.metadata.PackageNotFoundError as error:
+            raise ConfigError("a worker of the scheduler has no semstab; install semstab there") from error
+        for worker, version in there.items():
+            if version != own:
+                raise ConfigError(f"worker {worker} has semstab {version}, here is {own}; install the same on both")
 
 
 def _run_settled(job: Job) -> tuple[Outcome, ...]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,19 +21,35 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
+from semstab.engine.tiling.portion import PORTIONS, About, Finished, Portion, series_array
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import compare, macro_mean, summarise
 from semstab.metrics.matching import rows_of
-from semstab.model.measures import dominant, mean, measures, vss
-from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, UnitContent
-from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
+from semstab.metrics.summary import TableSums
+from semstab.model.measures import dominant, measures, vss
+from semstab.model.parquet import Tile
+from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
+from semstab.model.results import (
+    RECURRENT,
+    STAGES,
+    Agreement,
+    FrameDrift,
+    ReducedScores,
+    SizeAlpha,
+    TableSummary,
+    UnitSummary,
+    slug,
+)
+from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
-from semstab.statistics import Analysis, Sample, krippendorff_alpha
+from semstab.statistics import Analysis, Sample
+from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
+from semstab.statistics.map_sums import MapSums
 from semstab.task import Task, read
 
 WORST = 3
@@ -66,10 +83,19 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     if one.request.image_space and stream.image_space is not None:
         image_space = stream.image_space.result(summary.flicker_percent)
         content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
+        content = dataclasses.replace(content, quality=_quality(stream))
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_finished(unit, table, summary))
     return Outcome(one.request.identity, content, files=returned)
+
+
+def _quality(stream: Stream) -> FrameQuality | None:
+    """What the labels of single frames are worth, where that is asked for."""
+    if stream.judge is None:
+        return None
+    made = stream.task.scene.filtering(stream.task.backbone)
+    return stream.judge.result(made.model, made.filters, made.milliseconds)
 
 
 def _table(backend: FusionBackend, task: Task) -> VoxelTable:
@@ -85,13 +111,16 @@ def sample_of(one: UnitMap) -> Sample | None:
 
 
 def _require_voxels(task: Task, config: Config, table: VoxelTable) -> None:
-    """Raise DataError, which says what is missing in the first frame, where the map is empty."""
-    if len(table):
-        return
+    if not len(table):
+        raise no_voxels(task, config)
+
+
+def no_voxels(task: Task, config: Config) -> DataError:
+    """What to raise where a map is empty: it says what is missing in the first frame."""
     frame = read(task, task.indices[0], config.pixel_stride)
     depth = np.mean(np.isfinite(frame.depth) & (frame.depth > 0))
     labelled = np.mean(frame.predicted != frame.ignore_id)
-    raise DataError(
+    return DataError(
         f"{task.scene.name}, {task.backbone}: no pixel of {len(task.indices)} frames is valid (first frame: depth in"
         f" {depth:.0%} of the pixels, a label in {labelled:.0%}); check depth_scale, the ignore id and the taxonomy"
     )
@@ -106,30 +135,55 @@ def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
 
 
 def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
+    return unit_summary(
+        one.task,
+        one.rows,
+        summarise(table, one.request.config.strata),
+        None if found is None else found.summary,
+        None if one.hard is None else reduced_of(reduced_sums(one.hard.table())),
+        () if one.sizes is None else one.sizes.alphas(),
+    )
+
+
+def unit_summary(
+    task: Task,
+    rows: Sequence[FrameRow],
+    table: TableSummary,
+    statistics: MapStatistics | None,
+    reduced: ReducedScores | None,
+    sizes: tuple[SizeAlpha, ...],
+) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
-    task, config, rows = one.task, one.request.config, one.rows
     stages = [row.stage_ms() for row in rows]
     return UnitSummary(
         unit=task.units[0],
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
-        table=summarise(table, config.strata),
+        table=table,
         flicker_percent=macro_mean([row.flicker_percent for row in rows]),
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
         stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
         left_out=sum(row.left_out for row in rows),
         frames_left_out=task.left_out,
         frames_empty=sum(row.report.points == 0 for row in rows),
-        statistics=None if found is None else found.summary,
-        reduced=None if one.hard is None else _reduced(one.hard.table()),
+        statistics=statistics,
+        reduced=reduced,
         worst_frames=tuple(_worst(rows)),
-        sizes=() if one.sizes is None else one.sizes.alphas(),
+        sizes=sizes,
     )
 
 
-def _reduced(table: VoxelTable) -> ReducedScores:
-    values = vss(table)
-    return ReducedScores(mean(values), mean(values[table.op >= RECURRENT]), krippendorff_alpha(table))
+def reduced_sums(table: VoxelTable) -> npt.NDArray[np.float64]:
+    """What `reduced_of` is a function of: sums over voxels."""
+    values, recurrent = vss(table), table.op >= RECURRENT
+    means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
+    alpha = sum((alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks()), np.zeros(()))
+    return np.concatenate([means, np.atleast_1d(alpha)])
+
+
+def reduced_of(sums: npt.NDArray[np.float64]) -> ReducedScores:
+    """What soft scores come to as labels, from the sums of their map."""
+    return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
 
 
 def _worst(rows: Sequence[FrameRow]) -> list[FrameDrift]:
@@ -138,6 +192,59 @@ def _worst(rows: Sequence[FrameRow]) -> list[FrameDrift]:
     usual = np.median([frame.voxels for frame in found]) if found else 0
     met = [frame for frame in found if frame.voxels >= max(1, usual)]
     return sorted(met, key=lambda frame: -frame.drift)[:WORST]
+
+
+def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> Outcome:
+    """Write what is left of a portion of a unit in tiles: of the map its voxels, tile by tile, and sums."""
+    portion = one.request.portion
+    assert portion is not None
+    with watch("measure"):
+        table = _table(one.backend, one.task) if one.request.fuses else None
+        sums = {} if table is None else _sums_of(table, one.request.config.strata, judged=portion.judged)
+    with watch("reference"):
+        checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
+    with watch("write"):
+        saved, returned = _written(job, _portion_savers(stream, one, portion, table))
+        image_space = None if stream.image_space is None else stream.image_space.result(math.nan)
+        finished = Finished(
+            About(saved, checked, image_space, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
+            series_array(one.rows),
+            sums,
+            np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
+            np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),
+        )
+        _, left = _written(job, {f"{PORTIONS}/{portion.key}/{portion.name}.npz": finished.save})
+    return Outcome(one.request.identity, portion=portion.name, files=returned | left)
+
+
+def _sums_of(table: VoxelTable, edges: Sequence[int], *, judged: bool) -> dict[str, npt.NDArray[Any]]:
+    if not judged:
+        return TableSums.of(table, edges).arrays()
+    return MapSums.of(table, edges).arrays()
+
+
+def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, table: VoxelTable | None) -> Savers:
+    unit = one.task.units[0]
+    savers: Savers = {}
+    if one.request.image_space:
+        savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
+    if one.sampler is not None:
+        savers[f"{LOOKS}/{unit.slug}.parquet"] = one.sampler.looks(one.task.mapping.target.classes).save
+    if table is not None and portion.part is not None and portion.kept:
+        for tile, rows in tiles_of(table, portion.part.size, portion.key):
+            savers[f"{VOXELS}/{unit.slug}/{tile.name}"] = partial(save_voxels, rows, tile=tile)
+    return savers
+
+
+def tiles_of(table: VoxelTable, size: int, key: str) -> Iterator[tuple[Tile, VoxelTable]]:
+    """The voxels of a table by tile of that edge, of the map of that key."""
+    shift = size.bit_length() - 1
+    place = np.stack([table.ix >> shift, table.iy >> shift], axis=1)
+    tiles, of = np.unique(place, axis=0, return_inverse=True)
+    order = np.argsort(of.ravel(), kind="stable")
+    bounds = np.concatenate([[0], np.cumsum(np.bincount(of.ravel(), minlength=len(tiles)))])
+    for (x, y), first, last in zip(tiles.tolist(), bounds, bounds[1:], strict=False):
+        yield Tile(x, y, size, key), table.rows(order[first:last])
 
 
 def _savers(
@@ -180,10 +287,15 @@ def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]
     return digests, returned
 
 
-def save_voxels(table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
+def save_voxels(
+    table: VoxelTable,
+    path: Path,
+    columns: Mapping[str, npt.NDArray[Any]] | None = None,
+    tile: Tile | None = None,
+) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
     own = {measure.key: measure.of for measure in measures()}
-    table.save(path, columns, {**own, "label": dominant})
+    table.save(path, columns, {**own, "label": dominant}, tile)
 
 
 def _save_text(text: str, path: Path) -> None:

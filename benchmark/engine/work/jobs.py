@@ -9,8 +9,11 @@ from pathlib import Path
 
 from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
+from semstab.engine.tiling.partition import Tiling
+from semstab.engine.tiling.portion import Portion
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
+from semstab.model.extent import Extent
 from semstab.model.records import UnitContent
 from semstab.runtime.files import TEMPORARY
 
@@ -22,6 +25,7 @@ class Request:
     config    with its frames one by one: those of its sequence that all label sources of the plan have
     left_out  how many selected frames lack a file or a pose
     regions   whether it is the flicker of regions without classes, and nothing is fused
+    portion   what of a unit in tiles is wanted; None for all of a unit
     """
 
     identity: str
@@ -32,6 +36,39 @@ class Request:
     sampled: bool = False
     left_out: int = 0
     regions: bool = False
+    portion: Portion | None = None
+
+    @property
+    def within(self) -> Extent | None:
+        """The voxels that its map is restricted to."""
+        return None if self.portion is None or self.portion.part is None else self.portion.part.extent
+
+    @property
+    def fuses(self) -> bool:
+        """Whether there is a map."""
+        return self.portion is None or self.portion.part is not None
+
+    @property
+    def shown(self) -> bool:
+        """Whether observers are shown its frames, though there is no map."""
+        return not self.fuses and self.portion is not None and self.portion.kept
+
+    @property
+    def reduces(self) -> bool:
+        """Whether soft scores are also fused as labels."""
+        return self.image_space if self.portion is None else self.portion.reduces
+
+    @classmethod
+    def portions(cls, planned: PlannedUnit, key: str, tiling: Tiling) -> list[Request]:
+        """Those of a unit in tiles: of its frames, and of each part of its map."""
+        whole = replace(cls.of(planned), kept=False)
+        frames = replace(whole, sampled=False, portion=Portion(key, kept=planned.kept))
+        parts = []
+        for part in tiling.parts:
+            config = whole.config.model_copy(update={"frames": FrameSelection(list=part.frames)})
+            portion = Portion(key, part, planned.kept, planned.judged, planned.image_space)
+            parts.append(replace(whole, config=config, image_space=False, judged=False, portion=portion))
+        return [*parts, frames]
 
     @classmethod
     def of(cls, planned: Planned) -> Request:
@@ -71,6 +108,7 @@ class Job:
 class Outcome:
     """What became of a unit: what its file holds, or the one line that says why there is none.
 
+    portion  the name of what was computed of it, where that is not all
     files    further files of it by their path in the folder, where the worker does not see that folder
     cause    the exception, where the unit failed in this very process
     trace    where it was raised, if it is not semstab's own
@@ -79,6 +117,7 @@ class Outcome:
 
     identity: str
     content: UnitContent | None = None
+    portion: str | None = None
     error: str | None = None
     files: Mapping[str, bytes] = field(default_factory=dict)
     cause: BaseException | None = field(default=None, compare=False)

@@ -1,106 +1,84 @@
-"""Will a map fit into memory? Estimated from a few frames before the first one is fused, so that no run dies of it."""
+"""What a map takes: from a bound that costs one frame, or from what all frames see."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from semstab.backends import expected_bytes
+from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
-from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.runtime.memory import available_bytes
-from semstab.task import Task, read
-
-if TYPE_CHECKING:
-    from semstab.backends.shared.aggregator import Aggregator
+from semstab.task import Task
 
 GB = 1e9
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first, all new, is not looked at closer."""
-PROBES = 3
-"""Places of a sequence at which two consecutive frames are compared."""
 
 
 @dataclass(frozen=True)
-class Expected:
-    """What a task's maps will hold at most: voxels, observations, and the bytes of all its backends and results."""
+class Kind:
+    """What the bytes of a map depend on beside its size.
 
-    voxels: int
-    observations: int
-    bytes: int
-
-
-def require_memory(task: Task, config: Config, first: Frame) -> None:
-    """Refuse a task whose maps would not fit: in `memory_gb` where it is set, else in what is free.
-
-    `first` is the task's first frame. Further frames are read only where `DOUBT` times its voxels in each frame would
-    be too much: for a short sequence they would cost more than they tell.
-    Raises ConfigError that says how much is missing, and which settings change it.
+    backend  that fuses it
+    K        number of classes
+    soft     whether frames have scores
+    logged   whether every observation is kept, and the ground truth fused too
+    sampled  whether the reference follows a sample of its voxels
     """
-    free = available_bytes() if config.memory_gb is None else int(config.memory_gb * GB)
-    frames = len(task.indices)
-    voxels = DOUBT * frames * len(_pixels(task, config).observe(first.every(2)).key)
-    if _expected(task, config, voxels, voxels, soft=first.scores is not None).bytes <= free:
-        return
-    expected = estimate(task, config)
-    if expected.bytes <= free:
-        return
-    raise ConfigError(_too_large(task, config, expected, free))
+
+    backend: str
+    K: int
+    soft: bool = False
+    logged: bool = False
+    sampled: bool = False
+
+    def bytes(self, voxels: float, observations: float) -> float:
+        """Of a map of so many voxels and observations, with what comes of it."""
+        n, looks = int(voxels), int(observations)
+        fused = expected_bytes(self.backend, n, looks, self.K)
+        truth = expected_bytes(self.backend, n, looks, self.K) if self.logged else 0
+        logs = log_bytes(looks, self.K, soft=self.soft) if self.logged else 0
+        followed = expected_bytes("numpy", n // ONE_IN, looks // ONE_IN, self.K) if self.sampled else 0
+        return fused + truth + logs + followed + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
 
 
-def estimate(task: Task, config: Config) -> Expected:
-    """Voxels and bytes of a task's maps, from pairs of consecutive frames at a few places of the sequence.
-
-    The first frame's voxels, and as many new ones with each further frame as the second frame of a pair has on
-    average: too many where the camera comes back to a place.
-    """
-    pixels = _pixels(task, config)
-    seen, new, soft = [], [], False
-    for pair in _pairs(task.indices):
-        frames_there = [read(task, index, config.pixel_stride) for index in pair]
-        keys = [pixels.observe(frame).key.copy() for frame in frames_there]
-        soft = soft or any(frame.scores is not None for frame in frames_there)
-        seen += [len(key) for key in keys]
-        new += [int(np.isin(keys[1], keys[0], invert=True).sum())] if len(keys) > 1 else []
-    frames = len(task.indices)
-    voxels = np.mean(seen) + (frames - 1) * (np.mean(new) if new else 0)
-    return _expected(task, config, int(voxels), int(frames * np.mean(seen)), soft=soft)
+def limit(config: Config) -> int:
+    """Bytes that maps may take: `memory_gb` where it is set, else what is free."""
+    return available_bytes() if config.memory_gb is None else int(config.memory_gb * GB)
 
 
-def _pixels(task: Task, config: Config) -> Aggregator:
+def most_voxels(task: Task, config: Config, first: Frame) -> int:
+    """More voxels than a sequence shows, and observations, judged by its first frame."""
     from semstab.backends.shared.aggregator import Aggregator
 
-    return Aggregator(config.voxel_size, len(task.mapping.target))
+    seen = Aggregator(config.voxel_size, len(task.mapping.target)).observe(first.every(2))
+    return DOUBT * len(task.indices) * len(seen.key)
 
 
-def _too_large(task: Task, config: Config, expected: Expected, free: int) -> str:
+def too_large(task: Task, backends: Iterable[str], config: Config, voxels: float, needed: float, why: str = "") -> str:
+    """That a map does not fit, by how much, and which settings change it."""
+    free = limit(config)
     room = f"{free / GB:.2g} GB " + ("are free" if config.memory_gb is None else "is memory_gb")
-    keep_all = [name for name in task.backends if _keeps_observations(name)]
-    without = f", no backend that keeps every observation ({', '.join(keep_all)})" if keep_all else ""
-    without += ", no statistics" if config.statistics else ""
     return (
-        f"{task.scene.name}, {task.backbone}: about {expected.voxels / 1e6:.2g} million voxels of"
-        f" {config.voxel_size:g} m would take {expected.bytes / GB:.2g} GB, and {room}; use larger voxels (voxel_size),"
-        f" fewer frames (frames), a larger pixel_stride{without}; or set memory_gb to try all the same"
+        f"{takes(task, config, voxels, needed)}, and {room}; use larger voxels (voxel_size), fewer frames (frames), a"
+        f" larger pixel_stride{_without(backends, config)}; or set memory_gb to try all the same{why}"
     )
 
 
-def _pairs(indices: Sequence[int]) -> list[Sequence[int]]:
-    starts = sorted({round(place) for place in np.linspace(0, max(0, len(indices) - 2), PROBES)})
-    return [indices[start : start + 2] for start in starts]
+def takes(task: Task, config: Config, voxels: float, needed: float) -> str:
+    """What a map would take."""
+    return (
+        f"{task.scene.name}, {task.backbone}: about {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m would"
+        f" take {needed / GB:.2g} GB"
+    )
 
 
-def _expected(task: Task, config: Config, voxels: int, observations: int, *, soft: bool) -> Expected:
-    K = len(task.mapping.target)
-    maps = sum(expected_bytes(name, voxels, observations, K) for name in task.backends)
-    logs = log_bytes(observations, K, soft=soft) if config.statistics or config.events else 0
-    truth = expected_bytes(task.backends[0], voxels, observations, K) if config.statistics else 0
-    tables = (len(task.backends) + config.statistics) * result_bytes(voxels, K, soft=soft)
-    return Expected(voxels, observations, maps + logs + truth + tables)
+def _without(backends: Iterable[str], config: Config) -> str:
+    keep_all = [name for name in backends if _keeps_observations(name)]
+    without = f", no backend that keeps every observation ({', '.join(keep_all)})" if keep_all else ""
+    return without + (", no statistics" if config.statistics else "")
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:

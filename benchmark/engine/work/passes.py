@@ -16,14 +16,14 @@ from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.evaluation import truth_task
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow
-from semstab.engine.work.finish import finish
+from semstab.engine.work.finish import finish, finish_portion
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
-from semstab.engine.work.memory import require_memory
 from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
-from semstab.engine.work.stream import Decoded, Prepared, Stream, UnitMap, streams_of
+from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
 from semstab.errors import ConfigError, DataError
+from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.runtime.memory import available_bytes, resident_bytes
 from semstab.runtime.prefetch import Fetched, prefetch
@@ -110,11 +110,11 @@ class Pass:
         """Fuse and measure; the outcome of every unit that was not put off."""
         order = sorted(frozenset[int]().union(*(stream.indices for stream in self._streams)))
         decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
-        watched = [one for stream in self._streams for one in stream.maps if one.request.kept]
+        watched = [one for stream in self._streams for one in stream.maps if one.request.kept or one.request.shown]
         if watched:
             task = dataclasses.replace(watched[0].task, backends=tuple(one.task.backends[0] for one in watched))
             self.observers.tell(lambda observer: observer.group_started(task, watched[0].request.config))
-        for one in watched:
+        for one in (one for one in watched if one.request.kept):
             self.observers.tell(lambda observer, one=one: observer.unit_started(one.task.units[0], one.backend))  # type: ignore[misc]
         with contextlib.closing(decode) as frames:
             for index, fetched in zip(order, frames, strict=True):
@@ -139,10 +139,11 @@ class Pass:
             task = dataclasses.replace(task, left_out=request.left_out)
             truth = _truth_map(request.config, task) if request.config.statistics else None
             sampler, of_truth = (_sampler(request, task) if wanted else None for wanted in (request.judged, truth))
-            made = UnitMap(request, task, _new_map(request.config, task), truth, sampler, of_truth)
+            fused = _new_map(request.config, task, request.within) if request.fuses else NoMap()
+            made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
-                made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target))
-            if request.image_space and request.judged:
+                made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target), request.within)
+            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []
@@ -153,17 +154,23 @@ class Pass:
             color = self.observers.want_color or any(stream.shown == index for stream in self._streams)
             frame = self._scene.frame(index, self.job.backbone, color=color)
             wanted = any(stream.truth_task is not None and index in stream.indices for stream in self._streams)
-            return Decoded(index, frame, _ground_truth(self._scene, index) if wanted else None)
+            truth = _ground_truth(self._scene, index) if wanted else None
+            return Decoded(index, frame, truth, self._unfiltered(index))
         except Exception as error:  # noqa: BLE001 - raised again by `_feed`
             return Decoded(index, error=error)
+
+    def _unfiltered(self, index: int) -> Frame | None:
+        """What the model says of a frame without filters; None where that is not wanted, or it has none."""
+        if all(stream.judge is None for stream in self._streams):
+            return None
+        name = self._scene.filtering(self.job.backbone).model
+        return None if name == self.job.backbone else self._scene.frame(index, name, color=False)
 
     def _feed(self, stream: Stream, fetched: Fetched[Decoded]) -> None:
         """A frame into every map of a stream."""
         watched = [one for one in stream.maps if one.request.kept]
         with self._failing([one.request for one in stream.maps]):
             now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
-            if watched and not watched[0].rows:
-                require_memory(stream.task, watched[0].request.config, now.frame)
             for one in stream.maps:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
@@ -172,14 +179,14 @@ class Pass:
                     one.soft = one.soft or now.frame.scores is not None
             if watched:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
+            for one in (one for one in stream.maps if one.request.shown):
+                self.observers.tell(lambda observer, one=one: observer.frame_seen(one.task, now.frame))  # type: ignore[misc]
         lost = {outcome.identity for outcome in self._outcomes}
         stream.maps = [one for one in stream.maps if one.request.identity not in lost]
 
     def _integrate(self, one: UnitMap, now: Prepared, fetched: Fetched[Decoded]) -> FrameRow:
         frame = now.frame
-        if not one.rows:
-            if not one.request.kept:
-                require_memory(one.task, one.request.config, frame)
+        if not one.rows and one.request.fuses:
             _warm_up(one, frame)
         with self._watch(f"fuse {one.task.backends[0]}"):
             report = one.backend.integrate(frame)
@@ -192,9 +199,9 @@ class Pass:
         if one.sizes is not None:
             with self._watch("voxel sizes"):
                 one.sizes.add(fetched.item.index, frame)
-        if frame.scores is not None and one.request.image_space:
+        if frame.scores is not None and one.request.reduces:
             with self._watch("reduced scores"):
-                one.hard = one.hard or _map_without_log(one.request.config, one.task)
+                one.hard = one.hard or _map_without_log(one.request.config, one.task, one.request.within)
                 one.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if one.truth is not None and now.truth is not None:
             one.truth.integrate(now.truth)
@@ -209,7 +216,8 @@ class Pass:
         """The row, once the observers have seen it."""
         unit = one.task.units[0]
         what = f"{unit.scene} · {unit.backbone} · {unit.backend}"
-        self.observers.tell(lambda observer: observer.advanced(1, what))
+        if one.request.portion is None:
+            self.observers.tell(lambda observer: observer.advanced(1, what))
         if not one.request.kept:
             return row
         with self._watch("observe") as lap:
@@ -222,9 +230,14 @@ class Pass:
         while stream.maps:
             one = stream.maps.pop(0)
             with self._failing([one.request]):
-                self._outcomes.append(finish(self.job, stream, one, self.observers, self._watch))
+                self._outcomes.append(self._ended(stream, one))
         if watched:
             self.observers.tell(lambda observer: observer.group_finished(stream.task))
+
+    def _ended(self, stream: Stream, one: UnitMap) -> Outcome:
+        if one.request.portion is not None:
+            return finish_portion(self.job, stream, one, self._watch)
+        return finish(self.job, stream, one, self.observers, self._watch)
 
     def _make_room(self) -> None:
         """Put maps off to the next pass where they take more than the memory bound: half, but none that is watched."""
@@ -239,7 +252,7 @@ class Pass:
 
     def _require_room(self) -> None:
         """Fail the largest map where the memory left would not do for its end, before the system ends the process."""
-        maps = [one for stream in self._streams for one in stream.maps if one.rows]
+        maps = [one for stream in self._streams for one in stream.maps if one.rows and one.request.fuses]
         largest = self._room.lacking(maps) if maps else None
         if largest is None:
             return
@@ -258,12 +271,13 @@ class Pass:
             self._outcomes += failed([request for request in requests if request.identity not in lost], error)
 
 
-def _new_map(config: Config, task: Task) -> FusionBackend:
+def _new_map(config: Config, task: Task, within: Extent | None = None) -> FusionBackend:
     """An empty map; it keeps the history where that is to be written, or statistics are computed from it."""
     (backend,) = config.backends
     wanted = (config.events or config.statistics) and takes_option(backend.name, "history")
     options = ({"history": True} if wanted else {}) | backend.options
-    return create(backend.name, voxel_size=config.voxel_size, num_classes=len(task.mapping.target), **options)
+    K = len(task.mapping.target)
+    return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=within, **options)
 
 
 def _truth_map(config: Config, task: Task) -> FusionBackend | None:
@@ -271,8 +285,8 @@ def _truth_map(config: Config, task: Task) -> FusionBackend | None:
     return _map_without_log(config, task) if truth_task(task) else None
 
 
-def _map_without_log(config: Config, task: Task) -> FusionBackend:
-    return _new_map(config.model_copy(update={"statistics": False, "events": False}), task)
+def _map_without_log(config: Config, task: Task, within: Extent | None = None) -> FusionBackend:
+    return _new_map(config.model_copy(update={"statistics": False, "events": False}), task, within)
 
 
 def _sampler(request: Request, task: Task) -> Sampler:

@@ -17,14 +17,32 @@ from semstab.engine.series import FrameRow
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
 from semstab.engine.work.sizes import SizeMaps
-from semstab.metrics import flicker_percent
+from semstab.metrics import FrameJudge, flicker_percent
 from semstab.model.frames import Frame
+from semstab.model.results import FrameReport
+from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Sampler
 from semstab.task import Task, prepare
 
 SHOWN_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
+
+
+class NoMap:
+    """Stands for a map where frames are only looked at."""
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Nothing is fused."""
+        return FrameReport(frame.index, points=0, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
+
+    def table(self) -> VoxelTable:
+        """There is none."""
+        raise NotImplementedError
+
+    def events(self) -> Events | None:
+        """There are none."""
+        return None
 
 
 @dataclass(eq=False)
@@ -53,17 +71,21 @@ class UnitMap:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame as its scene has it, with its ground truth where that is wanted; or the error that came instead."""
+    """A frame as its scene has it; or the error that came instead.
+
+    truth  its ground truth, where that is wanted; model  what the model said before filters, where that is wanted
+    """
 
     index: int
     frame: Frame | None = None
     truth: Frame | None = None
+    model: Frame | None = None
     error: Exception | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes that it keeps in memory."""
-        return sum(frame.nbytes for frame in (self.frame, self.truth) if frame is not None)
+        return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +106,13 @@ class Stream:
         self.task = dataclasses.replace(
             maps[0].task, backends=tuple(one.task.backends[0] for one in maps if one.request.kept)
         )
+        self.whole = any(one.request.within is None for one in maps)
         self.pixel_stride = maps[0].request.config.pixel_stride
         self.indices = frozenset(self.task.indices)
         self.previous: Frame | None = None
         self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
+        wanted = self.image_space is not None and maps[0].request.config.frame_quality
+        self.judge = FrameJudge(len(self.task.mapping.target)) if wanted else None
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
         self.truth_task = truth_task(self.task) if takes_truth else None
         self.poses: list[Any] = []
@@ -101,11 +126,15 @@ class Stream:
         assert decoded.frame is not None
         frame = prepare(self.task, decoded.frame, self.pixel_stride)
         with watch("flicker") as lap:
-            flicker = _flicker_between(self.previous, frame)
+            flicker = _flicker_between(self.previous, frame) if self.whole else math.nan
         truth = self._truth(decoded)
         if self.image_space is not None:
             with watch("image space"):
                 self.image_space.add(frame, truth)
+        if self.judge is not None:
+            with watch("frame quality"):
+                model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
+                self.judge.add(frame, model, truth)
         if decoded.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
             frame = frame if color else dataclasses.replace(frame, color=None)

@@ -14,6 +14,7 @@ from semstab.outputs.export import las, mesh, ply, raster, tabular
 from semstab.outputs.export.onto import MEASURES as ONTO_MEASURES
 from semstab.outputs.export.onto import classify
 from semstab.outputs.export.voxels import Voxels, crs_name, voxels_of
+from semstab.statistics.commit import Commit
 
 __all__ = ["SUFFIXES", "Exported", "export"]
 
@@ -60,6 +61,7 @@ def export(
     measures: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
+    commit: str | Path | None = None,
     cell: int = 1,
     asprs: str | Path | None = None,
     onto: str | Path | None = None,
@@ -70,6 +72,7 @@ def export(
     scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
     measures  columns that go along: measures, op, category, psa, or what the run's Parquet file has
     min_op, classes  only voxels seen that often, of these dominant classes
+    commit    file of thresholds: only voxels whose label has the evidence that they ask for (`Commit`)
     cell      edge of a raster's cell, in voxels
     asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
     onto      a cloud: what is written is this cloud, classified; a point outside of all voxels takes the nearest one
@@ -83,11 +86,12 @@ def export(
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
+    thresholds = None if commit is None else Commit.load(commit)
     settings = Settings(cell, None if asprs is None else Path(asprs))
 
     @functools.cache
     def chosen(usual: tuple[str, ...] | None) -> Voxels:
-        return voxels_of(result, record, columns=measures or usual, min_op=min_op, classes=classes)
+        return voxels_of(result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds)
 
     if onto is not None:
         return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]

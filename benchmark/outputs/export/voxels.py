@@ -16,6 +16,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import categories
 from semstab.metrics.matching import rows_of
 from semstab.model import palette as colors
+from semstab.model import parquet
 from semstab.model.georeference import Georeference
 from semstab.model.labels import name_key
 from semstab.model.measures import dominant, measures
@@ -24,6 +25,7 @@ from semstab.model.results import slug
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.maps import Overview
 from semstab.statistics import psa
+from semstab.statistics.commit import Commit
 
 Float64 = npt.NDArray[np.float64]
 
@@ -81,8 +83,11 @@ def voxels_of(
     columns: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
+    commit: Commit | None = None,
 ) -> Voxels:
     """Those of a unit with OP >= min_op and one of these dominant classes, all where none is named.
+
+    With thresholds, of those the ones whose label has enough evidence.
 
     `columns` names measures, op, category, psa, or columns of the unit's Parquet file; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
@@ -94,8 +99,11 @@ def voxels_of(
     keep = table.op >= min_op
     if classes:
         keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
+    if commit is not None:
+        keep &= commit.decide(table) >= 0
     if not keep.any():
         limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
+        limits += " and the evidence that --commit asks for" if commit is not None else ""
         raise ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {int(table.op.max(initial=0))}")
     chosen = {name: _column(name, table, record.voxels_file) for name in columns or usual()}
     scene, backbone = record.unit.scene, record.unit.backbone
@@ -148,14 +156,11 @@ def _column(name: str, table: VoxelTable, file: Path) -> Column:
 
 def _kept_column(name: str, file: Path, known: Iterable[str]) -> Column:
     """A column that the run wrote beside those that every map has."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    kept = [field.name for field in pq.read_schema(file) if not pa.types.is_nested(field.type)]
+    kept = parquet.names_in(file)
     if name not in kept:
         there = sorted({*known, "op", "category", "psa", *kept} - {"ix", "iy", "iz", "label"})
         raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, there)}")
-    return Column(pq.read_table(file, columns=[name]).column(name).to_numpy())
+    return Column(VoxelTable.columns(file, [name])[name])
 
 
 def _colors(overview: Path, K: int) -> npt.NDArray[np.uint8]:

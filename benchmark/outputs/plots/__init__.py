@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from semstab.model.measures import measures
 from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
 from semstab.outputs.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
@@ -15,9 +16,11 @@ from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, inf
 from semstab.outputs.plots.histograms import Histograms, together
 from semstab.outputs.plots.judgement import statistics_figures
 from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability
+from semstab.outputs.plots.remedies import remedy_figure
 from semstab.outputs.plots.style import Figure
 from semstab.outputs.plots.sweeps import draw_sweep
 from semstab.outputs.plots.views import Views
+from semstab.outputs.remedies import of_interest, remedies
 from semstab.runtime.files import keep_only
 
 if TYPE_CHECKING:
@@ -57,8 +60,11 @@ def write_figures(
 def figures(result: Result, folder: str | Path, views: Views | None = None) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
     views = views or Views()
+    found = remedies(result)
+    result = of_interest(result)
     kept = [record for record in result.select() if record.voxels_file is not None]
     return [
+        *(remedy_figure(each, slug("remedies", each.model)) for each in found),
         *_overviews(result, kept, views, Path(folder) / OVERVIEW),
         *_distributions(kept, views),
         *_maps(result, kept, views),
@@ -130,6 +136,7 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
 
 
 def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
+    panels = " and ".join(measure.title for measure in measures() if measure.panel)
     for record in kept:
         scene, backbone = record.unit.scene, record.unit.backbone
         if scene in result.up:
@@ -137,9 +144,9 @@ def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
                 slug("stability_map", scene, backbone),
                 f"Stability from above: {scene}, {backbone}",
                 "The topmost voxel of each column along the up axis, beneath a ceiling where there is one, or of a wall"
-                " the foremost: its stability category and every measure; grey:"
-                " seen once, which says nothing. Values beyond a scale look like its end.",
-                f"Maps of {scene} from above with the stability category and each measure of {backbone}'s voxels.",
+                f" the foremost: (a) its stability category, then {panels}; grey: seen once, which says nothing. Values"
+                " beyond a scale, which has an arrow there, look like its end.",
+                f"Maps of {scene} from above with the stability category, {panels} of {backbone}'s voxels.",
                 partial(_draw_map, record, result.up[scene], views),
                 unit=record.unit.slug,
             )

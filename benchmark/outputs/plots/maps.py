@@ -57,7 +57,7 @@ def draw_stability(above: FromAbove) -> Figure:
     """Stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
     table, rows = above.table, above.rows
     shown = [measure for measure in measures() if measure.panel]
-    figure, (kind, *panels) = _panels(rows, 1 + len(shown))
+    figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
     _draw_categories(figure, kind, rows, categories(table))
     for axes, measure in zip(panels, shown, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
@@ -66,8 +66,8 @@ def draw_stability(above: FromAbove) -> Figure:
     titles = (f"stability{where}", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
-        _frame(axes)
-        _scale_bar(axes, rows.shape[1], above.cell)
+        framed(axes)
+        scale_bar(axes, rows.shape[1], above.cell)
     return figure
 
 
@@ -77,7 +77,7 @@ def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | Non
     `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel that is seen.
     """
     table, rows = above.table, above.rows
-    figure, panels = _panels(rows, 2 if wrong is None else 3)
+    figure, panels = map_panels(rows, 2 if wrong is None else 3)
     parts, again = decompose(table), table.op > 1
     most = math.log(2) / math.log(table.K)
     for axes, values in zip(panels, (parts.within, parts.between), strict=False):
@@ -90,8 +90,8 @@ def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | Non
     titles = ("entropy within frames", "entropy between frames", "right and wrong")
     for axes, letter, title in zip(panels, "abc", titles, strict=False):
         mark_panel(axes, letter, title)
-        _frame(axes)
-        _scale_bar(axes, rows.shape[1], above.cell)
+        framed(axes)
+        scale_bar(axes, rows.shape[1], above.cell)
     return figure
 
 
@@ -155,8 +155,8 @@ def draw_overview(above: FromAbove, overview: Overview) -> Figure:
     axes[-1].imshow(_painted(rows, label, palette), interpolation_stage="rgba")
     mark_panel(axes[-1], "abc"[len(images)], f"fused, {above.view}")
     for panel in axes:
-        _frame(panel)
-    _scale_bar(axes[-1], rows.shape[1], above.cell)
+        framed(panel)
+    scale_bar(axes[-1], rows.shape[1], above.cell)
     names = table.classes or tuple(str(k) for k in range(table.K))
     shown = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
     entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
@@ -172,7 +172,7 @@ def legend_columns(names: Sequence[str]) -> int:
     return max(1, min(len(names), int(PAGE / (LEGEND_KEY + LEGEND_LETTER * longest))))
 
 
-def _panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
+def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
     """A figure for n maps: up to three side by side, or for wide maps beneath each other in one column of the page."""
     height, width = rows.shape
     if width >= WIDE * height:
@@ -206,7 +206,7 @@ def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: npt.NDAr
     axes.imshow(_painted(rows, category, CATEGORY_COLORS), interpolation_stage="rgba")
     shades = ListedColormap(np.array(CATEGORY_COLORS) / 255)
     edges = np.arange(len(CATEGORIES) + 1) - 0.5
-    bar = _color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(CATEGORIES)), shades))
+    bar = color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(CATEGORIES)), shades))
     bar.set_ticks(range(len(CATEGORIES)), labels=[name.replace(" ", "\n") for name in CATEGORIES])
     bar.ax.tick_params(length=0)
 
@@ -224,7 +224,7 @@ def _draw_measure(
     image = colors.to_rgba(np.ma.masked_invalid(values[rows]), bytes=True)
     image[rows == EMPTY, :3] = BLANK
     axes.imshow(image, interpolation_stage="rgba")
-    _color_bar(figure, axes, colors, extend=_beyond(values, ends))
+    color_bar(figure, axes, colors, extend=_beyond(values, ends))
 
 
 def _beyond(values: Float64, ends: tuple[float, float]) -> str:
@@ -234,13 +234,14 @@ def _beyond(values: Float64, ends: tuple[float, float]) -> str:
     return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
 
 
-def _color_bar(figure: Figure, axes: Axes, colors: ScalarMappable, extend: str = "neither") -> Colorbar:
+def color_bar(figure: Figure, axes: Axes, colors: ScalarMappable, extend: str = "neither") -> Colorbar:
+    """Beneath a panel."""
     bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03, extend=extend)
     bar.outline.set_linewidth(0.4)
     return bar
 
 
-def _frame(axes: Axes) -> None:
+def framed(axes: Axes) -> None:
     """A thin frame and no ticks: the scale bar says the size."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.grid(visible=False)
@@ -254,7 +255,7 @@ def scale_length(width: float) -> float:
     return max(step * power for step in (1, 2, 5) if step * power <= width / 4)
 
 
-def _scale_bar(axes: Axes, cells: int, cell: float) -> None:
+def scale_bar(axes: Axes, cells: int, cell: float) -> None:
     """A bar of round length in the lower left corner."""
     from matplotlib.patheffects import withStroke
 

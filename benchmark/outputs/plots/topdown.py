@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,9 @@ Int64 = npt.NDArray[np.int64]
 EMPTY = -1
 LARGEST = 2000
 """Cells of a map's longer side; a larger map gets cells of several voxels."""
+
+MOST = LARGEST**2
+"""Voxels that are kept of a map that is looked at tile by tile."""
 
 LID, LIDDED = 0.4, 0.2
 """A map is cut open where more than the second share of its columns are covered by voxels of the upper part, the first
@@ -38,8 +42,10 @@ def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
     return right, np.cross(up_axis, right), up_axis
 
 
-def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
+def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) -> tuple[Int64, float]:
     """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
+
+    rank (n,) says which voxel of a cell is shown instead of the topmost one: the highest.
 
     The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
     each voxel covers the cells that a level square of its size touches.
@@ -54,7 +60,8 @@ def top_down(table: VoxelTable, up: npt.ArrayLike) -> tuple[Int64, float]:
     first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
     inside = ((cells >= first) & (cells <= last)).all(axis=1)
     cells, rows = cells[inside] - first, rows[inside]
-    order = np.argsort((centers @ up_axis)[rows], kind="stable")  # the topmost is written last
+    height = centers @ up_axis if rank is None else rank
+    order = np.argsort(height[rows], kind="stable")  # the topmost is written last
     image = np.full(last - first + 1, EMPTY, dtype=np.int64)
     image[tuple(cells[order].T)] = rows[order]
     return image[::-1], cell
@@ -71,6 +78,26 @@ def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tupl
     corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
     cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
     return cells, np.tile(np.arange(len(plane)), len(corners))
+
+
+def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
+    """Of a map that comes tile by tile the voxels that can be seen from above: a table that does not grow with it."""
+    factor, parts = 1, list[VoxelTable]()
+    for tile in tiles:
+        parts.append(_tops(tile, up, factor))
+        while sum(map(len, parts)) > MOST:
+            factor *= 2
+            parts = [_tops(part, up, factor) for part in parts]
+    return VoxelTable.joined(parts)
+
+
+def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
+    """The topmost voxel of each cell of so many voxels' width."""
+    right, ahead, up_axis = level_axes(up)
+    cells = np.floor(table.centers @ np.stack([right, ahead], axis=1) / (factor * table.voxel_size)).astype(np.int64)
+    order = np.lexsort([-(table.centers @ up_axis), cells[:, 1], cells[:, 0]])
+    first = (np.diff(cells[order], axis=0, prepend=cells[order][:1] - 1) != 0).any(axis=1)
+    return table.rows(np.sort(order[first]))
 
 
 def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool_], Float64, str]:
@@ -90,7 +117,7 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[npt.NDArray[np.bool
     covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
     if np.mean(covered_columns) <= LIDDED or high - low < 4 * table.voxel_size:
         return every, up_axis, "from above"
-    return heights <= cut, up_axis, f"from above, cut open at {cut:.3g} m"
+    return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
 
 
 def _area(table: VoxelTable, axis: Float64) -> int:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
+from semstab.model import parquet
 from semstab.model.records import Record, Tables
 from semstab.model.results import Unit
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.plots.histograms import Histograms, histograms
+from semstab.outputs.plots.histograms import Histograms, histograms, together
 from semstab.outputs.plots.statistics import DriftByOP
-from semstab.outputs.plots.topdown import FromAbove
+from semstab.outputs.plots.topdown import FromAbove, topmost
 from semstab.statistics import expected_sbd
 
 LARGEST = 2e8
@@ -26,6 +31,14 @@ class Sums:
     measures: Histograms
     drift: DriftByOP
 
+    @classmethod
+    def of(cls, table: VoxelTable, null: npt.NDArray[np.float64]) -> Sums:
+        """Of a map, and the SBD (n,) expected of its voxels in random order."""
+        return cls(histograms(table), DriftByOP.of(table, null))
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(together([self.measures, other.measures]), self.drift + other.drift)
+
 
 class Views:
     """The sums of every unit that was asked for or seen, and views from above: of the last one, and of units seen."""
@@ -38,7 +51,7 @@ class Views:
 
     def see(self, unit: Unit, table: VoxelTable, up: npt.ArrayLike | None) -> None:
         """Take what figures show of a unit while its map is in memory; from above where up is known."""
-        self._sums[unit.slug] = Sums(histograms(table), DriftByOP.of(table, expected_sbd(table)))
+        self._sums[unit.slug] = Sums.of(table, expected_sbd(table))
         if up is not None and sum(above.nbytes for above in self._above.values()) < LARGEST:
             self._above[unit.slug] = FromAbove.of(table, up)
 
@@ -46,10 +59,16 @@ class Views:
         """The unit's voxels by OP."""
         slug = record.unit.slug
         if slug not in self._sums:
-            table, null = self._tables.of(record), column(record, "sbd_null")
-            drift = DriftByOP.of(table, expected_sbd(table) if null is None else null)
-            self._sums[slug] = Sums(histograms(table), drift)
+            self._sums[slug] = reduce(add, self._parts(record))
         return self._sums[slug]
+
+    def _parts(self, record: Record) -> Iterator[Sums]:
+        """Of the unit, or of each of its tiles."""
+        if record.in_tiles:
+            yield from (Sums.of(tile, expected_sbd(tile)) for tile in record.tiles())
+            return
+        table, null = self._tables.of(record), column(record, "sbd_null")
+        yield Sums.of(table, expected_sbd(table) if null is None else null)
 
     def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
         """The unit's voxels that are seen from above."""
@@ -57,15 +76,13 @@ class Views:
         if slug in self._above:
             return self._above[slug]
         if self._last is None or self._last[0] != slug:
-            self._last = slug, FromAbove.of(self._tables.of(record), up)
+            table = topmost(record.tiles(), up) if record.in_tiles else self._tables.of(record)
+            self._last = slug, FromAbove.of(table, up)
         return self._last[1]
 
 
 def column(record: Record, name: str) -> npt.NDArray[Any] | None:
     """A column that was written beside the voxels; None where it was not."""
-    import pyarrow.parquet as pq
-
-    if name not in pq.read_schema(record.voxels_file).names:
+    if record.voxels_file is None or name not in parquet.names_in(record.voxels_file):
         return None
-    values: npt.NDArray[Any] = pq.read_table(record.voxels_file, columns=[name]).column(name).to_numpy()
-    return values
+    return VoxelTable.columns(record.voxels_file, [name])[name]

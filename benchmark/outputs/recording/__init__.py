@@ -14,8 +14,14 @@ flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them
 camera/BACKBONE/flips                   Points2D: those voxels in the frame, where their numbers lie inside its image
 difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
 difference_report/BACKBONE/A and B      TextDocument: how many they are
-legend, drift_legend                    Points2D: the classes and their colours; SegmentationImage: the levels of drift
+legend, all_classes                     Points2D: the classes in use and their colours
+drift_legend                            SegmentationImage: the levels of drift
 log                                     TextLog: each unit's final numbers
+
+and in the recording of a comparison
+
+change/RUN/agreement, .../truth         VoxelGridMap: what each voxel lost or gained
+places/RUN                              Points3D: the places that got worse, with their numbers
 """
 
 from semstab.outputs.recording.observer import Recording

@@ -10,19 +10,20 @@ import rerun as rr
 
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import SBD_MAX
+from semstab.model.palette import GLOW, Color, between
 
 NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
 LEVELS = 24
 LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
 """Bits at which one level of drift ends and the next begins: finer where drift is small; the last one is open."""
 
-RAMPS = np.array([
-    [(150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230)],  # fire
-    [(0, 100, 120), (0, 160, 190), (0, 220, 240), (130, 245, 255), (215, 255, 255)],
-    [(120, 0, 110), (200, 0, 190), (255, 60, 220), (255, 150, 235), (255, 220, 250)],
-    [(30, 100, 0), (70, 170, 0), (130, 235, 30), (190, 255, 110), (230, 255, 200)],
-], dtype=np.float64)  # fmt: skip
-"""What drifts lights up like a glowing body; where a class wears such a colour, in another hue."""
+RAMPS: tuple[tuple[Color, ...], ...] = (
+    GLOW,
+    ((0, 100, 120), (0, 160, 190), (0, 220, 240), (130, 245, 255), (215, 255, 255)),
+    ((120, 0, 110), (200, 0, 190), (255, 60, 220), (255, 150, 235), (255, 220, 250)),
+    ((30, 100, 0), (70, 170, 0), (130, 235, 30), (190, 255, 110), (230, 255, 200)),
+)
+"""What drifts lights up like a glowing body; where a taxonomy of the user's has such a colour, in another hue."""
 
 NEAR = 40.0
 """Distance in RGB from which on two colours are told apart."""
@@ -33,8 +34,7 @@ LEGEND = (-1.0, LEVELS + 3.0), (0.0, 2.8)
 
 def ramp(classes: LabelSpace) -> npt.NDArray[np.float64]:
     """Colours (LEVELS, 3) of the levels: the first of RAMPS that no class's colour is near, else the farthest."""
-    at = np.linspace(0, RAMPS.shape[1] - 1, LEVELS)
-    ramps = [np.stack([np.interp(at, np.arange(len(r)), channel) for channel in r.T], axis=1) for r in RAMPS]
+    ramps = [between(colors, LEVELS) for colors in RAMPS]
     worn = np.array(classes.colors, dtype=np.float64)
     distance = [float(np.linalg.norm(r[:, None] - worn, axis=2).min()) for r in ramps]
     clear = [number for number, least in enumerate(distance) if least >= NEAR]

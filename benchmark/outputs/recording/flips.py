@@ -27,8 +27,8 @@ MAX_MOVES = 2_000_000
 MOVED_BITS = 0.05
 """Drift from which on a frame is to blame, also where the dominant class stays: that of a drifting voxel."""
 
-NUMBER = 0.04
-"""Of an image's longer side, what a number takes up beside its point."""
+NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
+"""Of an image's longer side, what a number takes up left of its point and above, and right of it and below."""
 
 MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
@@ -70,8 +70,8 @@ class Camera:
         before = z > 0
         pixels = np.stack([x, y], axis=1) / np.where(before, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
         size = np.array(self.shape[::-1], dtype=np.float64)
-        room = NUMBER * size.max()
-        return pixels, before & np.all((pixels >= room) & (pixels <= size - room), axis=1)
+        first, last = NUMBER * size.max()
+        return pixels, before & np.all((pixels >= first) & (pixels <= size - last), axis=1)
 
 
 class FlipLog:

@@ -91,8 +91,17 @@ class GroupLog:
         """Voxels of the map that is drawn while it grows."""
         return len(self._tracker.map) if is_pointwise(drawn(self.task)) else 0
 
-    def log_map(self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float) -> None:
-        """Log a unit's final voxels, and where they differ from those of the drawn unit."""
+    def log_map(
+        self, stream: rr.RecordingStream, unit: Unit, table: VoxelTable, tolerance: float, factor: int = 1
+    ) -> None:
+        """Log a unit's final voxels, and where they differ from those of the drawn unit.
+
+        factor  of a table that is thinned already: it is not compared
+        """
+        if factor > 1:
+            self.voxels = max(self.voxels, len(table))
+            self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table, factor)
+            return
         first = drawn(self.task)
         self.tables[unit.backend] = table
         self.voxels = max(self.voxels, len(table))

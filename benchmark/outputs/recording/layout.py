@@ -17,8 +17,9 @@ from semstab.backends import REGISTRY
 from semstab.engine.units import Plan
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.results import RECURRENT, Unit
-from semstab.outputs.recording import drift_colors, legend
+from semstab.outputs.recording import drift_colors
 from semstab.outputs.recording.entities import path
+from semstab.outputs.recording.legend import Legend
 from semstab.outputs.recording.series import SERIES, entity
 from semstab.outputs.recording.voxel_maps import chunk, defaults, looks, visualizer
 from semstab.task import Task
@@ -77,11 +78,13 @@ class Scenery:
 class Known:
     """What is known of a run so far, and the layout depends on.
 
+    legends    by scene
     sceneries  by scene, say where its maps are seen from; else the viewer chooses
     chunks     by scene, of how many chunks of a map the views say how they are coloured
     spans      by scene and backbone, the lowest and highest value of each of COMPARED in all backends
     """
 
+    legends: dict[str, Legend] = field(default_factory=dict)
     sceneries: dict[str, Scenery] = field(default_factory=dict)
     chunks: dict[str, int] = field(default_factory=dict)
     spans: dict[tuple[str, str], dict[str, tuple[float, float]]] = field(default_factory=dict)
@@ -124,18 +127,18 @@ def distinct(task: Task) -> list[str]:
 def _scene(scene: str, tasks: list[Task], known: Known) -> rrb.Container:
     flips = [_flips(scene, task) for task in tasks]
     comparisons = [_comparison(task, *pair, known) for task in tasks for pair in compared(task)]
-    overview = _overview(scene, tasks, known.sceneries.get(scene), known.chunks[scene])
+    overview = _overview(scene, tasks, known)
     return rrb.Tabs(overview, *flips, *comparisons, name=scene)
 
 
-def _overview(scene: str, tasks: list[Task], scenery: Scenery | None, chunks: int) -> rrb.Container:
-    classes = tasks[0].mapping.target
-    width, height = legend.size(classes)
+def _overview(scene: str, tasks: list[Task], known: Known) -> rrb.Container:
+    legend, scenery, chunks = known.legends[scene], known.sceneries.get(scene), known.chunks[scene]
+    _, height = legend.size(whole=False)
     area = LEFT[0], LEFT[1] - TITLE - (height + TITLE)
-    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area, chunks) for name in looks()))
-    bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
-    classes_view = rrb.Spatial2DView(origin=path(scene, "legend"), name="Classes", visual_bounds=bounds)
-    left = rrb.Vertical(maps, classes_view, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
+    all_classes = [] if legend.is_whole else [_legend(scene, "all_classes", "All classes", legend.size(whole=True))]
+    maps = rrb.Tabs(*(_maps(name, tasks, scenery, area, chunks) for name in looks()), *all_classes)
+    classes = _legend(scene, "legend", "Classes", legend.size(whole=False))
+    left = rrb.Vertical(maps, classes, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
     levels = rrb.VisualBounds2D(x_range=drift_colors.LEGEND[0], y_range=drift_colors.LEGEND[1])
     drift_view = rrb.Spatial2DView(
         origin=path(scene, "drift_legend"), name="Drift of a frame at each pixel", visual_bounds=levels
@@ -143,6 +146,11 @@ def _overview(scene: str, tasks: list[Task], scenery: Scenery | None, chunks: in
     right = rrb.Vertical(_cameras(scene, tasks), drift_view, row_shares=[LEFT[1] - DRIFT_LEGEND, DRIFT_LEGEND])
     top = rrb.Horizontal(left, right, column_shares=[5, 4])
     return rrb.Vertical(top, _below(scene, tasks), row_shares=[5, 2], name="Overview")
+
+
+def _legend(scene: str, entity: str, name: str, size: tuple[float, float]) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=(0, size[0]), y_range=(0, size[1]))
+    return rrb.Spatial2DView(origin=path(scene, entity), name=name, visual_bounds=bounds)
 
 
 def _below(scene: str, tasks: list[Task]) -> rrb.Container:
@@ -248,7 +256,7 @@ def _map(
         name=title,
         background=BACKGROUND,
         line_grid=False,
-        eye_controls=_eye(scenery, aspect),
+        eye_controls=eye(scenery, aspect),
     )
 
 
@@ -263,7 +271,7 @@ def _comparison(task: Task, first: str, second: str, known: Known) -> rrb.Contai
         name=f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
         background=BACKGROUND,
         line_grid=False,
-        eye_controls=_eye(scenery, DIFFERENCE_ASPECT),
+        eye_controls=eye(scenery, DIFFERENCE_ASPECT),
     )
     found = rrb.TextDocumentView(origin=path(scene, "difference_report", backbone, pair), name="What differs")
     maps = rrb.Horizontal(
@@ -297,7 +305,8 @@ def _axis(span: tuple[float, float] | None) -> rrb.ScalarAxis | None:
     return rrb.ScalarAxis(range=(low - margin, high + margin))
 
 
-def _eye(scenery: Scenery | None, aspect: float) -> rrb.EyeControls3D | None:
+def eye(scenery: Scenery | None, aspect: float) -> rrb.EyeControls3D | None:
+    """From where a view of that width by height shows it; None where the viewer chooses."""
     if scenery is None:
         return None
     target, distance = fit(scenery, aspect)

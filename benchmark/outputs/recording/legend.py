@@ -1,12 +1,15 @@
-"""The classes and their colours, laid out like words on lines."""
+"""The classes of a scene's maps and their colours, laid out like words on lines."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
 from semstab.model.labels import LabelSpace
+from semstab.model.palette import Color
 
 WIDTH, LINE = 780.0, 24.0
 """Of the legend and of one of its lines, in points of a window of 1500."""
@@ -17,28 +20,86 @@ LETTER, DOT, GAP = 7.0, 20.0, 34.0
 LABEL = -13.5
 """The viewer draws a label below its point: from the middle of the label to its point."""
 
+LINES = 2
+"""Of the legend that is always seen; what it leaves out is in a tab."""
 
-def log_legend(stream: rr.RecordingStream, entity: str, classes: LabelSpace) -> None:
+Entry = tuple[str, Color]
+
+
+class Legend:
+    """Names and colours of a scene's classes: those of its maps, and in a tab all that a frame may show."""
+
+    def __init__(self, spaces: Iterable[LabelSpace]) -> None:
+        self._voxels: dict[Entry, int] = {
+            entry: 0 for space in spaces for entry in zip(space.classes, space.colors, strict=True)
+        }
+
+    def see(self, classes: LabelSpace, label: npt.NDArray[np.integer]) -> None:
+        """A finished map has voxels of these dominant classes."""
+        voxels = np.bincount(label, minlength=len(classes)).tolist()
+        for entry, n in zip(zip(classes.classes, classes.colors, strict=True), voxels, strict=True):
+            self._voxels[entry] += n
+
+    @property
+    def entries(self) -> list[Entry]:
+        """All, those with the most voxels first."""
+        return sorted(self._voxels, key=lambda entry: -self._voxels[entry])
+
+    @property
+    def used(self) -> list[Entry]:
+        """Those that the maps show; all, while no map is finished."""
+        return [entry for entry in self.entries if self._voxels[entry]] or self.entries
+
+    @property
+    def shown(self) -> int:
+        """How many of these the legend that is always seen has room for."""
+        names = [name for name, _ in self.used]
+        if _lines(names) <= LINES:
+            return len(names)
+        return max((n for n in range(len(names)) if _lines([*names[:n], _rest(len(names) - n)]) <= LINES), default=0)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it has all classes."""
+        return self.shown == len(self.entries)
+
+    def size(self, *, whole: bool) -> tuple[float, float]:
+        """Width and height of the legend that is always seen, or of that of all classes."""
+        lines = _lines([name for name, _ in (self.entries if whole else self.used)])
+        return WIDTH, LINE * (lines if whole else min(lines, LINES))
+
+    def log(self, stream: rr.RecordingStream, entity: str, all_classes: str) -> None:
+        """Both legends, each below an entity of its own."""
+        used, shown = self.used, self.shown
+        _log(stream, all_classes, self.entries)
+        _log(stream, entity, used[:shown], _rest(len(used) - shown) if shown < len(used) else "")
+
+
+def _rest(classes: int) -> str:
+    return f"and {classes} more: tab All classes"
+
+
+def _log(stream: rr.RecordingStream, entity: str, entries: Sequence[Entry], rest: str = "") -> None:
     """Dots in the classes' colours, and their names in white: a label has its point's colour, which may be dark."""
-    at = places(classes)
-    middle = DOT + LETTER / 2 * np.array([len(name) for name in classes.classes])
-    dots = rr.Points2D(at, colors=classes.colors, radii=rr.Radius.ui_points(5.0))
+    names = [*(name for name, _ in entries), *([rest] if rest else [])]
+    at = _places(names)
+    middle = DOT + LETTER / 2 * np.array([len(name) for name in names])
     beside = at + np.stack([middle, np.full(len(at), LABEL)], axis=1)
-    names = rr.Points2D(beside, colors=(255, 255, 255), labels=classes.classes, radii=0.0, show_labels=True)
+    dots = rr.Points2D(at[: len(entries)], colors=[color for _, color in entries], radii=rr.Radius.ui_points(5.0))
+    words = rr.Points2D(beside, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
     stream.log(entity, dots, static=True)
-    stream.log(f"{entity}/names", names, static=True)
+    stream.log(f"{entity}/names", words, static=True)
 
 
-def size(classes: LabelSpace) -> tuple[float, float]:
-    """Width and height that the legend takes."""
-    return WIDTH, float(places(classes)[:, 1].max()) + LINE / 2
+def _lines(names: Sequence[str]) -> int:
+    return round(float(_places(names)[:, 1].max()) / LINE + 0.5)
 
 
-def places(classes: LabelSpace) -> npt.NDArray[np.float64]:
-    """(K, 2) where the classes' dots are; a name is right of its dot."""
+def _places(names: Sequence[str]) -> npt.NDArray[np.float64]:
+    """(n, 2) where the dots are; a name is right of its dot."""
     left, line = 0.0, 0
     at = []
-    for name in classes.classes:
+    for name in names:
         width = DOT + LETTER * len(name) + GAP
         if left + width > WIDTH and left > 0:
             left, line = 0.0, line + 1

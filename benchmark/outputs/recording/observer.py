@@ -22,12 +22,13 @@ from semstab.engine.observer import Factory, Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned, PlannedUnit
 from semstab.errors import ConfigError, one_line
+from semstab.metrics import dominant
 from semstab.model.frames import Frame
 from semstab.model.measures import measures
-from semstab.model.records import RECORDING_PARTS, Result, Variation
+from semstab.model.records import RECORDING_PARTS, Result, Variation, voxels_of
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import drift_colors, legend, series
+from semstab.outputs.recording import drift_colors, series
 from semstab.outputs.recording.agreement import looks_report
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
@@ -37,9 +38,10 @@ from semstab.outputs.recording.camera import (
 from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.group import GroupLog
 from semstab.outputs.recording.layout import Known, Scenery, blueprint
+from semstab.outputs.recording.legend import Legend
 from semstab.outputs.recording.parts import Parts
 from semstab.outputs.recording.target import DEFAULT_URL, Target, is_whole
-from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of
+from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of, thinned_map
 from semstab.task import Task
 
 FIRST_CHUNKS = 8
@@ -90,6 +92,10 @@ class Recording(Observer):
         self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
         first = CHUNKS if self.target.live else FIRST_CHUNKS  # a live viewer keeps the layout that it got first
         self._known.chunks = {task.scene.name: first for task in plan.tasks}
+        self._known.legends = {
+            scene: Legend(task.mapping.target for task in plan.tasks if task.scene.name == scene)
+            for scene in self._known.chunks
+        }
         unmerged = self._run is not None and (self._run / RECORDING_PARTS).exists()
         self._cut = unmerged or not is_whole(self.target.file)
 
@@ -120,6 +126,22 @@ class Recording(Observer):
         if not self.pictures_only and chunks_of(group.grown) > self._known.chunks[scene]:
             show = functools.partial(self._show_chunks, stream, scene, group.grown)
             background.submit(frame.index, frame.timestamp, show)
+
+    def frame_seen(self, task: Task, frame: Frame) -> None:
+        """Log what the camera shows; the map follows when its tiles are there."""
+        (stream, background), scene = self._opened(), task.scene.name
+        self._clock.set(stream, frame.index, frame.timestamp)
+        self._origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
+        self._cameras[scene].log(stream, frame, background)
+
+    def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
+        """Log the unit's series and voxels from the folder."""
+        if self._parts is not None:  # all that is in the folder is logged at the end
+            return
+        stream, background = self._opened()
+        background.drain()
+        self._kept.append((self._tasks[task.scene.name, task.backbone], [summary]))
+        self._log_kept(stream)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """Log the unit's voxels, while they are measured; the time is that of its last frame."""
@@ -235,7 +257,7 @@ class Recording(Observer):
             self._background = Background(stream, self._clock)
             if self.pictures_only:
                 return stream, self._background
-            _log_static(stream, self._plan)
+            _log_static(stream, self._plan, self._known)
             self._send_blueprint(stream)
             self._log_kept(stream)
         return self._stream, self._background
@@ -246,13 +268,17 @@ class Recording(Observer):
         compared = len(group.task.backends) > 1
         if compared:
             known.spans[scene, group.task.backbone] = group.spans
+        legend = known.legends[scene]
+        used = legend.used
+        legend.see(group.task.mapping.target, dominant(table))
+        _log_legend(stream, scene, legend)
         first = scene not in known.sceneries and len(table) > 0
         if first:
             some = table.index[:: math.ceil(len(table) / SAMPLE)]
             poses = np.reshape(self._cameras[scene].poses, (-1, 4, 4))
             points = ((some - group.origin + 0.5) * table.voxel_size).astype(np.float64)
             known.sceneries[scene] = Scenery(points, poses, group.task.scene.up)
-        self._show_chunks(stream, scene, group.voxels, anyway=first or compared)
+        self._show_chunks(stream, scene, group.voxels, anyway=first or compared or used != legend.used)
 
     def _log_numbers(self, stream: rr.RecordingStream, group: GroupLog, summary: UnitSummary) -> None:
         text = _final(summary) + group.remarks.get(summary.unit.backend, "")
@@ -287,16 +313,16 @@ class Recording(Observer):
                     stream.log(path(task.scene.name, "log"), rr.TextLog(text))
                     continue
                 unit = summary.unit
-                table = VoxelTable.load(self._run / "voxels" / f"{unit.slug}.parquet")
                 if group is None:
                     at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
-                    group = GroupLog(task, table.voxel_size, self._origin(stream, task, at))
+                    group = GroupLog(task, summary.table.voxel_size, self._origin(stream, task, at))
+                factor, table = thinned_map(voxels_of(self._run, unit), group.origin)
                 for values in series.send_rows(
                     stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
                 ):
                     group.span(values)
                 self._clock.set(stream, task.indices[-1])
-                group.log_map(stream, unit, table, self._plan.config.tolerance)
+                group.log_map(stream, unit, table, self._plan.config.tolerance, factor)
                 self._log_numbers(stream, group, summary)
             if group is not None:
                 self._lay_out(stream, group, table)
@@ -334,13 +360,17 @@ class PictureRecording(Recording):
         self.run_started(Plan(config, {}, tuple(units), ()), [])
 
 
-def _log_static(stream: rr.RecordingStream, plan: Plan) -> None:
+def _log_legend(stream: rr.RecordingStream, scene: str, legend: Legend) -> None:
+    legend.log(stream, path(scene, "legend"), path(scene, "all_classes"))
+
+
+def _log_static(stream: rr.RecordingStream, plan: Plan, known: Known) -> None:
     for scene, task in {task.scene.name: task for task in plan.tasks}.items():
         if (up := task.scene.up) is not None:  # the axis of the world that is nearest to it
             axis = int(np.abs(up).argmax())
             name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
             stream.log(path(scene), getattr(rr.ViewCoordinates, name), static=True)
-        legend.log_legend(stream, path(scene, "legend"), task.mapping.target)
+        _log_legend(stream, scene, known.legends[scene])
         drift_colors.log_legend(stream, path(scene, "drift_legend"), task.mapping.target)
     for task in plan.tasks:
         entity = path(task.scene.name, "camera", task.backbone)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -198,6 +199,29 @@ def thinned(index: npt.NDArray[np.int64]) -> tuple[int, npt.NDArray[np.int64]]:
     return factor, np.sort(rows) if factor > 1 else rows
 
 
+def thinned_map(path: Path, origin: npt.NDArray[np.int64]) -> tuple[int, VoxelTable]:
+    """A map from its file, or few enough voxels of one in tiles: the factor, and one voxel of each block of factor^3.
+
+    Tiles are read one after the other: what is not drawn is not kept. Blocks are aligned with the origin.
+    """
+    if path.is_file():
+        return 1, VoxelTable.load(path)
+    factor, parts = 1, list[VoxelTable]()
+    for tile in VoxelTable.iter_tiles(path):
+        parts.append(_of_blocks(tile, origin, factor))
+        while sum(map(len, parts)) > MAX_VOXELS:
+            factor *= 2
+            parts = [_of_blocks(part, origin, factor) for part in parts]
+    return factor, VoxelTable.joined(parts)
+
+
+def _of_blocks(table: VoxelTable, origin: npt.NDArray[np.int64], factor: int) -> VoxelTable:
+    if factor == 1:
+        return table
+    _, first = np.unique((table.index - origin) // factor, axis=0, return_index=True)
+    return table.rows(np.sort(first))
+
+
 class MapLog:
     """Logs what changes in a map, within the budget: of `frames` frames each one may log its share, and what is saved.
 
@@ -233,10 +257,13 @@ class MapLog:
             jobs.append(self._job(stream, fused, int(c), int(sizes[c])))
         return jobs
 
-    def finish(self, stream: rr.RecordingStream, table: VoxelTable) -> str:
-        """Log the final map in place of what is there; says how it was thinned, where it is too large."""
+    def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
+        """Log the final map in place of what is there; says how it was thinned, where it is too large.
+
+        factor  of a table that is thinned already
+        """
         index = table.index - self._origin
-        factor, rows = thinned(index)
+        factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
                 at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # what is not thinned is not copied

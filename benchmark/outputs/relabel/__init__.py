@@ -56,7 +56,7 @@ def relabel(
     record = result.record(scene=scene, backbone=backbone, backend=backend)
     task, pixel_stride = _task(Path(run), record, result.manifest["inputs"])
     chosen, name = belief or Belief(), name or f"{record.unit.backbone}-fused"
-    settings = {"unit": record.key, "backend": record.unit.backend, **dataclasses.asdict(chosen)}
+    settings = {"unit": record.key, "backend": record.unit.backend, **chosen.settings()}
     space = task.mapping.target
     folder = PredictionFolder(
         Path(out) / "labels" / name, "labels", settings, {"name": name}, space, overwrite=overwrite
@@ -81,7 +81,7 @@ def relabel(
         task.scene.name, task.backbone, name, str(folder.path), len(task.indices), **tally.counts,
         leave_own_out=chosen.leave_own_out, correctness=tally.correctness(),
     )  # fmt: skip
-    write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": dataclasses.asdict(chosen)})
+    write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
     return report
 
 

@@ -21,6 +21,7 @@ from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.export.lookup import NONE, VoxelLookup
 from semstab.statistics import psa
+from semstab.statistics.commit import Commit
 
 Int64 = npt.NDArray[np.int64]
 
@@ -40,6 +41,7 @@ class Belief:
     categories     of these categories, of any where none is named
     leave_own_out  without the frame's own vote, and seen by another frame. Drift is that of all votes: it depends on
                    their order
+    commit         whose label has the evidence that these thresholds ask for
 
     Raises ConfigError for a category that there is not, and values out of range.
     """
@@ -48,6 +50,7 @@ class Belief:
     min_psa: float = 0.0
     categories: tuple[str, ...] = ()
     leave_own_out: bool = False
+    commit: Commit | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_psa <= 1:
@@ -64,7 +67,14 @@ class Belief:
         if self.categories:
             with np.errstate(invalid="ignore"):  # the belief of no vote
                 believed &= np.isin(categories(table), [CATEGORIES.index(name) for name in self.categories])
+        if self.commit is not None:
+            believed &= self.commit.decide(table) >= 0
         return believed
+
+    def settings(self) -> dict[str, object]:
+        """As JSON has it."""
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return own | {"commit": None if self.commit is None else self.commit.model_dump(by_alias=True)}
 
 
 class FusedLabels:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import io
-import itertools
 import json
-import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +14,13 @@ from semstab.model.records import Failure, Result
 from semstab.model.results import slug
 from semstab.outputs import plots
 from semstab.outputs.averages import describe
-from semstab.outputs.findings import Finding, findings
-from semstab.outputs.plots.style import COLUMN, DPI, Figure
-from semstab.outputs.report.reading import reading
-from semstab.outputs.tables import Table, tables, write_tables
-from semstab.outputs.tables.writers import ARROWS, relations, sections
+from semstab.outputs.findings import Answer, Finding, findings
+from semstab.outputs.plots.style import Figure
+from semstab.outputs.remedies import advice, of_interest, remedies
+from semstab.outputs.report.page import blocks, figure_block, filled
+from semstab.outputs.report.reading import reading, verdicts
+from semstab.outputs.tables import tables, write_tables
+from semstab.outputs.tables.writers import relations
 from semstab.runtime.files import write_text
 
 if TYPE_CHECKING:
@@ -37,15 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Reporting", "write_report"]
 
-SCREEN_DPI = 200
-"""Dense images are embedded with that many pixels an inch and in 256 colours: a quarter of the file's size."""
-
-CSS_INCH = 122
-"""Pixels of the page an inch of a figure: its smallest type then is as large as the text of the tables."""
-
-
-ABSENT = "absent"
-"""What a table notes of a class that covers no voxel: the page names such classes in a line."""
+MOST_NAMED = 3
+"""Scenes that are named in the title."""
 
 WORTH_A_PROCESS = 5.0
 """Seconds of work from which on figures are drawn by two processes."""
@@ -108,20 +99,21 @@ def write_report(result: Result, folder: str | Path) -> list[Path]:
 
 def render(result: Result, folder: Path) -> str:
     """The page."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    here = Path(__file__).parent
-    environment = Environment(
-        loader=FileSystemLoader(here), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    everything, result = result, of_interest(result)
     found = findings(result)
-    return environment.get_template("report.html.j2").render(
-        result=result,
-        style=(here / "style.css").read_text(encoding="utf-8"),
+    return filled(
+        "report.html.j2",
+        kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
+        title=_title(result),
         subtitle=_subtitle(result),
-        reading=[relations(sentence) for sentence in reading(result, found)],
-        findings=[_finding(row) for row in found],
-        topics=list(_topics(result, folder)),
+        verdicts=[
+            *(sentence for each in remedies(everything) for sentence in advice(each)),
+            *(relations(sentence) for sentence in verdicts(result)),
+        ],
+        reading=[relations(sentence) for sentence in reading(result, found) if sentence not in verdicts(result)],
+        findings=[_finding(row) for row in found if row.verdict is not Answer.UNTESTED],
+        untested=[_finding(row) for row in found if row.verdict is Answer.UNTESTED],
+        topics=list(_topics(everything, folder)),
         without_map=[scene for scene in result.scenes if scene not in result.up],
         failures=[_failure(row) for row in result.failures],
         facts=list(_facts(result.manifest)),
@@ -147,6 +139,13 @@ class Topic:
 
 
 TOPICS = (
+    Topic(
+        "remedies",
+        "What would steady it?",
+        "Filters over the same model and frames. Labels that do not change are not yet right: read flicker beside what"
+        " it costs.",
+        ("remedies",),
+    ),
     Topic("glance", "At a glance", "", ("glance", "verdicts", "overview")),
     Topic(
         "flicker",
@@ -261,8 +260,8 @@ def _topics(result: Result, folder: Path) -> Iterator[dict[str, Any]]:
                 "id": topic.id,
                 "title": topic.title,
                 "lead": topic.lead,
-                "blocks": list(_blocks(own, first, folder)),
-                "folded": [_figure(figure, folder) for figure in folded],
+                "blocks": list(blocks(own, first, folder)),
+                "folded": [figure_block(figure, folder) for figure in folded],
             }
 
 
@@ -274,88 +273,6 @@ def _unfolded(shown: Sequence[Figure], result: Result) -> tuple[list[Figure], li
             if figure.name.endswith(f"__{slug(backbone)}"):
                 first.setdefault((figure.name.partition("__")[0], backbone), figure)
     return list(first.values()), [figure for figure in shown if figure not in first.values()]
-
-
-def _blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
-    """Tables, each with the figure of its name beneath it, then the other figures; a caption is not said twice."""
-    beside = {figure.name: figure for figure in shown}
-    ordered: list[Table | Figure] = []
-    for table in own:
-        ordered.append(table)
-        if table.name in beside:
-            ordered.append(beside.pop(table.name))
-    said: set[str] = set()
-    for item in (*ordered, *beside.values()):
-        block = _table(item) if isinstance(item, Table) else _figure(item, folder)
-        if block["caption"] in said:
-            block["caption"] = ""
-        said.add(block["caption"])
-        yield {"kind": "table" if isinstance(item, Table) else "figure", "content": block}
-
-
-def _table(table: Table) -> dict[str, Any]:
-    headers = [f"{column.header} {ARROWS[column.better]}".strip() for column in table.columns]
-    absent = [*dict.fromkeys(row[0] for _, rows in sections(table) for row in rows if row[-1] == ABSENT)]
-    left_out = f" Absent: {', '.join(absent)}." if absent else ""
-    return {
-        "name": table.name,
-        "title": relations(table.title),
-        "caption": relations(table.caption + left_out),
-        "headers": [relations(header) for header in headers],
-        "over": _runs([relations(column.over) for column in table.columns]),
-        "numeric": [column.digits is not None for column in table.columns],
-        "sections": [
-            (relations(name), [[_cell(cell) for cell in row] for row in rows if row[-1] != ABSENT])
-            for name, rows in sections(table)
-        ],
-    }
-
-
-def _runs(names: Sequence[str]) -> list[tuple[str, int]]:
-    """Equal neighbours and how many they are; nothing where all are empty."""
-    return [(name, len(list(run))) for name, run in itertools.groupby(names)] if any(names) else []
-
-
-def _cell(text: str) -> str:
-    """A cell as typography has it: minus signs, a dash for what is undefined."""
-    if text == "--":
-        return "\N{EN DASH}"
-    number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)
-    return relations(re.sub(r"(^|(?<=\()|(?<=, )|(?<=e))-(?=\d)", "\N{MINUS SIGN}", text) if number else text)
-
-
-def _figure(figure: Figure, folder: Path) -> dict[str, Any]:
-    from PIL import Image
-
-    png, svg = (folder / "figures" / f"{figure.name}.{suffix}" for suffix in ("png", "svg"))
-    if not (png.exists() and svg.exists()):
-        figure.save(folder / "figures")
-    with Image.open(png) as image:
-        width, height = (edge / DPI for edge in image.size)
-        data = _screen_png(image) if figure.dense else svg.read_bytes()
-    kind = "png" if figure.dense else "svg+xml"
-    return {
-        "name": figure.name,
-        "title": figure.title,
-        "caption": relations(figure.caption),
-        "alt": figure.alt,
-        "source": f"data:image/{kind};base64,{base64.b64encode(data).decode()}",
-        "width": round(width * CSS_INCH),
-        "height": round(height * CSS_INCH),
-        "narrow": width <= COLUMN * 1.01,
-    }
-
-
-def _screen_png(image: Any) -> bytes:
-    """The image at the resolution of a screen, in few colours."""
-    from PIL import Image
-
-    size = tuple(round(edge * SCREEN_DPI / DPI) for edge in image.size)
-    small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-    data = io.BytesIO()
-    # the octree keeps colours of small areas, which the median cut merges, and takes a fortieth of its time
-    small.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(data, "PNG")
-    return data.getvalue()
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
@@ -377,6 +294,14 @@ def _finding(finding: Finding) -> dict[str, Any]:
             for row in finding.evidence
         ],
     }
+
+
+def _title(result: Result) -> str:
+    """The name of a study; of a run, which has none, its scenes."""
+    if result.sweeps():
+        return result.name
+    scenes = result.scenes
+    return ", ".join(scenes) if len(scenes) <= MOST_NAMED else f"{len(scenes)} scenes"
 
 
 def _subtitle(result: Result) -> str:

@@ -10,7 +10,7 @@ from semstab.metrics import macro_mean
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.outputs.averages import ENOUGH, Pooled, by_backbone, pooled
-from semstab.outputs.findings import Finding
+from semstab.outputs.findings import Answer, Finding
 from semstab.outputs.remarks import mixed, remarks
 from semstab.outputs.tables.stability import comparable
 
@@ -22,8 +22,8 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
         return ["No unit at the study's own settings was finished: there is nothing to say yet."]
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
     return [
-        *(sentence for rows in by_backbone(records).values() for sentence in _verdict(rows)),
-        *(f"{remark[0].upper()}{remark[1:]}." for remark in remarks(result)),
+        *verdicts(result),
+        *(remark if remark.endswith(":") else f"{remark}." for remark in remarks(result)),  # may begin with a name
         *_once(pooled(records)),
         *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
         *_ranking(result),
@@ -32,6 +32,11 @@ def reading(result: Result, found: Sequence[Finding]) -> list[str]:
         *_findings(found),
         *_implementations(result),
     ]
+
+
+def verdicts(result: Result) -> list[str]:
+    """On each backbone."""
+    return [sentence for rows in by_backbone(result.select()).values() for sentence in _verdict(rows)]
 
 
 def _once(voxels: Pooled) -> Iterator[str]:
@@ -114,8 +119,9 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
 
 
 def _findings(found: Sequence[Finding]) -> Iterator[str]:
-    parts = (f"{row.claim[0].lower()}{row.claim[1:].rstrip('.')} ({row.said})" for row in found)
-    if found:
+    tested = [row for row in found if row.verdict is not Answer.UNTESTED]
+    parts = (f"{row.claim[0].lower()}{row.claim[1:].rstrip('.')} ({row.said})" for row in tested)
+    if tested:
         yield f"The paper's findings here: {'; '.join(parts)}."
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from semstab.model.comparison import BackboneComparison, CommonLooks, MapCoverage
 from semstab.model.records import Result
 from semstab.outputs.tables.statistics import INTERVALS
@@ -13,8 +15,11 @@ _COMMON = "On the voxels that every backbone saw twice or more, and on looks (a 
 
 def comparison(result: Result) -> list[Table]:
     """Paired differences, ranking, and what each map covers; one group a scene."""
-    found = [_differences(result), _ranking(result), _coverage(result)] if result.comparisons else []
-    return [*found, _ignored(result)] if any(each.looks for each in result.comparisons) else found
+    if not result.comparisons:
+        return []
+    covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
+    looks = {found.scene: found.looks for found in result.comparisons if found.looks is not None}
+    return [_differences(result), _ranking(result), covered, *([ignored_table(looks)] if looks else [])]
 
 
 def _differences(result: Result) -> Table:
@@ -77,7 +82,8 @@ def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
     )
 
 
-def _ignored(result: Result) -> Table:
+def ignored_table(looks: Mapping[str, CommonLooks]) -> Table:
+    """What each backbone left out, by scene."""
     columns = (
         Column("backbone", "Backbone"),
         Column("missing_percent", "left out (%)", 1),
@@ -91,7 +97,7 @@ def _ignored(result: Result) -> Table:
         " (Manski); alpha between frames where to leave a place out is a class of its own. The order depends on it"
         " where that alpha, or PSA within its bounds, would order the backbones otherwise."
     )
-    groups = tuple(Group(found.scene, _ignored_rows(found.looks)) for found in result.comparisons if found.looks)
+    groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in looks.items())
     return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
 
 
@@ -102,7 +108,8 @@ def _ignored_rows(found: CommonLooks) -> tuple[Row, ...]:
     )
 
 
-def _coverage(result: Result) -> Table:
+def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
+    """What each map covers, by scene."""
     columns = (
         Column("backbone", "Backbone"),
         Column("voxels", "Voxels", 0),
@@ -113,7 +120,7 @@ def _coverage(result: Result) -> Table:
         Column("alone", "in no other", 0),
     )
     caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
-    groups = tuple(Group(found.scene, tuple(map(_coverage_row, found.coverage))) for found in result.comparisons)
+    groups = tuple(Group(scene, tuple(map(_coverage_row, found))) for scene, found in covered.items())
     return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
 
 

@@ -17,10 +17,10 @@ def correlogram(result: Result) -> list[Table]:
     low, high = STANDARD
     stated = f"{low:g} to {high:g} degrees apart"
     columns = (
-        Column("standard", "found", 2, "higher", over=stated),
-        Column("standard_ceiling", "ceiling", 2, over=stated),
+        Column("standard", "found", 3, "higher", over=stated),
+        Column("standard_ceiling", "ceiling", 3, over=stated),
         Column("standard_pairs", "pairs", 0, over=stated),
-        *(Column(f"{axis}_{end}", f"{end}", 2, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
+        *(Column(f"{axis}_{end}", f"{end}", 3, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
     )
     numbers = (
         _of(lambda found: found.standard.alpha),

@@ -11,7 +11,7 @@ from semstab.model.measures import ENTROPY, VSS
 from semstab.model.records import Record, Result
 from semstab.model.statistics import UNDEFINED, DriftTests, Estimate, MapStatistics, Reach
 from semstab.outputs.averages import by_backbone
-from semstab.outputs.tables.table import Column, Group, Row, Table
+from semstab.outputs.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
 from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.verdict import ADVICE
@@ -32,8 +32,8 @@ def temporal_agreement(result: Result) -> list[Table]:
         *map(Column.of, (VSS, PSA, KAPPA, ALPHA)),
         Column("within", "within a frame", 3, "lower", over="Disagreement"),
         Column("between", "between frames", 3, "lower", over="Disagreement"),
-        Column("alpha_between", "found", 2, "higher", over="Alpha between frames"),
-        Column("ceiling", "ceiling", 2, over="Alpha between frames"),
+        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
         Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
         Column.of(FLIP_RATE),
     )
@@ -61,21 +61,32 @@ def temporal_agreement(result: Result) -> list[Table]:
 
 
 def class_agreement(result: Result) -> list[Table]:
-    """Alpha of each class against all others, macro means over scenes."""
+    """Alpha of each class against all others, beside its ceiling; macro means over scenes."""
     judged = judged_records(result)
-    if not judged:
+    groups = tuple(Group(name, _class_rows([found for _, found in rows])) for name, rows in judged.items())
+    if not any(group.rows for group in groups):
         return []
     columns = (
-        Column("class", "Class"),
         Column("observations", "Observations", 0),
+        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
+        Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
+        Column("matters", "Matters"),
         *map(Column.of, (KAPPA, ALPHA)),
     )
-    groups = tuple(Group(name, _class_rows(rows)) for name, rows in judged.items())
+    cells = [row[1:] for group in groups for row in group.rows]
+    known = [k for k in range(len(columns)) if any(_says(row[k]) for row in cells)]
+    kept = tuple(
+        Group(group.name, tuple((row[0], *(row[1 + k] for k in known)) for row in group.rows)) for group in groups
+    )
     caption = (
         f"{SEEN_TWICE} Each class against all others; observations are the evidence for it, in frames, of all scenes."
-        " Macro means: each scene counts once."
+        " Alpha between frames, its ceiling, and the share of it that is reached: in sampled voxels. Matters: the"
+        f" verdict depends on it. Classes that no frame saw there are left out. Macro means: each scene counts once."
+        f" {INTERVALS}"
     )
-    return [Table("class_agreement", "Agreement of the frames, by class", caption, columns, groups)]
+    title = "Agreement of the frames, by class"
+    return [Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), kept)]
 
 
 def drift(result: Result) -> list[Table]:
@@ -105,7 +116,7 @@ def drift(result: Result) -> list[Table]:
         tested(lambda tests: tests.tested_voxels),
     )
     logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())
-    one_class = f"{SEEN_TWICE[:-1]}, each frame as one class; the others need a log (statistics: true)."
+    one_class = f"{SEEN_TWICE[:-1]}, where each frame says one class; --statistics adds the others, and tests of trend."
     seen = SEEN_TWICE if logged else one_class
     tests = (
         " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
@@ -225,6 +236,11 @@ def _value(found: float | Estimate) -> float:
     return found.value if isinstance(found, Estimate) else found
 
 
+def _says(cell: Cell) -> bool:
+    value = cell.value if isinstance(cell, Estimate) else cell
+    return value != "" and not (isinstance(value, float) and math.isnan(value))
+
+
 def _known(row: Sequence[float | Estimate]) -> list[int]:
     """Which of the numbers are defined."""
     return [k for k, cell in enumerate(row) if not math.isnan(_value(cell))]
@@ -243,17 +259,28 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
     return found
 
 
-def _class_rows(judged: Sequence[tuple[Record, MapStatistics]]) -> tuple[Row, ...]:
-    by_name = grouped((row for _, found in judged for row in found.agreement.classes), lambda row: row.name)
+def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
+    by_name = grouped((row for found in judged for row in found.agreement.classes), lambda row: row.name)
+    reached = grouped((row for found in judged if found.reach for row in found.reach.classes), lambda row: row.name)
     return tuple(
         (
             name,
             sum(row.observations for row in rows),
+            macro_mean([row.alpha for row in reached.get(name, [])]),
+            macro_mean([row.ceiling for row in reached.get(name, [])]),
+            _one_or_mean([row.reached.percent for row in reached.get(name, [])]),
+            "yes" if any(row.matters for row in reached.get(name, [])) else "",
             macro_mean([row.kappa for row in rows]),
             macro_mean([row.alpha for row in rows]),
         )
         for name, rows in by_name.items()
+        if any(row.observations for row in rows)
     )
+
+
+def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
+    """The one, with its interval; of several scenes the macro mean, which has none."""
+    return values[0] if len(values) == 1 else macro_mean([found.value for found in values])
 
 
 def _verdict_row(record: Record, found: MapStatistics) -> Row:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+import numpy.typing as npt
+
 from semstab.model.statistics import ClassReach, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.looks.entries import Sample
@@ -32,15 +35,27 @@ def reach_of(
     critical  names of the classes that matter; where none is given, those with `least` places or more
     """
     sums = influence_sums(table, sample=sample.shared()) if sums is None else sums
+    repeated = table.op >= 2
+    places = (table.evidence[repeated] / table.op[repeated, None]).sum(axis=0)
+    return reach_from(sample.by, places, sums, critical=critical, least=least)
+
+
+def reach_from(
+    by: str,
+    places: npt.NDArray[np.float64],
+    sums: InfluenceSums,
+    *,
+    critical: Sequence[str] = (),
+    least: float = SUPPORT,
+) -> Reach:
+    """The same from the sums of a map with a sample, whose limit has labels `by` whom; places (K,) of each class."""
     assert sums.seen is not None
     assert sums.limit is not None
     question = question_of(sums)
-    repeated = table.op >= 2
-    places = (table.evidence[repeated] / table.op[repeated, None]).sum(axis=0)
-    names = table.classes or tuple(str(k) for k in range(table.K))
+    names = sums.classes or tuple(str(k) for k in range(len(places)))
     named = set(critical) & set(names)
     return Reach(
-        by=sample.by,
+        by=by,
         voxels=round(float(sums.seen["voxels"].sum())),
         alpha=estimate(sums.seen, "alpha_between", question=question),
         ceiling=estimate(sums.limit, "alpha_between", question=question),

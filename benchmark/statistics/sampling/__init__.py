@@ -1,6 +1,6 @@
 """What a map's numbers would be elsewhere, or in the next flight: sums by frame and cube of space, and intervals."""
 
-from semstab.statistics.sampling.collect import influence_sums
+from semstab.statistics.sampling.collect import influence_sums, with_sample
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
 from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
@@ -13,11 +13,12 @@ from semstab.statistics.sampling.intervals import (
     unpaired,
 )
 from semstab.statistics.sampling.paired import coverage, identical, mean_over_frames, same_flight
-from semstab.statistics.sampling.places import Places
+from semstab.statistics.sampling.places import Places, PlaceSums
 
 __all__ = [
     "LEAST_FRAMES",
     "InfluenceSums",
+    "PlaceSums",
     "Places",
     "aligned",
     "coverage",
@@ -35,4 +36,5 @@ __all__ = [
     "standard_error",
     "unpaired",
     "value",
+    "with_sample",
 ]

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import voxel_keys
+from semstab.model.evidence import row_chunks
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
@@ -47,12 +48,16 @@ def influence_sums(
     likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
     whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
     whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)
-    if sample is None:
-        return whole
+    return whole if sample is None else with_sample(whole, sample, logged=events is not None)
+
+
+def with_sample(whole: InfluenceSums, sample: tuple[Events, Events], *, logged: bool = False) -> InfluenceSums:
+    """The sums of a map with those of a sample of its voxels, see `influence_sums`; logged: its frames are known."""
     seen, limit = (
-        dataclasses.replace(_of_log(log, None, edge, np.zeros(len(log.ix))), classes=table.classes) for log in sample
+        dataclasses.replace(_of_log(log, None, whole.edge, np.zeros(len(log.ix))), classes=whole.classes)
+        for log in sample
     )
-    whole = _with_frames(whole, seen) if events is None else whole
+    whole = whole if logged else _with_frames(whole, seen)
     return dataclasses.replace(whole, seen=seen, limit=limit)
 
 
@@ -211,23 +216,35 @@ def _sums_of_table(
     table: VoxelTable, again: Int64, of: Int64, cells: int, true_label: Int64 | None, likely: Float64
 ) -> Float64:
     """(cells, C) from the voxels' rows alone; sums by class are NaN for evidence that is not one-hot."""
-    T, e = table.op[again].astype(np.float64), table.evidence[again]
-    agreement, recurrent = psa(table)[again], (table.op[again] >= RECURRENT).astype(np.float64)
+    one_hot = bool((np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[again].all())
+    sums = np.zeros((cells, width(table.K, truth=true_label is not None)))
+    for some in row_chunks(len(again), table.K):
+        rows = again[some]
+        label = None if true_label is None else true_label[rows]
+        columns = _columns_of_table(table.rows(rows), label, likely[rows], one_hot=one_hot)
+        for to, column in zip(sums.T, columns.T, strict=True):
+            to += np.bincount(of[some], weights=column, minlength=cells)  # noqa: PLW2901 - in place
+    return sums
+
+
+def _columns_of_table(table: VoxelTable, true_label: Int64 | None, likely: Float64, *, one_hot: bool) -> Float64:
+    """(n, C) of voxels with OP >= 2; what a class has is known where all evidence is one-hot."""
+    T, e = table.op.astype(np.float64), table.evidence[:]
+    agreement, recurrent = psa(table), (table.op >= RECURRENT).astype(np.float64)
     twice = np.where(T == 2, T, 0.0)
     values: dict[str, npt.NDArray[Any]] = {
         "voxels": np.ones(len(T)), "psa": agreement, "observations": T, "agreeing": T * agreement,
-        "own": table.self_sum[again], "twice": twice, "twice_agreeing": twice * agreement, "recurrent": recurrent,
-        "vss": recurrent * vss(table)[again], "entropy": entropy(table)[again], "evidence": e,
+        "own": table.self_sum, "twice": twice, "twice_agreeing": twice * agreement, "recurrent": recurrent,
+        "vss": recurrent * vss(table), "entropy": entropy(table), "evidence": e,
     }  # fmt: skip
     if table.K <= MOST_CLASSES:
-        one_hot = (np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[again].all()
         squares = e if one_hot else np.full_like(e, np.nan)
         values["class_own"] = squares
         values["class_apart"] = 2 * ((T[:, None] - 1) * e - e**2 + squares) / (T[:, None] - 1)
     if true_label is not None:
-        label = true_label[again]
-        known, right = label >= 0, label == dominant(table)[again]
-        stable = known * likely[again] * recurrent
+        label = true_label
+        known, right = label >= 0, label == dominant(table)
+        stable = known * likely * recurrent
         looks = np.take_along_axis(e, np.maximum(label, 0)[:, None], axis=1)[:, 0]
         values |= {
             "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
@@ -235,10 +252,10 @@ def _sums_of_table(
         }  # fmt: skip
         if table.K <= MOST_CLASSES:
             true = (label[:, None] == np.arange(table.K)).astype(np.float64)
-            predicted = known[:, None] * (dominant(table)[again][:, None] == np.arange(table.K))
+            predicted = known[:, None] * (dominant(table)[:, None] == np.arange(table.K))
             values |= {"class_known": true, "class_right": true * right[:, None], "class_predicted": predicted}
     columns = np.zeros((len(T), width(table.K, truth=true_label is not None)))
     for name, own in layout(table.K, truth=true_label is not None).items():
         if name not in OF_PLACES:
-            columns[:, own] = np.asarray(values[name], float).reshape(len(T), -1)
-    return np.stack([np.bincount(of, weights=column, minlength=cells) for column in columns.T], axis=1)
+            columns[:, own] = np.asarray(values[name], float).reshape(len(T), own.stop - own.start)
+    return columns

@@ -206,7 +206,8 @@ def aligned(*parts: InfluenceSums) -> tuple[InfluenceSums, ...]:
     if len({(part.K, part.classes, part.truth) for part in parts}) > 1:
         raise DataError("sums of maps of different classes, or with and without ground truth, do not fit together")
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
-    return tuple(part.coarsened(edge, max(steps) if all(steps) else 0) for part in parts)
+    step = max(steps) if all(steps) else 0
+    return tuple(part if (part.edge, part.step) == (edge, step) else part.coarsened(edge, step) for part in parts)
 
 
 # --- What follows from the sums ---------------------------------------------------------------------------------------

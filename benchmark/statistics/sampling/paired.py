@@ -11,7 +11,7 @@ import numpy.typing as npt
 from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.blocks import LEVEL
-from semstab.statistics.sampling.influence import MOST_GROUPS, InfluenceSums, aligned
+from semstab.statistics.sampling.influence import MOST_GROUPS, InfluenceSums, aligned, columns_of, functional, parts_of
 from semstab.statistics.sampling.intervals import LEAST_FRAMES, TOO_FEW, of_places
 
 Float64 = npt.NDArray[np.float64]
@@ -52,17 +52,26 @@ def coverage(new: InfluenceSums, base: InfluenceSums, level: float = LEVEL) -> I
         np.bincount(at, weights=part["voxels"][:, 0], minlength=len(cell)) for at, part in zip(of, parts, strict=True)
     ]
     columns = np.stack([each[0], each[0] + each[1], each[1]], axis=1)
-    return of_places(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    found = of_places(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    same = np.allclose(each[0], each[1], rtol=1e-9)
+    return dataclasses.replace(found, low=1.0, high=1.0, undecided="") if same else found
 
 
 def same_flight(a: InfluenceSums, b: InfluenceSums) -> bool:
     """Whether both have the same groups of frames, so that they can be paired."""
-    a, b = (part.coarsened(part.edge, max(a.step, b.step)) for part in (a, b)) if a.step and b.step else (a, b)
-    one, other = (np.unique(part.frame[part.frame >= 0]) for part in (a, b))
+    step = max(a.step, b.step)
+    if not a.step or not b.step:
+        return False
+    one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step)) for part in (a, b))
     return len(one) > 0 and np.array_equal(one, other)
 
 
-def identical(a: InfluenceSums, b: InfluenceSums) -> bool:
-    """Whether two maps have the very same sums."""
-    a, b = aligned(a, b)
-    return a.columns.shape == b.columns.shape and np.array_equal(a.columns, b.columns, equal_nan=True)
+def identical(a: InfluenceSums, b: InfluenceSums, key: str, k: int | None = None) -> bool:
+    """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
+    found = []
+    for part in aligned(a, b):
+        columns = columns_of(part, key, k)
+        rows = parts_of(part, functional(key, k))[:1]
+        where = columns.any(axis=1) & bool(rows)
+        found.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
+    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*found, strict=True))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ from semstab.model.statistics import Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.blocks import Blocks
 from semstab.statistics.sampling.collect import cell_edge, cells_of
-from semstab.statistics.sampling.influence import Scale, Statistic
+from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
 from semstab.statistics.sampling.intervals import of_places
 
 Float64 = npt.NDArray[np.float64]
@@ -30,6 +31,16 @@ class Places:
         """How many cubes there are."""
         return len(self.cell)
 
+    def sums(self, columns: Float64) -> Float64:
+        """(G, C) over the voxels of each cube of columns (n, C)."""
+        return self._blocks.sums(columns.astype(np.float64))
+
+    def sums_of(
+        self, table: VoxelTable, rows: npt.NDArray[np.int64], formula: Callable[[VoxelTable], Float64]
+    ) -> Float64:
+        """The same of the columns that a formula makes of these rows of a table, which are the voxels."""
+        return self._blocks.sums_of(table, rows, formula)
+
     def estimate(
         self,
         columns: Float64,
@@ -41,20 +52,53 @@ class Places:
 
         Where no scale is given, what goes from 0 to 1 is a share.
         """
-        return self._of(self._blocks.sums(columns.astype(np.float64)), statistic, bounds, scale)
+        return PlaceSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
 
-    def estimate_of(
+
+@dataclass(frozen=True, eq=False)
+class PlaceSums:
+    """Sums by name over the voxels of cubes; those of a map in parts follow from the parts'.
+
+    cell  (G, 3) int32 the cubes, of an edge in metres, a power of 2
+    sums  (G, C) of each name
+    """
+
+    cell: npt.NDArray[np.int32]
+    edge: float
+    sums: Mapping[str, Float64]
+
+    def __getitem__(self, name: str) -> Float64:
+        """Sums (C,) over all cubes."""
+        total: Float64 = self.sums[name].sum(axis=0)
+        return total
+
+    def __or__(self, further: Mapping[str, Float64]) -> PlaceSums:
+        return PlaceSums(self.cell, self.edge, {**self.sums, **further})
+
+    def estimate(
         self,
-        table: VoxelTable,
-        rows: npt.NDArray[np.int64],
-        formula: Callable[[VoxelTable], Float64],
+        name: str,
         statistic: Statistic,
         bounds: tuple[float, float] = (0.0, 1.0),
         scale: Scale | None = None,
     ) -> Interval:
-        """The same of the columns that a formula makes of these rows of a table, which are the voxels."""
-        return self._of(self._blocks.sums_of(table, rows, formula), statistic, bounds, scale)
+        """The statistic of sums (..., C), the second of which counts, with its interval.
 
-    def _of(self, sums: Float64, statistic: Statistic, bounds: tuple[float, float], scale: Scale | None) -> Interval:
+        Where no scale is given, what goes from 0 to 1 is a share.
+        """
         kind: Scale = scale or ("share" if bounds == (0.0, 1.0) else "plain")
-        return of_places(self.cell, self.edge, sums, statistic, kind, bounds)
+        return of_places(self.cell, self.edge, self.sums[name], statistic, kind, bounds)
+
+    @classmethod
+    def merged(cls, parts: Sequence[PlaceSums]) -> PlaceSums:
+        """Those of a map from its parts, by the cubes that the whole map has."""
+        edge = max(part.edge for part in parts)
+        cells = np.concatenate([part.cell // round(edge / part.edge) for part in parts])
+        while len(distinct := np.unique(cells, axis=0)) > MOST_CELLS:
+            cells, edge = cells // 2, 2 * edge
+        _, of = np.unique(cells, axis=0, return_inverse=True)
+        joined = {name: np.concatenate([part.sums[name] for part in parts]) for name in parts[0].sums}
+        sums = {name: np.zeros((len(distinct), own.shape[1])) for name, own in joined.items()}
+        for name, own in joined.items():
+            np.add.at(sums[name], of.ravel(), own)
+        return cls(distinct.astype(np.int32), edge, sums)

@@ -1,0 +1,204 @@
+"""The tables of a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from semstab.comparison.quantities import BY_CLASS, HEADLINES, IOU, RECALL, VERDICT, by_key
+from semstab.model.contrast import Against, Blame, Contrast, Place, RunComparison
+from semstab.model.measures import Quantity
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Estimate, Interval
+from semstab.outputs.tables.comparison import coverage_table, ignored_table
+from semstab.outputs.tables.table import Column, Group, Row, Table
+from semstab.statistics.agreement import ALPHA_BETWEEN, PSA
+
+ALL_SCENES = "all scenes"
+NAMED_FRAMES = 5
+
+IN_CLASSES = (VERDICT, ALPHA_BETWEEN, PSA, RECALL, IOU)
+"""What the table of classes has beside each other."""
+
+ANSWERS = (
+    "In brackets: intervals at 95%. They answer for the next flight where 60 frames or more tell of it, else for this"
+    " map: other places like these in these very frames. p (Holm): that there is no difference, corrected for all that"
+    " is compared in the scene, or over all scenes."
+)
+
+
+def tables(found: RunComparison) -> list[Table]:
+    """All that there is something for."""
+    made = [_differences(found), _by_class(found), _places(found), _frames(found), *_what_was_compared(found)]
+    return [table for table in made if any(group.rows for group in table.groups)] + [everything(found)]
+
+
+def scopes(found: RunComparison) -> Iterator[tuple[str, Against]]:
+    """Each run against the base: over all scenes where there are several, then scene by scene."""
+    if len(found.scenes) > 1:
+        yield from ((ALL_SCENES, own) for own in found.overall)
+    for scene in found.scenes:
+        yield from ((scene.scene, own) for own in scene.against)
+
+
+def heading(found: RunComparison, scope: str, own: Against) -> str:
+    """What stands above a run's differences."""
+    return f"{scope}: {own.other} less {found.base}"
+
+
+def question(row: Contrast) -> str:
+    """What a difference answers, or why it claims nothing, in a word or two."""
+    if row.difference.undecided:
+        return "undecided"
+    return {THIS_MAP: "this map", NEXT_FLIGHT: "next flight"}[row.difference.question]
+
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+def _differences(found: RunComparison) -> Table:
+    columns = (
+        Column("measure", "Measure"),
+        Column("base", found.base, 4),
+        Column("other", "The run", 4),
+        Column("difference", "Difference", 4, signed=True),
+        Column("p_holm", "p (Holm)", 4),
+        Column("answers", "Answers for"),
+        Column("change", "Change"),
+    )
+    groups = tuple(Group(heading(found, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(found))
+    macro = " Over all scenes each scene counts once." if len(found.scenes) > 1 else ""
+    caption = (
+        "On the places that all runs saw; the share of the ceiling and coverage are of each run's whole map, flicker of"
+        " its images; coverage is the number of voxels seen twice or more, for each one of the base. Undecided: too few"
+        f" frames, or errors reach as far as the scene. {ANSWERS}{macro}"
+    )
+    return Table("comparison", "Differences", caption, columns, groups, "scope")
+
+
+def _rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
+    keys = {quantity.key: quantity for quantity in shown}
+    return tuple(
+        (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, question(row), row.change)
+        for row in own.contrasts
+        if row.measure in keys
+    )
+
+
+def _titled(quantity: Quantity) -> str:
+    unit = f", {quantity.unit}" if quantity.unit else ""
+    return f"{quantity.title}{unit}"
+
+
+def _by_class(found: RunComparison) -> Table:
+    there = {row.measure for _, own in scopes(found) for row in own.by_class}
+    shown = [quantity for quantity in IN_CLASSES if quantity.key in there]
+    columns = (Column("class", "Class"), *(Column(q.key, q.title, 3, q.better, signed=True) for q in shown))
+    worse = Column("worse", "Worse"), Column("better", "Better")
+    groups = tuple(Group(heading(found, scope, own), _class_rows(own, shown)) for scope, own in scopes(found))
+    caption = (
+        "Differences of each class: agreement of the class against all others, PSA of the places that are of it (by the"
+        " ground truth, else by what all runs together say), recall and IoU. Worse, better: what differs where the"
+        f" p-values are corrected for all measures and classes. {ANSWERS}"
+    )
+    return Table("comparison_classes", "By class", caption, (columns[0], *worse, *columns[1:]), groups, "scope")
+
+
+def _class_rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
+    words = by_key(BY_CLASS)
+    rows = []
+    for name in dict.fromkeys(row.of for row in own.by_class):
+        mine = {row.measure: row for row in own.by_class if row.of == name}
+        cells = [mine[q.key].difference if q.key in mine else math.nan for q in shown]
+        changed = {
+            change: ", ".join(words[row.measure].symbol for row in mine.values() if row.change == change)
+            for change in ("worse", "better")
+        }
+        rows.append((name, changed["worse"], changed["better"], *cells))
+    return tuple(rows)
+
+
+def _places(found: RunComparison) -> Table:
+    columns = (
+        Column("number", "Place", 0),
+        Column("what", "Lost"),
+        Column("class", "Class"),
+        Column("instead", "Instead"),
+        Column("voxels", "Voxels", 0),
+        Column("loss", "Loss", 2),
+        Column("x", "x", 2, over="Centre (m)"),
+        Column("y", "y", 2, over="Centre (m)"),
+        Column("z", "z", 2, over="Centre (m)"),
+        Column("size", "Size (m)", 2),
+        Column("rivals", "Rivals", 0),
+        Column("frames", "Frames to blame"),
+    )
+    groups = tuple(
+        Group(heading(found, scene.scene, own), tuple(_place_row(place) for place in own.places))
+        for scene in found.scenes
+        for own in scene.against
+    )
+    caption = (
+        "Neighbouring voxels of one class that got worse. Agreement: a fifth or more of the agreement between frames is"
+        " lost; truth: right in the base, and wrong now. Loss: its mean. Instead: what the blamed looks say. Rivals:"
+        " places that got better by as much; where nothing changed there are as many of them. Frames to blame: those"
+        " whose looks turned away from the class, with their share."
+    )
+    return Table("comparison_places", "Places that got worse", caption, columns, groups, "scope")
+
+
+def _place_row(place: Place) -> Row:
+    return (
+        place.number, place.what, place.of, place.instead, place.voxels, place.loss, *place.centre, place.size,
+        place.rivals, blamed(place.frames),
+    )  # fmt: skip
+
+
+def blamed(frames: Sequence[Blame]) -> str:
+    """'13 (30%), 4 (26%)'."""
+    listed = ", ".join(f"{own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
+    return listed + (", ..." if len(frames) > NAMED_FRAMES else "")
+
+
+def _frames(found: RunComparison) -> Table:
+    columns = (Column("frame", "Frame"), Column("share_percent", "Share of what was lost (%)", 1))
+    groups = tuple(
+        Group(heading(found, scene.scene, own), tuple((str(each.frame), 100 * each.share) for each in own.blamed))
+        for scene in found.scenes
+        for own in scene.against
+    )
+    caption = "Of all places whose frames agree less, together."
+    return Table("comparison_frames", "Frames to blame", caption, columns, groups, "scope")
+
+
+def _what_was_compared(found: RunComparison) -> list[Table]:
+    covered = coverage_table({scene.scene: scene.coverage for scene in found.scenes if scene.coverage})
+    looks = {scene.scene: scene.looks for scene in found.scenes if scene.looks is not None}
+    return [covered, ignored_table(looks)]
+
+
+def everything(found: RunComparison) -> Table:
+    """All contrasts, one a row."""
+    columns = (
+        Column("run", "Run"),
+        Column("class", "Class"),
+        Column("measure", "Measure"),
+        Column("base", "Base", 6),
+        Column("other", "The run", 6),
+        Column("difference", "Difference", 6, signed=True),
+        Column("question", "Question"),
+        Column("p", "p", 6),
+        Column("p_holm", "p (Holm)", 6),
+        Column("change", "Change"),
+        Column("undecided", "Undecided"),
+    )
+    groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(found))
+    return Table("comparison_all", "All that was compared", ANSWERS, columns, groups, "scope")
+
+
+def _all_rows(own: Against) -> Iterator[Row]:
+    for row in (*own.contrasts, *own.by_class):
+        found: Interval = row.difference
+        yield (
+            own.other, row.of, row.measure, row.base, row.other, Estimate(found.value, found.low, found.high),
+            found.question, found.p_value, row.p_holm, row.change, found.undecided,
+        )  # fmt: skip

@@ -1,0 +1,143 @@
+"""Which units fit into memory as they are, which are fused in tiles, and which not at all: before any is fused."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from semstab.backends import restrictable
+from semstab.config import Config
+from semstab.engine.tiling.partition import Tiling, tiled
+from semstab.engine.tiling.sights import CELL, SIGHTS, Sights, look_at
+from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.work.memory import GB, Kind, limit, most_voxels, takes, too_large
+from semstab.errors import ConfigError, DataError
+from semstab.model.frames import Frame
+from semstab.task import Task, read
+
+SHARE = 0.7
+"""Of the memory that maps may take, a part of one in tiles takes so much: frames are read ahead beside it."""
+
+
+@dataclass
+class Sizing:
+    """What is done with units that would not fit, by identity.
+
+    tilings  into which parts their maps are cut
+    refused  why they cannot be fused
+    remarks  a line for each sequence that is fused in tiles
+    """
+
+    tilings: dict[str, Tiling] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def sized(config: Config, missing: Sequence[Planned], folder: Path, width: int = 1) -> Sizing:
+    """Look at units that are to be fused by `width` tasks at once; what cannot be read is left to them to report."""
+    found = Sizing()
+    for group in _groups(missing):
+        with contextlib.suppress(DataError):
+            _size(config, group, folder, width, found)
+    return found
+
+
+def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
+    """Units that are in memory at once: those of a sequence that are watched; others can be put off."""
+    together: dict[tuple[str, str], list[PlannedUnit]] = {}
+    for each in missing:
+        if isinstance(each, PlannedUnit):
+            if each.kept:
+                together.setdefault((each.unit.scene, each.unit.backbone), []).append(each)
+            else:
+                yield [each]
+    yield from together.values()
+
+
+def _size(config: Config, group: Sequence[PlannedUnit], folder: Path, width: int, found: Sizing) -> None:
+    task, settings = group[0].task, group[0].config
+    forced = isinstance(config.tile_size, int)
+    if not forced and _surely_fits(config, group):
+        return
+    size = config.tile_size if isinstance(config.tile_size, int) else None
+    sights = _sights(folder, task, settings, min(CELL, size or CELL))
+    voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
+    kinds = _kinds(group, soft=_is_soft(task))
+    needed = sum(kind.bytes(voxels, observations) for kind in kinds)
+    if not forced and needed <= limit(config):
+        return
+    if (why := _cannot_be_tiled(config, group)) is not None:
+        if forced:
+            raise ConfigError(f"tile_size = {config.tile_size}: {why}")
+        names = [each.unit.backend for each in group]
+        line = too_large(task, names, settings, voxels, needed, f" ({why})")
+        found.refused |= {each.identity: line for each in group}
+        return
+    budget = SHARE * limit(config) / width
+    for each, kind in zip(group, kinds, strict=True):
+        found.tilings[each.identity] = tiled(sights, kind.bytes, budget, size, 2 * width if width > 1 else 1)
+    tiling = found.tilings[group[0].identity]
+    decoded = tiling.decodes / max(len(task.indices), 1)
+    found.remarks.append(
+        f"{takes(task, settings, voxels, needed)}, {limit(config) / GB:.2g} GB are there: fused in {len(tiling.parts)}"
+        f" parts, of tiles of {tiling.size * settings.voxel_size:g} m; a frame is decoded {decoded:.2f} times for them"
+    )
+
+
+def _surely_fits(config: Config, group: Sequence[PlannedUnit]) -> bool:
+    task, settings = group[0].task, group[0].config
+    voxels = most_voxels(task, settings, _first(task, settings))
+
+    def fits(*, soft: bool) -> bool:
+        return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft)) <= limit(config)
+
+    return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
+
+
+def _first(task: Task, settings: Config) -> Frame:
+    """The geometry of the first frame as it is fused."""
+    return task.scene.geometry(task.indices[0]).every(settings.pixel_stride)
+
+
+def _kinds(group: Sequence[PlannedUnit], *, soft: bool) -> list[Kind]:
+    return [
+        Kind(
+            each.unit.backend,
+            len(each.task.mapping.target),
+            soft=soft,
+            logged=each.config.statistics or each.config.events,
+            sampled=each.sampled,
+        )
+        for each in group
+    ]
+
+
+def _is_soft(task: Task) -> bool:
+    return read(task, task.indices[0]).scores is not None
+
+
+def _cannot_be_tiled(config: Config, group: Sequence[PlannedUnit]) -> str | None:
+    """Why not; None where they can."""
+    if config.tile_size == "off":
+        return "tile_size: off forbids to fuse it in tiles"
+    if config.statistics or config.events:
+        return "statistics and events keep every observation; without them it can be fused in tiles"
+    other = [each.unit.backend for each in group if not restrictable(each.unit.backend)]
+    return f"backend '{other[0]}' cannot be restricted to tiles" if other else None
+
+
+def _sights(folder: Path, task: Task, settings: Config, cell: int) -> Sights:
+    """What the frames see, kept from before or looked at now."""
+    noise = None if task.perturbation is None else task.perturbation.model_dump()
+    content = [task.scene.name, task.digest, settings.voxel_size, settings.pixel_stride, noise, task.indices, cell]
+    key = hashlib.blake2b(json.dumps(content).encode(), digest_size=12).hexdigest()
+    file = folder / SIGHTS / f"{key}.npz"
+    kept = Sights.load(file)
+    if kept is None:
+        kept = look_at(task, settings.voxel_size, settings.pixel_stride, cell, settings.threads)
+        kept.save(file)
+    return kept

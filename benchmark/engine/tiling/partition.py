@@ -1,0 +1,121 @@
+"""Who fuses which tiles: rectangles of them, so that few frames are decoded for two, each small enough for a task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.engine.tiling.sights import Sights
+from semstab.model.extent import Extent
+
+ROOM = 4
+"""A tile takes at most that part of what a task may take, where its size is not given."""
+
+Cost = Callable[[float, float], float]
+"""Bytes of a map of so many voxels and observations."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Tiles that one task fuses: its voxels are in no other part.
+
+    extent  of its tiles together
+    size    edge of a tile, voxels
+    frames  indices of those that see it, in order
+    voxels  how many it will have, as estimated
+    """
+
+    extent: Extent
+    size: int
+    frames: tuple[int, ...]
+    voxels: int
+
+    @property
+    def name(self) -> str:
+        """Its corners in tiles: X_Y, or X_Y-X_Y of the first and the last one."""
+        (x0, y0), (x1, y1) = ((x // self.size, y // self.size) for x, y in (self.extent.low, self.extent.high))
+        first, last = f"{x0}_{y0}", f"{x1 - 1}_{y1 - 1}"
+        return first if first == last else f"{first}-{last}"
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """All parts of a unit's map. size is that of its tiles, in voxels."""
+
+    size: int
+    parts: tuple[Part, ...]
+
+    @property
+    def decodes(self) -> int:
+        """How many frames the parts will read together."""
+        return sum(len(part.frames) for part in self.parts)
+
+
+def tiled(sights: Sights, cost: Cost, budget: float, size: int | None = None, least: int = 1) -> Tiling:
+    """The parts of what frames see, each within the budget as far as tiles of that size allow it.
+
+    size   edge of a tile, voxels, a power of 2; where none is given, the largest that leaves room
+    least  so many parts at least, if there are as many tiles
+    """
+    if size is None:
+        size = tile_size(sights, cost, budget / ROOM)
+    tiles = sights.in_tiles(max(size, sights.size))
+    total = cost(float(tiles.voxels.sum()), float(tiles.observations.sum()))
+    budget = min(budget, 1.1 * total / least)
+    parts = [_part(tiles, rows) for rows in _split(tiles, cost, budget, np.arange(len(tiles.place)))]
+    return Tiling(tiles.size, tuple(part for part in parts if part.frames))
+
+
+def tile_size(sights: Sights, cost: Cost, budget: float) -> int:
+    """The largest power of 2 whose most crowded tile is within the budget, but no more than one tile for all."""
+    size, tiles = sights.size, sights
+    while len(tiles.place) > 1:
+        tiles = tiles.in_tiles(2 * tiles.size)
+        most = int(np.argmax(tiles.voxels)) if len(tiles.place) else 0
+        if cost(tiles.voxels[most], tiles.observations[most]) > budget:
+            break
+        size = tiles.size
+    return size
+
+
+def _split(tiles: Sights, cost: Cost, budget: float, rows: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
+    """Rows of tiles by rectangle: halves by what they cost, cut across the longer side, until each fits."""
+    weight = np.array([cost(*own) for own in zip(tiles.voxels[rows], tiles.observations[rows], strict=True)])
+    place = tiles.place[rows]
+    length = np.ptp(place, axis=0) + 1
+    if weight.sum() <= budget or length.max() == 1:
+        yield rows
+        return
+    axis = int(np.argmax(length))
+    low = _middle(place[:, axis], weight)
+    for half in (place[:, axis] < low, place[:, axis] >= low):
+        yield from _split(tiles, cost, budget, rows[half])
+
+
+def _middle(at: npt.NDArray[np.int32], weight: npt.NDArray[np.float64]) -> int:
+    """Where to cut: the coordinate at which the two sides' weights are closest, with something on either side."""
+    values, of = np.unique(at, return_inverse=True)
+    below = np.cumsum(np.bincount(of, weights=weight))[:-1]
+    return int(values[1 + np.argmin(np.abs(below - weight.sum() / 2))])
+
+
+def _part(tiles: Sights, rows: npt.NDArray[np.int64]) -> Part:
+    place = tiles.place[rows]
+    low, high = place.min(axis=0), place.max(axis=0) + 1
+    inside = ((tiles.cell >= low) & (tiles.cell < high)).all(axis=1)
+    frames = np.unique(tiles.frame[inside])
+    corner, end = (tuple(int(edge) * tiles.size for edge in edges) for edges in (low, high))
+    return Part(
+        Extent((corner[0], corner[1]), (end[0], end[1])),
+        tiles.size,
+        tuple(frames.tolist()),
+        round(float(tiles.voxels[rows].sum())),
+    )
+
+
+def decodes_a_frame(tilings: Sequence[Tiling], frames: int) -> float:
+    """How often a frame is decoded, on average."""
+    return sum(tiling.decodes for tiling in tilings) / max(frames, 1)

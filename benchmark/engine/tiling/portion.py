@@ -1,0 +1,137 @@
+"""What is computed of a unit in tiles at a time, and what is left of it: sums and series that add up to the unit's."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.engine.series import FrameRow
+from semstab.engine.tiling.partition import Part
+from semstab.model.records import FrameQuality, ImageSpace
+from semstab.model.results import Agreement, FrameReport, SizeAlpha
+from semstab.runtime.files import atomic_path
+from semstab.runtime.json_form import from_json, to_json
+
+PORTIONS = "parts"
+"""Folder of what is finished of units in tiles, unit by unit, until they are whole."""
+
+REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
+          "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
+ROW = ("timestamp", "flicker_percent", "decode_seconds", "wait_seconds", "flicker_seconds", "left_out")
+MEANS = ("map_vss", "map_entropy", "map_recurrent")
+INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Portion:
+    """What of a unit in tiles is computed in one go: the voxels of a part, or else what its frames tell without a map.
+
+    key      of the unit
+    part     None for the frames
+    kept     whether the voxels are kept
+    judged   whether the statistics say something of the map
+    reduces  whether soft scores are also fused as labels
+    """
+
+    key: str
+    part: Part | None = None
+    kept: bool = False
+    judged: bool = False
+    reduces: bool = False
+
+    @property
+    def name(self) -> str:
+        """Of the file of what is left of it."""
+        return "frames" if self.part is None else self.part.name
+
+
+@dataclass(frozen=True)
+class About:
+    """What is no array of a finished portion.
+
+    files    digests of its files, by their path in the folder
+    checked  how far it agrees with the reference on a sample of its voxels
+    image_space, sizes, quality  of the frames
+    """
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    checked: Agreement | None = None
+    image_space: ImageSpace | None = None
+    sizes: tuple[SizeAlpha, ...] = ()
+    quality: FrameQuality | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """What is left of a portion.
+
+    series   (F, C) a row a frame: REPORT, then ROW
+    sums     over the voxels, by name: those of `TableSums`, or of `MapSums` where its map is judged
+    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
+    poses    (F, 4, 4) of the frames, where it is of these
+    """
+
+    about: About
+    series: Float64
+    sums: Mapping[str, Any] = field(default_factory=dict)
+    reduced: Float64 = field(default_factory=lambda: np.zeros(0))
+    poses: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+
+    def save(self, path: Path) -> None:
+        """Write it, atomically."""
+        arrays: dict[str, Any] = {"series": self.series, "reduced": self.reduced, "poses": self.poses}
+        arrays |= {f"sums {name}": value for name, value in self.sums.items()}
+        text = json.dumps(to_json(self.about)).encode()
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, about=np.frombuffer(text, np.uint8), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Finished:
+        """What `save` wrote. Raises OSError, ValueError or BadZipFile where it is not there or damaged."""
+        with path.open("rb") as file, np.load(file) as content:
+            about = from_json(About, json.loads(content["about"].tobytes()), path)
+            sums = {name[5:]: content[name] for name in content.files if name.startswith("sums ")}
+            return cls(about, content["series"], sums, content["reduced"], content["poses"])
+
+
+def series_array(rows: Sequence[FrameRow]) -> Float64:
+    """(F, C) of the rows of a time series, an undefined number as NaN."""
+    values = [[*(getattr(row.report, name) for name in REPORT), *(getattr(row, name) for name in ROW)] for row in rows]
+    return np.array(values, dtype=np.float64).reshape(len(rows), len(REPORT) + len(ROW))
+
+
+def joined_series(frames: Float64, parts: Sequence[Float64]) -> list[FrameRow]:
+    """The time series of a unit (F rows) from that of its frames without a map, and those of the parts of its map."""
+    columns = {name: frames[:, k].copy() for k, name in enumerate((*REPORT, *ROW))}
+    state = {name: np.zeros(len(frames)) for name in ("map_voxels", *MEANS)}
+    for part in parts:
+        own = {name: part[:, k] for k, name in enumerate((*REPORT, *ROW))}
+        at = np.searchsorted(columns["frame"], own["frame"])
+        for name in ("points", "voxels", "new_voxels", "drift_sum", "seconds"):
+            columns[name][at] += own[name]
+        for name in ("association_seconds", "update_seconds"):
+            columns[name][at] = np.nan_to_num(columns[name][at]) + own[name]
+        last = np.searchsorted(own["frame"], columns["frame"], side="right") - 1
+        voxels = np.where(last >= 0, own["map_voxels"][last], 0.0)
+        state["map_voxels"] += voxels
+        for name in MEANS:
+            state[name] += np.where(voxels > 0, voxels * own[name][last], 0.0)
+    n = np.where(state["map_voxels"] > 0, state["map_voxels"], math.nan)
+    columns |= {"map_voxels": state["map_voxels"], **{name: state[name] / n for name in MEANS}}
+    return [_row({name: float(values[k]) for name, values in columns.items()}) for k in range(len(frames))]
+
+
+def _row(values: Mapping[str, float]) -> FrameRow:
+    report: dict[str, Any] = {name: int(values[name]) if name in INTEGERS else values[name] for name in REPORT}
+    row: dict[str, Any] = {name: values[name] for name in ROW} | {"left_out": int(values["left_out"])}
+    row["timestamp"] = None if math.isnan(values["timestamp"]) else values["timestamp"]
+    return FrameRow(FrameReport(**report), **row)

@@ -1,0 +1,135 @@
+"""A unit in tiles, once all of its portions are finished: their sums and series make what a unit leaves."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.datasets.formats.disk import file_digest
+from semstab.engine.series import to_csv
+from semstab.engine.tiling.portion import Finished, joined_series
+from semstab.engine.units import PlannedUnit
+from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
+from semstab.engine.work.up_axis import estimate_up
+from semstab.errors import DataError
+from semstab.metrics.summary import TableSums
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
+from semstab.model.results import Agreement, Deviation
+from semstab.model.statistics import MapStatistics
+from semstab.model.voxels import VoxelTable
+from semstab.runtime.files import write_text
+from semstab.statistics import Looks
+from semstab.statistics.description import analyse_sums
+from semstab.statistics.map_sums import MapSums
+from semstab.statistics.sampling import InfluenceSums
+
+UP_VOXELS = 1 << 20
+"""Of more voxels every n-th is looked at for the up axis."""
+
+
+def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished], folder: Path) -> UnitContent:
+    """The unit's content; its series is written. Raises DataError where no pixel was valid."""
+    task, unit, config = planned.task, planned.unit, planned.config
+    sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
+    if not sums.total[2]:
+        raise no_voxels(task, config)
+    found = _statistics(planned, parts, folder, frames.about.files) if planned.judged else None
+    rows = joined_series(frames.series, [part.series for part in parts])
+    reduced = [part.reduced for part in parts if len(part.reduced)]
+    summary = unit_summary(
+        task,
+        rows,
+        sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
+        None if found is None else found[0],
+        reduced_of(np.sum(reduced, axis=0)) if reduced else None,
+        frames.about.sizes,
+    )
+    files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
+    if planned.kept:
+        savers: Savers = {f"{FRAMES}/{unit.slug}.csv": lambda path: write_text(path, to_csv(rows))}
+        if found is not None:
+            savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
+        files |= {name: _saved(save, folder / name) for name, save in savers.items()}
+    content = UnitContent(
+        planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
+    )
+    if not planned.image_space or frames.about.image_space is None:
+        return content
+    image_space = replace(frames.about.image_space, flicker_percent=summary.flicker_percent)
+    tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
+    content = replace(content, quality=frames.about.quality)
+    return replace(content, image_space=image_space, up=_up(planned, tiles, int(sums.total[2]), frames.poses))
+
+
+def _saved(save: Callable[[Path], None], path: Path) -> str:
+    """The digest of a file that was written."""
+    save(path)
+    return file_digest(path).hex()
+
+
+def _statistics(
+    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Iterable[str]
+) -> tuple[MapStatistics, InfluenceSums]:
+    """What the statistics say of all parts together, with the looks that were sampled of the frames."""
+    classes, config = planned.task.mapping.target.classes, planned.config
+    looks = next(Looks.load(folder / name) for name in files if name.startswith(f"{LOOKS}/"))
+    return analyse_sums(
+        MapSums.merged([MapSums.read(part.sums, classes) for part in parts]),
+        voxel_size=config.voxel_size,
+        classes=classes,
+        sample=looks.sample(),
+        name=planned.task.backbone,
+        edges=config.strata,
+        critical=config.critical_classes,
+    )
+
+
+def _checked(found: Sequence[Agreement | None]) -> Agreement | None:
+    """The agreement on all parts, from that on each; None where it was not checked."""
+    there = [each for each in found if each is not None]
+    if not there or len(there) < len(found):
+        return None
+    shared = [each.voxels[0] - each.only_in[0] for each in there]
+    return replace(
+        there[0],
+        voxels=(sum(each.voxels[0] for each in there), sum(each.voxels[1] for each in there)),
+        only_in=(sum(each.only_in[0] for each in there), sum(each.only_in[1] for each in there)),
+        differences=dict(_deviations(there, shared)),
+        agrees=all(each.agrees for each in there),
+    )
+
+
+def _deviations(there: Sequence[Agreement], shared: Sequence[int]) -> Iterator[tuple[str, Deviation]]:
+    total = sum(shared)
+    for name in there[0].differences:
+        own = [(each.differences[name], n) for each, n in zip(there, shared, strict=True) if n]
+        largest = max((each.max for each, _ in own), default=math.nan)
+        yield name, Deviation(largest, sum(each.mean * n for each, n in own) / total if total else math.nan)
+
+
+def _up(
+    planned: PlannedUnit, tiles: Sequence[Path], voxels: int, poses: npt.NDArray[np.float64]
+) -> tuple[float, float, float] | None:
+    """The scene's up axis, said, or estimated from some voxels of each tile; None where neither works."""
+    scene, step = planned.task.scene, -(-voxels // UP_VOXELS)
+    try:
+        up = scene.up if scene.up is not None else estimate_up(_centers(tiles, planned.config.voxel_size, step), poses)
+    except (DataError, ImportError, OSError):
+        return None
+    x, y, z = (float(value) for value in up)
+    return x, y, z
+
+
+def _centers(tiles: Sequence[Path], voxel_size: float, step: int) -> npt.NDArray[np.float64]:
+    """(n, 3) of every n-th voxel, metres, in the order of a whole table."""
+    found: list[Mapping[str, npt.NDArray[Any]]] = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in tiles]
+    index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in found])
+    return (index[np.lexsort(index.T[::-1])] + 0.5) * voxel_size

@@ -1,0 +1,152 @@
+"""What labels of single frames are worth: right, steady, what the model says next, how late they follow a change."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.frames import Frame
+from semstab.model.records import FrameQuality
+from semstab.pixels.warp import Correspondence, correspond
+
+HORIZON = 8
+"""Frames after a change over which lag is counted."""
+
+Mask = npt.NDArray[np.bool_]
+NONE = -1
+
+
+class FrameJudge:
+    """Takes the frames of a sequence in order, each as a filter left it, as the model said it, and as it truly is.
+
+    All have labels in one label space of K classes and one size; the truth may be missing.
+    """
+
+    def __init__(self, num_classes: int) -> None:
+        self._K = num_classes
+        self._confusion = np.zeros((num_classes, num_classes), dtype=np.int64)
+        self._counts = np.zeros(6)
+        self._lag = Lag()
+        self._before: tuple[Frame, Frame, Frame | None] | None = None
+        self._accuracy: list[float] = []
+        self._foresight: list[float] = []
+
+    def add(self, frame: Frame, model: Frame, truth: Frame | None) -> None:
+        """Add the next frame."""
+        if truth is not None:
+            known = frame.valid & truth.valid
+            pairs = truth.predicted[known].astype(np.int64) * self._K + frame.predicted[known]
+            found = np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
+            self._confusion += found
+            self._accuracy.append(_share(np.trace(found), found.sum()))
+        self._count(labelled=frame.valid, sayable=model.valid)
+        if self._before is not None and self._before[0].shape == frame.shape:
+            self._compare(*self._before, frame, model, truth)
+        self._before = frame, model, truth
+
+    def result(self, model: str, filters: str, milliseconds: float) -> FrameQuality:
+        """What was found so far of filters over a model, which took so many milliseconds a frame."""
+        labelled, sayable, foreseen, met, stale, looked = self._counts
+        right = np.diag(self._confusion)
+        union = self._confusion.sum(axis=0) + self._confusion.sum(axis=1) - right
+        there = union > 0
+        return FrameQuality(
+            model=model,
+            filters=filters,
+            coverage=_share(labelled, sayable),
+            foresight=_share(foreseen, met),
+            accuracy=_share(right.sum(), self._confusion.sum()),
+            miou=float(np.mean(right[there] / union[there])) if there.any() else math.nan,
+            stable_wrong=_share(stale, looked),
+            lag=self._lag.mean,
+            changes=self._lag.changes,
+            milliseconds=milliseconds,
+            accuracy_by_frame=tuple(self._accuracy),
+            foresight_by_frame=tuple(self._foresight),
+        )
+
+    def _compare(
+        self, frame: Frame, model: Frame, truth: Frame | None, now: Frame, model_now: Frame, truth_now: Frame | None
+    ) -> None:
+        seen = correspond(now, frame)
+        labelled = seen.bring(frame.valid, fill=False)
+        before = seen.bring(frame.predicted)
+        met = labelled & model_now.valid
+        foreseen = met & (before == model_now.predicted)
+        self._foresight.append(_share(foreseen.sum(), met.sum()))
+        self._count(foreseen=foreseen, met=met)
+        if truth is None or truth_now is None:
+            return
+        looked = labelled & now.valid & truth_now.valid
+        self._count(stale=looked & (before == now.predicted) & (now.predicted != truth_now.predicted), looked=looked)
+        where = correspond(now, frame, depth_tolerance=math.inf)
+        self._lag.add(where, now, model_now, truth, truth_now)
+
+    def _count(self, **masks: Mask) -> None:
+        names = ("labelled", "sayable", "foreseen", "met", "stale", "looked")
+        for name, mask in masks.items():
+            self._counts[names.index(name)] += np.count_nonzero(mask)
+
+
+class Lag:
+    """Frames from a true change of what is seen in a direction until the labels follow, where the model does at once.
+
+    Each pixel is followed back to where its point lay in the frame before, whether it was hidden there or not: a car
+    that leaves uncovers the road. It changed where its true class was not within a pixel of that place. Estimated by
+    Kaplan and Meier's product, as pixels leave the view or change again before their label followed: the mean over
+    `HORIZON` frames, one who never follows has `HORIZON`.
+    """
+
+    def __init__(self) -> None:
+        self._waiting = np.zeros(HORIZON, dtype=np.int64)
+        self._followed = np.zeros(HORIZON, dtype=np.int64)
+        self._age: npt.NDArray[np.int16] | None = None
+
+    def add(self, where: Correspondence, now: Frame, model: Frame, truth: Frame, truth_now: Frame) -> None:
+        """Add the next frame; `where` its pixels lay in the frame before, whose truth is `truth`."""
+        if self._age is None:
+            self._age = np.full(truth.shape, NONE, dtype=np.int16)
+        true = truth_now.predicted
+        known = truth_now.valid & where.bring(truth.valid, fill=False)
+        changed = known & ~_near(truth, where, true)
+        same = known & (where.bring(truth.predicted) == true)
+        age = np.where(same, where.bring(self._age, fill=NONE), NONE)
+        age = np.where(age >= 0, age + 1, NONE)
+        age[changed & model.valid & (model.predicted == true)] = 0
+        age[age >= HORIZON] = NONE
+        followed = (age >= 0) & now.valid & (now.predicted == true)
+        self._waiting += np.bincount(age[age >= 0], minlength=HORIZON)
+        self._followed += np.bincount(age[followed], minlength=HORIZON)
+        age[followed] = NONE
+        self._age = age.astype(np.int16)
+
+    @property
+    def changes(self) -> int:
+        """How many pixels changed, where the model followed at once."""
+        return int(self._waiting[0])
+
+    @property
+    def mean(self) -> float:
+        """In frames; NaN where nothing changed."""
+        if not self._waiting[0]:
+            return math.nan
+        waiting = np.maximum(self._waiting, 1)
+        return float(np.cumprod(1 - self._followed / waiting).sum())
+
+
+def _near(truth: Frame, where: Correspondence, true: npt.NDArray[Any]) -> Mask:
+    """Whether a pixel's class was seen within a pixel of where it lay before."""
+    padded = np.pad(truth.predicted, 1, mode="edge")
+    H, W = truth.shape
+    near = np.zeros(true.shape, dtype=np.bool_)
+    for dv in range(3):
+        for du in range(3):
+            near |= where.bring(np.ascontiguousarray(padded[dv : dv + H, du : du + W])) == true
+    return near
+
+
+def _share(part: float, of: float) -> float:
+    return float(part) / float(of) if of else math.nan

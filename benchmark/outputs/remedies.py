@@ -1,0 +1,233 @@
+"""What steadied a model, at what price, and which filter to use: from the records of `remedies`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from semstab.metrics import macro_mean
+from semstab.model.records import Record, Result
+
+MOST_LAG = 1.0
+"""Frames by which a recommended filter may follow a change late, in the mean."""
+
+LEAST_COVERAGE = 0.95
+"""Share of the model's labels that a recommended filter must leave."""
+
+ALIKE = 0.005
+"""Shares that differ by no more are taken for alike: then the steadier one is better."""
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """A filter over a model: macro means over the scenes, shares 0 to 1, NaN where undefined; see `FrameQuality`.
+
+    filters   '' for the model itself
+    flicker   of places seen in two frames in a row, those whose label changes: motion-compensated
+    alpha     between frames, of the fused map
+    better    in how many frames, of how many, the accuracy is above the model's; without truth the foresight
+    """
+
+    filters: str
+    flicker: float
+    alpha: float
+    foresight: float
+    accuracy: float
+    miou: float
+    stable_wrong: float
+    lag: float
+    coverage: float
+    milliseconds: float
+    better: tuple[int, int] = (0, 0)
+
+    @property
+    def family(self) -> str:
+        """The filter's name without its number; of a chain all of it."""
+        return self.filters if "+" in self.filters else self.filters.partition(":")[0]
+
+
+@dataclass(frozen=True)
+class Remedies:
+    """A model and the filters over it."""
+
+    model: str
+    unfiltered: Remedy
+    filtered: tuple[Remedy, ...]
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether right and wrong are known."""
+        return not math.isnan(self.unfiltered.accuracy)
+
+    def worth(self, row: Remedy) -> float:
+        """What a filter must not lower: accuracy; without ground truth foresight."""
+        return row.accuracy if self.has_truth else row.foresight
+
+    def harmless(self, row: Remedy) -> bool:
+        """Whether it costs nothing that must not be lost, whatever it does for stability."""
+        base = self.unfiltered
+        if row.coverage < LEAST_COVERAGE:
+            return False
+        if not self.has_truth:
+            return row.foresight >= base.foresight - ALIKE
+        return row.accuracy >= base.accuracy and row.miou >= base.miou and not row.lag > MOST_LAG
+
+    @property
+    def best(self) -> Remedy | None:
+        """The filter to use: harmless, steadier than the model, and worth most; of those alike the steadiest.
+
+        Stability alone chooses nothing: a label that never changes is as steady as can be.
+        """
+        return self._best_of(self.filtered)
+
+    @property
+    def best_whole(self) -> Remedy | None:
+        """The same of the filters that leave every label."""
+        return self._best_of([row for row in self.filtered if row.coverage >= 1 - ALIKE])
+
+    def _best_of(self, rows: Sequence[Remedy]) -> Remedy | None:
+        able = [row for row in rows if row.flicker < self.unfiltered.flicker and self.harmless(row)]
+        most = max(map(self.worth, able), default=math.nan)
+        return min((row for row in able if self.worth(row) >= most - ALIKE), key=lambda row: row.flicker, default=None)
+
+    @property
+    def misleading(self) -> list[Remedy]:
+        """Filters that steady the labels and make them worse, the steadiest first."""
+        worse = [row for row in self.filtered if self.worth(row) < self.worth(self.unfiltered) - ALIKE]
+        return sorted((r for r in worse if r.flicker < self.unfiltered.flicker), key=lambda row: row.flicker)
+
+    @property
+    def front(self) -> list[Remedy]:
+        """The rows that no other one beats in both flicker and worth, from the steadiest on."""
+        found: list[Remedy] = []
+        for row in sorted([self.unfiltered, *self.filtered], key=lambda row: (row.flicker, -self.worth(row))):
+            if not found or self.worth(row) > self.worth(found[-1]):
+                found.append(row)
+        return found
+
+
+def remedies(result: Result) -> list[Remedies]:
+    """Each model of which filtered labels were judged beside its own; none in other results."""
+    groups: dict[str, dict[str, list[Record]]] = {}
+    for record in result.select():
+        if record.quality is not None:
+            groups.setdefault(record.quality.model, {}).setdefault(record.quality.filters, []).append(record)
+    return [
+        Remedies(
+            model, _row(rows[""], rows[""]), tuple(_row(found, rows[""]) for filters, found in rows.items() if filters)
+        )
+        for model, rows in groups.items()
+        if "" in rows and len(rows) > 1
+    ]
+
+
+def of_interest(result: Result) -> Result:
+    """The result for tables and figures of maps: of remedies the models, and the filters to use, alone."""
+    found = {each.model: {"", each.best.filters if each.best else ""} for each in remedies(result)}
+    if not found:
+        return result
+
+    def shown(record: Record) -> bool:
+        quality = record.quality
+        return quality is None or quality.filters in found.get(quality.model, {quality.filters})
+
+    names = {record.unit.backbone for record in result.select() if shown(record)}
+    records = tuple(record for record in result.records if record.unit.backbone in names)
+    return dataclasses.replace(result, records=records)
+
+
+def advice(found: Remedies) -> Iterator[str]:
+    """What to use and why; what only seems to help; what cannot be known."""
+    best, base = found.best, found.unfiltered
+    if best is None:
+        least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "foresight or coverage"
+        yield f"Use none of these filters over {found.model}: none steadies it without a loss of {least}."
+    else:
+        yield f"Use --filter {typed(best)} over {found.model}: {_why(found, best)}."
+        if (whole := found.best_whole) is not None and whole != best:
+            yield f"Of those that leave every label, --filter {typed(whole)}: {_why(found, whole)}."
+    if found.misleading:
+        worst = found.misleading[0]
+        names = ", ".join(row.filters for row in found.misleading[:4])
+        more = f" and {len(found.misleading) - 4} more" if len(found.misleading) > 4 else ""
+        yield f"Steadier and worse: {names}{more}. {worst.filters} {_harm(found, worst)}."
+    if not found.has_truth:
+        yield (
+            "There is no ground truth: whether labels are right, and how late they follow a true change, is not known."
+            f" The choice rests on foresight, how often a label is what {found.model} says of the place in the next"
+            " frame, which no filter has seen. What the model gets wrong in every frame stays wrong."
+        )
+    elif not math.isfinite(base.lag):
+        yield "Nothing changes in what is seen here: how late labels follow is not known."
+
+
+def typed(remedy: Remedy) -> str:
+    """The filters as they are typed after the first --filter."""
+    return remedy.filters.replace("+", " --filter ")
+
+
+def _why(found: Remedies, best: Remedy) -> str:
+    base, (better, frames) = found.unfiltered, best.better
+    parts = [f"flicker falls from {100 * base.flicker:.1f} to {100 * best.flicker:.1f} %"]
+    if found.has_truth:
+        parts.append(
+            f"accuracy goes from {100 * base.accuracy:.1f} to {100 * best.accuracy:.1f} % (better in {better} of"
+            f" {frames} frames), mean IoU from {100 * base.miou:.1f} to {100 * best.miou:.1f} %"
+        )
+    else:
+        parts.append(
+            f"foresight goes from {100 * base.foresight:.1f} to {100 * best.foresight:.1f} % (better in {better} of"
+            f" {frames} frames)"
+        )
+    if found.has_truth and math.isfinite(best.lag):
+        parts.append(f"labels follow a change {best.lag:.1f} frames late")
+    if best.coverage < 1 - ALIKE:
+        parts.append(f"{100 * best.coverage:.0f} % of the labels are left")
+    return f"{', '.join(parts)}, for {best.milliseconds:.0f} ms a frame"
+
+
+def _harm(found: Remedies, row: Remedy) -> str:
+    base = found.unfiltered
+    if not found.has_truth:
+        return (
+            f"has {100 * row.flicker:.1f} % flicker, but foresees {100 * row.foresight:.1f} % of the next labels"
+            f" ({100 * base.foresight:.1f} % without)"
+        )
+    late = f", {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
+    return (
+        f"has {100 * row.flicker:.1f} % flicker, but {100 * row.stable_wrong:.0f} % of what it shows is stable and"
+        f" wrong ({100 * base.stable_wrong:.0f} % without){late}"
+    )
+
+
+def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
+    qualities = [record.quality for record in records if record.quality is not None]
+    judged = [record.statistics.judged for record in records if record.statistics is not None]
+
+    def mean(name: str) -> float:
+        return macro_mean([getattr(quality, name) for quality in qualities])
+
+    return Remedy(
+        filters=qualities[0].filters,
+        flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
+        alpha=macro_mean([row.alpha_between.value for row in judged]),
+        **{
+            name: mean(name)
+            for name in ("foresight", "accuracy", "miou", "stable_wrong", "lag", "coverage", "milliseconds")
+        },
+        better=_better(records, unfiltered),
+    )
+
+
+def _better(records: Sequence[Record], unfiltered: Sequence[Record]) -> tuple[int, int]:
+    """In how many frames, of how many, the filtered labels are worth more."""
+    before = {record.unit.scene: record.quality for record in unfiltered}
+    pairs: list[tuple[float, float]] = []
+    for record in records:
+        a, b = record.quality, before.get(record.unit.scene)
+        if a is not None and b is not None:
+            kind = "accuracy_by_frame" if any(math.isfinite(v) for v in b.accuracy_by_frame) else "foresight_by_frame"
+            pairs += zip(getattr(a, kind), getattr(b, kind), strict=False)
+    return sum(a > b for a, b in pairs), len(pairs)

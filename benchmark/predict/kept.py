@@ -1,0 +1,55 @@
+"""What a model said, kept on disk: several filters over one model let it look at each image once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from semstab.backbones import Backbone, Image, Prediction, image_digest
+from semstab.backbones.wrapped import Wrapped
+from semstab.model.frames import Frame
+from semstab.predict.images import shown_digest
+from semstab.runtime.files import atomic_path, content_key
+
+
+class Kept(Wrapped):
+    """A backbone that looks its predictions up in a folder, by its identity and the image, and leaves new ones there.
+
+    It has no memory of images before (`sequential`). Files of one folder may be read and written by several processes.
+    """
+
+    def __init__(self, inner: Backbone, folder: Path) -> None:
+        super().__init__(inner)
+        self._folder = folder
+        self._fitted_to: list[str] = []
+
+    def fit(self, images: Sequence[Image]) -> Self:
+        """See `Backbone`."""
+        fitted = super().fit(images)
+        fitted._fitted_to = [image_digest(image) for image in images]
+        return fitted
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`."""
+        frames = [[frame] for frame in geometry] or [[]] * len(images)
+        return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
+
+    def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
+        file = self._folder / f"{self._key(image, scores, frame)}.npz"
+        if not file.is_file():
+            (prediction,) = self.ask([image], scores, frame)
+            held: dict[str, Any] = {"labels": prediction.labels} | ({"scores": prediction.scores} if scores else {})
+            with atomic_path(file) as temporary:
+                np.savez(temporary, **held)
+            return prediction
+        with np.load(file) as there:
+            return Prediction(there["labels"], there["scores"] if scores else None)
+
+    def _key(self, image: Image, scores: bool, frame: Sequence[Frame]) -> str:
+        seen = {"fitted": self._fitted_to, "shown": shown_digest(image, frame), "scores": scores}
+        return content_key({"model": self.identity(), **seen})

@@ -1,0 +1,68 @@
+"""The study of what would steady a model: the shipped grid of filters over any model and scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from semstab.backbones import create
+from semstab.check import with_voxel_size
+from semstab.config import Config, merge
+from semstab.datasets import Scene, open_dataset
+from semstab.predict.filters import parse
+from semstab.predict.predictor import PredictorConfig
+from semstab.predict.stored import NAME as STORED
+from semstab.predict.stored import StoredSequence
+from semstab.settings import dataset_defaults, load_config, load_study, predicted_config, resolve
+
+STUDY = "remedies"
+
+
+def remedies_config(
+    models: Sequence[PredictorConfig],
+    sources: Sequence[str],
+    filters: Sequence[str],
+    content: Mapping[str, Any],
+    kept: Path | None = None,
+) -> tuple[Config, list[str]]:
+    """The study `remedies` with these models, and filters over label sources of the scenes, in a dataset's settings.
+
+    Without models or sources all sources are taken; without filters those of the shipped study, its map prior in voxels
+    of the run. What a model says is kept in a folder. Also says which filters are left out, as no scores are there.
+
+    Raises ConfigError for what is not known, DataError for a scene that cannot be read.
+    """
+    content = merge(dataset_defaults(content), content)
+    config = resolve(load_config(None, {key: value for key, value in content.items() if key != "backbones"}))
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    scene = dataset.scene((config.scenes or dataset.scenes)[0])
+    names = sources or ([] if models else config.backbones or scene.backbones)
+    predictors = [*models, *(PredictorConfig(backbone=STORED, options={"source": name}) for name in names)]
+    config, _ = with_voxel_size(config)
+    shipped = load_study(STUDY).dataset.options["remedies"]
+    grid = ["+".join(str(parse(text)) for text in chain.split("+")) for chain in filters] or [
+        f"map-prior:{config.voxel_size:g}" if "map-prior" in text else text for text in shipped
+    ]
+    able, left_out = _able(grid, predictors, scene)
+    settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
+    study = predicted_config(predictors, None, {**settings, "backbones": None})
+    more = {"remedies": able, "kept": None if kept is None else str(kept)}
+    dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, **more}})
+    return study.model_copy(update={"dataset": dataset_config}), left_out
+
+
+def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Scene) -> tuple[list[str], list[str]]:
+    """The filters that all models can take, and what to say of the others."""
+    needing = [text for text in grid if parse(text.partition("+")[0]).kind.needs_scores]
+    without = [each.label_name for each in predictors if needing and not _gives_scores(each, scene)]
+    if not without:
+        return list(grid), []
+    said = f"{', '.join(needing)}: left out, for {', '.join(without)} gives labels without scores"
+    return [text for text in grid if text not in needing], [said]
+
+
+def _gives_scores(predictor: PredictorConfig, scene: Scene) -> bool:
+    if predictor.backbone == STORED:
+        return StoredSequence(scene, predictor.options["source"], False).has_scores
+    return create(predictor.backbone, **predictor.resolved().options).gives_scores

@@ -1,0 +1,163 @@
+"""What the statistics of a map without log and ground truth are functions of: sums that add up over its parts."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.metrics.summary import STRATA, TableSums
+from semstab.model.measures import sbd, vss
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
+from semstab.statistics.drift import expected_sbd
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
+from semstab.statistics.uncertainty import decompose
+
+Float64 = npt.NDArray[np.float64]
+Maps = dict[str, npt.NDArray[Any]]
+
+BY_STRATUM = ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_between")
+"""Maps of which strata have the mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapSums:
+    """Those of a map.
+
+    table      sums of the measures
+    places     sums over cubes of space, of the voxels with OP >= 2; see `_place_sums`
+    strata     (2 * len(BY_STRATUM), strata) sum of each map, and over how many voxels it runs
+    classes    (S, K) sums by class, see `class_sums`
+    influence  those that intervals and comparisons rest on
+    """
+
+    table: TableSums
+    places: PlaceSums
+    strata: Float64
+    classes: Float64
+    influence: InfluenceSums
+
+    @classmethod
+    def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> MapSums:
+        """Those of a table."""
+        maps = maps_of(table, null=expected_sbd(table))
+        places = Places(table.index[table.op >= 2], table.voxel_size)
+        return cls(
+            TableSums.of(table, edges),
+            place_sums(table, maps, places),
+            stratum_sums(table, maps, edges),
+            class_sums(table),
+            influence_sums(table, sbd_excess=maps["sbd_excess"], edge=places.edge),
+        )
+
+    @classmethod
+    def merged(cls, parts: Sequence[MapSums]) -> MapSums:
+        """Those of a map from its parts."""
+        return cls(
+            functools.reduce(operator.add, (part.table for part in parts)),
+            PlaceSums.merged([part.places for part in parts]),
+            np.sum([part.strata for part in parts], axis=0),
+            _class_sums([part.classes for part in parts]),
+            merged(*(part.influence for part in parts)),
+        )
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All of it by name, as `read` takes it."""
+        influence = {f"influence {name}": getattr(self.influence, name) for name in ("cell", "frame", "columns")}
+        return {
+            **self.table.arrays(),
+            **{f"places {name}": value for name, value in self.places.sums.items()},
+            **influence,
+            "place cells": self.places.cell,
+            "strata": self.strata,
+            "classes": self.classes,
+            "about": np.array([self.places.edge, self.influence.edge, self.influence.step, self.influence.voxel_size]),
+        }
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, npt.NDArray[Any]], classes: tuple[str, ...]) -> MapSums:
+        """From its arrays, and the names of the classes."""
+        edge, cube, step, voxel_size = (float(value) for value in arrays["about"])
+        places = {name.removeprefix("places "): value for name, value in arrays.items() if name.startswith("places ")}
+        cell, frame, columns = (arrays[f"influence {name}"] for name in ("cell", "frame", "columns"))
+        K = arrays["classes"].shape[1]
+        return cls(
+            TableSums.read(arrays),
+            PlaceSums(arrays["place cells"], edge, places),
+            arrays["strata"],
+            arrays["classes"],
+            InfluenceSums(cell, frame, columns, cube, int(step), voxel_size, K, classes),
+        )
+
+
+def maps_of(table: VoxelTable, null: Float64) -> Maps:
+    """Numbers of each voxel (n,) that need nothing but its row; null is its SBD expected in random order."""
+    within, between = disagreement(table)
+    parts = decompose(table)
+    return {
+        "psa": psa(table),
+        "disagreement_within": within,
+        "disagreement_between": between,
+        "sbd_null": null,
+        "sbd_excess": sbd(table) - null,
+        "entropy_within": parts.within,
+        "entropy_between": parts.between,
+    }
+
+
+def mean_columns(values: Float64) -> Float64:
+    """(n, 2): what the mean of values (n,) where they are defined is a function of by its sum."""
+    defined = ~np.isnan(values)
+    return np.stack([np.where(defined, values, 0.0), defined], axis=1)
+
+
+def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
+    """Over the cubes of the voxels with OP >= 2: what means and agreement beyond chance are functions of."""
+    again = table.op >= 2
+    rows = np.flatnonzero(again)
+    own = {name: values[again] for name, values in maps.items()}
+    T, known, op = table.op[again].astype(np.float64), ~np.isnan(own["sbd_null"]), table.op[again]
+    means = {
+        "psa": own["psa"],
+        "vss": vss(table)[again],
+        "sbd": np.where(known, sbd(table)[again], np.nan),
+        "null": own["sbd_null"],
+        "excess": own["sbd_excess"],
+        "steadier": np.where(op > 2, -own["sbd_excess"], np.nan),
+        "entropy": own["entropy_within"] + own["entropy_between"],
+        "entropy_within": own["entropy_within"],
+        "entropy_between": own["entropy_between"],
+    }
+    columns = {name: mean_columns(values) for name, values in means.items()}
+    columns |= {name: np.stack([T * own[f"disagreement_{name}"], T], axis=1) for name in ("within", "between")}
+    coin = [np.stack([own["psa"] * where, where], axis=1) for where in (op == 2, op > 2)]
+    columns["coin"] = np.concatenate(coin, axis=1)
+    formulas = {
+        "kappa": kappa_columns,
+        "alpha": alpha_columns,
+        "each_place": lambda some: alpha_columns(some, np.ones(len(some))),
+    }
+    sums = {name: places.sums(values) for name, values in columns.items()}
+    sums |= {name: places.sums_of(table, rows, formula) for name, formula in formulas.items()}
+    return PlaceSums(places.cell, places.edge, sums)
+
+
+def stratum_sums(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> Float64:
+    """(2 * len(BY_STRATUM), strata) of maps: their sums, and how often each is defined."""
+    group, count = np.searchsorted(edges, table.op), len(edges) + 1
+    columns = np.concatenate([mean_columns(maps[name]) for name in BY_STRATUM], axis=1)
+    return np.stack([np.bincount(group, weights=column, minlength=count) for column in columns.T])
+
+
+def _class_sums(parts: Sequence[Float64]) -> Float64:
+    """Where the evidence of one part does not tell how frames agree on a class, that of all does not."""
+    total: Float64 = np.sum(parts, axis=0)
+    if np.isnan(total).any():
+        total[2:5, total[0] > 0] = np.nan
+    return total

@@ -1,0 +1,97 @@
+"""How often does a gate err, and how much does it take to be decided?
+
+    python tests/simulation/gate.py [--trials 200] [--seed 0] [--only TEXT]
+
+Two models on the same frames of the same scene; scenes, frames and errors are drawn anew for each trial. Prints a table
+in Markdown of the rule 'alpha drop < margin' at the 5 % level: without a difference, which must not fail, and with a
+true loss of the margin, which must not pass. The margin is the loss that all trials of the second pair have together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+from flights import Flight, World, fly, sums_of, world
+
+from semstab.gating.judging import change, negative, verdict
+from semstab.gating.rules import parse
+from semstab.model.statistics import Interval
+from semstab.statistics.sampling import InfluenceSums
+from semstab.statistics.sampling.influence import FUNCTIONALS
+
+EASES = (1.0, 1.0, 0.8)
+"""How easy a scene is to the baseline and to two new models: as easy, harder."""
+
+ALPHA = parse("alpha drop < 0.02").measure
+LEVEL = 0.05
+
+
+def conditions() -> Iterator[tuple[str, Flight, bool]]:
+    """Name, flight, and whether both models find the same places hard."""
+    for frames in (15, 30, 64):
+        for side in (32, 64):
+            for quality in ("alike", "bad", "uneven", "lasting"):
+                looks = frames if frames < 64 else 16
+                flight = Flight(side, 1.5, 1.0, frames, looks, quality)
+                yield f"{frames} frames, {side} x {side}, {quality}", flight, False
+            yield f"{frames} frames, {side} x {side}, uneven, same places hard", flight_of(frames, side), True
+
+
+def flight_of(frames: int, side: int) -> Flight:
+    """Frames of uneven quality."""
+    return Flight(side, 1.5, 1.0, frames, frames if frames < 64 else 16, "uneven")
+
+
+def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[InfluenceSums]:
+    """The sums of the baseline and of each new model."""
+    over = world(flight, rng)
+    found = []
+    for ease in EASES:
+        hard = over.hard if same else world(flight, rng).hard
+        scene: World = dataclasses.replace(over, hard=hard)
+        found.append(sums_of(fly(flight, scene, rng, ease), over))
+    return found
+
+
+def rates(flight: Flight, same: bool, trials: int, seed: int) -> list[float]:
+    """The margin, then shares of trials: without a difference failed, passed; with it passed, failed, undecided."""
+    found: list[list[Interval]] = []
+    totals = np.zeros((len(EASES), 3 + 2))
+    for trial in range(trials):
+        rng = np.random.default_rng([seed, trial])
+        base, *new = own = models(flight, same, rng)
+        totals += [each.of(FUNCTIONALS["alpha"].names).sum(axis=0) for each in own]
+        found.append([change(each, base, ALPHA, None, LEVEL) for each in new])
+    alphas = FUNCTIONALS["alpha"].of(totals)
+    margin = float(alphas[0] - alphas[2])
+    rule = dataclasses.replace(parse("alpha drop < 0.02"), limit=margin)
+    said = [[verdict(rule, negative(each)) for each in column] for column in zip(*found, strict=True)]
+    asked = [(0, "fails"), (0, "passes"), (1, "passes"), (1, "fails"), (1, "undecided")]
+    return [margin, *(float(np.mean([each == what for each in said[which]])) for which, what in asked)]
+
+
+HEAD = [
+    "condition", "margin", "no difference: fails", "passes", "loss of the margin: passes", "fails", "undecided",
+]  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="")
+    arguments = parser.parse_args()
+    print("|", " | ".join(HEAD), "|")
+    print("|", " | ".join("---" for _ in HEAD), "|")
+    for name, flight, same in conditions():
+        if arguments.only in name:
+            row = rates(flight, same, arguments.trials, arguments.seed)
+            print("|", " | ".join([name, *(f"{x:.3f}" for x in row)]), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()

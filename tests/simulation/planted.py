@@ -1,0 +1,76 @@
+"""Copies of a posed folder whose label source has a known fault, to see whether a gate finds it.
+
+    python tests/simulation/planted.py SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
+
+Writes OUT/third (the class is labelled as another one in every third frame), OUT/first (in the first third of the
+frames) and OUT/flip (2 % of the pixels, drawn at random, have a random class), each with the scene's own depth, poses
+and ground truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import yaml
+from PIL import Image
+
+SHARE, SEED = 0.02, 0
+Fault = Callable[[int, int, np.ndarray], np.ndarray]
+
+
+def plant(scene: Path, out: Path, source: str, fault: Fault) -> None:
+    """A copy of the scene with this fault of (number of the frame, how many there are, its labels)."""
+    labels = out / "labels" / source
+    shutil.rmtree(out, ignore_errors=True)
+    labels.mkdir(parents=True)
+    for part in ("color", "depth", "pose", "labels/gt"):
+        if (scene / part).is_dir():
+            (out / part).symlink_to(os.path.relpath((scene / part).resolve(), (out / part).parent.resolve()))
+    for file in (path for path in scene.iterdir() if path.suffix in (".yaml", ".txt")):
+        shutil.copy(file, out)
+    files = sorted((scene / "labels" / source).glob("*.png"))
+    for number, file in enumerate(files):
+        changed = fault(number, len(files), np.array(Image.open(file)))
+        Image.fromarray(changed).save(labels / file.name)
+
+
+def faults(names: list[str], wrong: str, to: str) -> dict[str, Fault]:
+    """By name."""
+    k, other = names.index(wrong), names.index(to)
+    rng = np.random.default_rng(SEED)
+
+    def relabelled(labels: np.ndarray) -> np.ndarray:
+        return np.where(labels == k, other, labels).astype(labels.dtype)
+
+    def flipped(labels: np.ndarray) -> np.ndarray:
+        drawn = (rng.random(labels.shape) < SHARE) & (labels < len(names))
+        return np.where(drawn, rng.integers(0, len(names), labels.shape), labels).astype(labels.dtype)
+
+    return {
+        "third": lambda number, count, labels: labels if number % 3 else relabelled(labels),
+        "first": lambda number, count, labels: relabelled(labels) if number < count // 3 else labels,
+        "flip": lambda number, count, labels: flipped(labels),
+    }
+
+
+def main() -> None:
+    """Write the copies."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--source", default="fcn")
+    parser.add_argument("--class", dest="wrong", default="bunny_book")
+    parser.add_argument("--to", default="kleenex")
+    arguments = parser.parse_args()
+    names = yaml.safe_load((arguments.scene / "scene.yaml").read_text())["classes"]
+    for name, fault in faults(names, arguments.wrong, arguments.to).items():
+        plant(arguments.scene, arguments.out / name / arguments.scene.name, arguments.source, fault)
+
+
+if __name__ == "__main__":
+    main()

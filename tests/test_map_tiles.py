@@ -1,0 +1,253 @@
+"""A map fused tile by tile is the map fused at once, to the last bit."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Generator
+
+import numpy as np
+import pytest
+import tiny_scene
+from compare_summaries import differences
+from posed_config import configure
+from posed_writer import write_posed
+
+import semstab
+from semstab import backends
+from semstab.engine import InProcess
+from semstab.engine.tiling.partition import tiled
+from semstab.engine.tiling.sights import Sights, look_at
+from semstab.engine.units import make_plan
+from semstab.errors import ConfigError, DataError
+from semstab.model.extent import Extent
+from semstab.model.voxels import VoxelTable
+from semstab.testing import random_frames
+from semstab.testing.builders import EXACT, SUMS, sight_line
+
+K, SIZE = 4, 0.4
+
+
+def fused(name: str, frames, within: Extent | None = None, **options) -> VoxelTable:
+    backend = backends.create(name, voxel_size=SIZE, num_classes=K, within=within, **options)
+    for frame in frames:
+        backend.integrate(frame)
+    return backend.table()
+
+
+def assert_same_bits(part: VoxelTable, whole: VoxelTable) -> None:
+    for name in ("ix", "iy", "iz", *EXACT, *SUMS):
+        assert np.asarray(getattr(part, name)).tobytes() == np.asarray(getattr(whole, name)).tobytes(), name
+
+
+@pytest.mark.parametrize("name", ["numpy", "numba", "open3d", "torch"])
+def test_the_maps_of_tiles_are_the_parts_of_the_whole_map(name) -> None:
+    """Whichever frame opens a tile's map; labels and soft scores, to the last bit."""
+    frames = random_frames(3, count=4, K=K)
+    whole = fused(name, frames)
+    tiles = [Extent((x, y), (x + 16, y + 16)) for x in range(-16, 16, 16) for y in range(-16, 16, 16)]
+    found = 0
+    for tile in tiles:
+        part = fused(name, frames, tile)
+        assert_same_bits(part, whole.rows(tile.holds(whole.index.T)))
+        found += len(part)
+    assert found == len(whole) > 500
+
+
+def test_a_frame_that_reaches_far_is_restricted_too() -> None:
+    """Beyond 2^15 voxels from the camera pixels become voxels by another loop."""
+    far = [sight_line(t, [(0.5, 1), (20000.5, 2), (20001.5, 0)], along="x") for t in range(2)]
+    whole, part = fused("numba", far), fused("numba", far, Extent((50000, 0), (50003, 4)))
+    assert 0 < len(part) < len(whole)
+    assert_same_bits(part, whole.rows(Extent((50000, 0), (50003, 4)).holds(whole.index.T)))
+
+
+def test_a_backend_that_looks_pixels_up_cannot_be_restricted() -> None:
+    with pytest.raises(ConfigError, match="open3d-projective' does not associate pixel by pixel"):
+        fused("open3d-projective", [], Extent((0, 0), (1, 1)))
+    with pytest.raises(ConfigError, match="'numba' has no option 'within'"):
+        fused("numba", [], "all")
+
+
+# --- Runs -------------------------------------------------------------------------------------------------------------
+
+
+class Several(InProcess):
+    """In this process, but as if four tasks were done at once: so that there are several parts."""
+
+    width = 4
+
+    def __init__(self, stop_after: int = 1000) -> None:
+        self.left, self.done = stop_after, []
+
+    def run(self, jobs, observers) -> Generator:
+        for job, outcomes in super().run(jobs, observers):
+            self.done += [request.portion and request.portion.name for request in job.requests]
+            yield job, outcomes
+            self.left -= 1
+            if not self.left:
+                raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return tiny_scene.write(tmp_path_factory.mktemp("scene") / "wall", backbones=("a",), frames=30)
+
+
+@pytest.fixture(scope="module")
+def soft_wall(tmp_path_factory):
+    """The same with soft scores, of a camera that comes back."""
+    rng = np.random.default_rng(2)
+    frames = []
+    for i in (*range(8), *range(8)):
+        seen = tiny_scene.frame(i, np.zeros((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.uint8))
+        scores = rng.random((*seen.shape, 3)).astype(np.float32) ** 4
+        frames.append(dataclasses.replace(seen, index=len(frames), labels=None, scores=scores))
+    root = tmp_path_factory.mktemp("soft") / "wall"
+    return write_posed(root, [f"{i:02d}" for i in range(16)], {"a": frames}, classes=["x", "y", "z"], up_axis="-y")
+
+
+def summary_of(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def series_of(folder):
+    (series,) = (folder / "frames").iterdir()
+    with series.open() as file:
+        return [{key: row[key] for key in row if not key.endswith("_ms")} for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize(("scene", "backend"), [("wall", "numba"), ("soft_wall", "numba"), ("wall", "numpy")])
+def test_a_run_in_tiles_says_what_a_whole_one_says(scene, backend, tmp_path, request) -> None:
+    """Every column of every voxel to the last bit, every number of the summary to 1e-12, the series but for times."""
+    root = request.getfixturevalue(scene)
+    settings = {"backends": [backend], "check": "sample"}
+    whole = semstab.engine.run(configure(root, **settings), out=tmp_path / "whole")
+    executor = Several()
+    tiles = semstab.engine.run(configure(root, **settings, tile_size=8), out=tmp_path / "tiles", executor=executor)
+    assert len(executor.done) > 4
+    assert "frames" in executor.done
+    assert len(list((tmp_path / "tiles" / "voxels").glob("*/tile=*.parquet"))) > 4
+    found = differences(summary_of(tmp_path / "whole"), summary_of(tmp_path / "tiles"), tolerance=1e-12)
+    assert [line for line in found if "voxels_file" not in line] == []
+    assert_same_bits(tiles.records[0].table(), whole.records[0].table())
+    for one, other in zip(series_of(tmp_path / "tiles"), series_of(tmp_path / "whole"), strict=True):
+        assert {key: float(value or "nan") for key, value in one.items()} == pytest.approx(
+            {key: float(value or "nan") for key, value in other.items()}, rel=1e-12, abs=1e-12, nan_ok=True
+        )
+    assert tiles.up == whole.up
+    assert not (tmp_path / "tiles" / "parts").exists()
+
+
+def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
+    """Parts that are whole are not computed again; a damaged one is."""
+    config, out = configure(wall, backends=["numba"], check=None, tile_size=8), tmp_path / "run"
+    first, second = Several(stop_after=3), Several()
+    with pytest.raises(KeyboardInterrupt):
+        semstab.engine.run(config, out=out, executor=first)
+    (damaged,) = out.glob(f"parts/*/{first.done[0]}.npz")
+    damaged.write_bytes(damaged.read_bytes()[:-20])
+    result = semstab.engine.run(config, out=out, executor=second)
+    assert set(first.done) & set(second.done) == {first.done[0]}
+    whole = semstab.engine.run(configure(wall, backends=["numba"], check=None), out=tmp_path / "whole")
+    assert_same_bits(result.records[0].table(), whole.records[0].table())
+    again = semstab.engine.run(config, out=out)
+    assert again.manifest["units"]["kept"] == 1
+
+
+def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path) -> None:
+    """No file of the other form stays."""
+    voxels = tmp_path / "run" / "voxels"
+    for size, there in (
+        (None, "wall__a__numba.parquet"),
+        (8, "wall__a__numba"),
+        (None, "wall__a__numba.parquet"),
+    ):
+        (tmp_path / "run" / "units").mkdir(parents=True, exist_ok=True)
+        for unit in (tmp_path / "run" / "units").iterdir():
+            unit.unlink()
+        semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=size), out=tmp_path / "run")
+        assert [path.name for path in voxels.iterdir()] == [there]
+
+
+def test_tiles_of_two_maps_are_no_table(wall, tmp_path) -> None:
+    for name, size in (("a", 8), ("b", 16)):
+        semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=size), out=tmp_path / name)
+    a, b = (tmp_path / name / "voxels" / "wall__a__numba" for name in "ab")
+    assert sum(map(len, VoxelTable.iter_tiles(a))) == len(VoxelTable.load(b)) == 222
+    measured = VoxelTable.columns(a, ["vss", "ix"])
+    np.testing.assert_array_equal(measured["ix"], VoxelTable.load(b).ix)
+    foreign = next(b.glob("tile=2_*.parquet"))
+    (a / foreign.name.replace("tile=2_", "tile=9_")).write_bytes(foreign.read_bytes())
+    with pytest.raises(DataError, match=r"tile=9_.* is a tile of another map than .*; remove it"):
+        VoxelTable.load(a)
+    with pytest.raises(DataError, match="a folder without tiles"):
+        VoxelTable.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"tile_size": 12}, r"tile_size: use a power of 2 from 8, or off"),
+        ({"tile_size": 8, "statistics": True}, r"tile_size = 8: statistics and events keep every observation"),
+        ({"tile_size": 8, "backends": ["open3d-projective"]}, r"tile_size = 8: backend 'open3d-projective' cannot"),
+    ],
+)
+def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) -> None:
+    with pytest.raises(ConfigError, match=message):
+        semstab.engine.run(configure(wall, **{"backends": ["numba"], "check": None, **settings}))
+
+
+# --- What frames see --------------------------------------------------------------------------------------------------
+
+
+def test_no_frame_sees_a_tile_that_the_index_lacks(soft_wall) -> None:
+    """Nor are there more: what depth shows is what is fused where every pixel has a label."""
+    config = configure(soft_wall, backends=["numba"], voxel_size=0.1)
+    (task,) = make_plan(config).tasks
+    sights = look_at(task, 0.1, cell=8)
+    tiles = sights.in_tiles(16)
+    for index in task.indices:
+        backend = backends.create("numba", voxel_size=0.1, num_classes=3)
+        backend.integrate(semstab.task.read(task, index))
+        seen = np.unique(backend.table().index[:, :2] // 16, axis=0)
+        np.testing.assert_array_equal(tiles.cell[tiles.frame == index], seen)
+
+
+def test_parts_are_rectangles_within_the_budget_that_share_nothing() -> None:
+    """A strip of tiles that frames pass one after the other: few frames are decoded for two parts."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-8, 8), np.arange(4), indexing="ij"))
+    place = np.stack([x, y], axis=1).astype(np.int32)
+    rows = [(t, *tile) for t in range(100) for tile in place.tolist() if abs(tile[0] + 8 - t * 0.16) < 1]
+    frame, *cell = np.array(rows, np.int32).T
+    sights = Sights(64, frame, np.stack(cell, axis=1), place, np.full(64, 100.0), np.full(64, 500.0), 100)
+    tiling = tiled(sights, lambda voxels, observations: voxels, 1600, 64)
+    assert [part.voxels for part in tiling.parts] == [1600] * 4
+    covered = np.zeros((16, 4), int)
+    for part in tiling.parts:
+        (x0, y0), (x1, y1) = np.array([part.extent.low, part.extent.high]) // 64
+        covered[x0 + 8 : x1 + 8, y0:y1] += 1
+    assert (covered == 1).all()
+    assert tiling.decodes < 1.6 * 100
+    assert tiled(sights, lambda voxels, observations: voxels, 1600).size == 128  # four parts a budget, at most
+
+
+def test_other_programs_read_the_tiles_as_one_table(wall, tmp_path) -> None:
+    """The queries of docs/large-scenes.md."""
+    from pyarrow import dataset
+
+    run = semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=8), out=tmp_path / "run")
+    table, folder = run.records[0].table(), tmp_path / "run" / "voxels" / "wall__a__numba"
+    expected = {
+        k: float(semstab.metrics.vss(table)[(table.op >= 3) & (semstab.metrics.dominant(table) == k)].mean())
+        for k in range(3)
+    }
+    read = dataset.dataset(folder).to_table(columns=["label", "vss", "op"])
+    assert read.num_rows == len(table)
+    query = f"SELECT label, avg(vss) FROM '{folder}/*.parquet' WHERE op >= 3 GROUP BY label"
+    duckdb = pytest.importorskip("duckdb")
+    assert dict(duckdb.sql(query).fetchall()) == pytest.approx(expected)
+    pl = pytest.importorskip("polars")
+    found = pl.scan_parquet(f"{folder}/*.parquet").filter(pl.col("op") >= 3).group_by("label").agg(pl.col("vss").mean())
+    assert dict(found.collect().iter_rows()) == pytest.approx(expected)

@@ -1,0 +1,151 @@
+"""The study of what would steady a model: what it recommends, and from the command line to the report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import predicted_scene
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from semstab.cli import app
+from semstab.engine.folder import load_result
+from semstab.outputs.remedies import Remedies, Remedy, advice, remedies
+
+NAN = float("nan")
+
+
+def remedy(filters="", flicker=0.2, worth=0.8, **more):
+    known = {"alpha": 0.5, "foresight": worth, "accuracy": worth, "miou": worth, "stable_wrong": 0.05}
+    return Remedy(filters, flicker, **{**known, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
+
+
+def study(*rows, truth=True):
+    unknown = {"accuracy": NAN, "miou": NAN, "stable_wrong": NAN, "lag": NAN}
+    rows = [row if truth else dataclasses.replace(row, **unknown) for row in (remedy(), *rows)]
+    return Remedies("net", rows[0], tuple(rows[1:]))
+
+
+def said(found):
+    return " ".join(advice(found))
+
+
+# --- Which one --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_the_steadiest_is_not_the_best(truth):
+    frozen = remedy("ema:0.98", flicker=0.001, worth=0.4, alpha=0.99)
+    good = remedy("ema-warped:0.6", flicker=0.08, worth=0.9, alpha=0.8)
+    found = study(frozen, good, truth=truth)
+    assert found.best.filters == "ema-warped:0.6"
+    assert [row.filters for row in found.misleading] == ["ema:0.98"]
+    assert "Use --filter ema-warped:0.6 over net: flicker falls from 20.0 to 8.0 %" in said(found)
+    assert "Steadier and worse: ema:0.98." in said(found)
+    assert ("There is no ground truth: whether labels are right" in said(found)) is not truth
+
+
+def test_alpha_alone_chooses_nothing():
+    found = study(remedy("ema:0.9", worth=0.79, alpha=0.99, flicker=0.01))
+    assert found.best is None
+    assert said(found).startswith("Use none of these filters over net: none steadies it without a loss of accuracy")
+
+
+@pytest.mark.parametrize(
+    "loss", [{"lag": 1.2}, {"coverage": 0.9}, {"miou": 0.7}, {"accuracy": 0.79}, {"flicker": 0.25}], ids=str
+)
+def test_what_a_filter_must_not_cost(loss):
+    found = study(dataclasses.replace(remedy("vote:9", flicker=0.05, worth=0.9), **loss))
+    assert found.best is None
+
+
+def test_among_those_alike_the_steadier_one():
+    rows = remedy("vote:3", 0.1, 0.9), remedy("vote:5", 0.05, 0.897), remedy("vote:9", 0.01, 0.88)
+    assert study(*rows).best.filters == "vote:5"
+
+
+def test_the_front_is_what_none_beats():
+    rows = remedy("a:1", 0.1, 0.9), remedy("b:1", 0.15, 0.85), remedy("c:1", 0.05, 0.5), remedy("d:1", 0.3, 0.95)
+    assert [row.filters for row in study(*rows).front] == ["c:1", "a:1", "d:1"]
+
+
+def test_chains_are_written_as_they_are_typed():
+    assert "Use --filter ema:0.6 --filter guided:8 over net" in said(study(remedy("ema:0.6+guided:8", 0.1, 0.9)))
+
+
+# --- From the command line --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """Labels of a wall that flicker, with the truth, through the command to the end."""
+    folder = tmp_path_factory.mktemp("remedies")
+    scene = predicted_scene.write(folder / "flight", frames=8)
+    (scene / "scene.yaml").write_text("classes: [dark, bright, blue]\n")
+    rng = np.random.default_rng(0)
+    for name in ("gt", "net"):
+        (scene / "labels" / name).mkdir(parents=True)
+    for k in range(8):
+        truth = ((np.arange(80) + 2 * k) // 9 % 2 + np.zeros((48, 1))).astype(np.uint8)
+        noisy = np.where(rng.random(truth.shape) < 0.25, 1 - truth, truth).astype(np.uint8)
+        for name, labels in (("gt", truth), ("net", noisy)):
+            Image.fromarray(labels).save(scene / f"labels/{name}/{k:03d}.png")
+    filters = [w for f in ("ema:0.98", "vote-warped:5", "threshold", "vote:3+threshold:0.5") for w in ("--filter", f)]
+    words = ["remedies", "--data", scene, "--backbone", "net", *filters, "--voxel-size", "0.1", "--out", folder / "out"]
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return folder, result.output
+
+
+def test_the_terminal_says_what_to_use_in_80_columns(done):
+    _, text = done
+    assert "threshold:0.6: left out, for net gives labels without scores" in text
+    assert "Use --filter vote-warped:5 over net: flicker falls from" in " ".join(text.split())
+    table = text[text.index("remedies for net") : text.index("Use --filter")]
+    assert max(map(len, table.splitlines())) <= 80
+    assert "vote-warped:5" in table
+
+
+def test_the_folder_holds_table_figure_and_sentence(done):
+    folder, _ = done
+    rows = json.loads((folder / "out/tables/remedies.json").read_text())
+    assert (folder / "out/figures/remedies__net.png").stat().st_size > 10_000
+    page = (folder / "out/report.html").read_text()
+    assert "What would steady it?" in page
+    assert "Use --filter vote-warped:5 over net" in page
+    (found,) = remedies(load_result(folder / "out"))
+    assert [row.filters for row in found.filtered] == ["ema:0.98", "vote-warped:5", "vote:3+threshold:0.5"]
+    best, frozen = found.best, found.filtered[0]
+    assert best.accuracy > found.unfiltered.accuracy + 0.05
+    assert frozen.stable_wrong > 0.2
+    assert len(rows["rows"]) == 4
+
+
+def test_a_second_start_computes_nothing(done):
+    folder, _ = done
+    filters = ["--filter", "ema:0.98", "--filter", "vote-warped:5", "--filter", "vote:3+threshold:0.5"]
+    words = ["remedies", "--data", folder / "flight", "--backbone", "net", *filters, "--voxel-size", "0.1"]
+    result = CliRunner().invoke(app, [str(w) for w in (*words, "--out", folder / "out", "--report", "off")])
+    assert result.exit_code == 0, result.output
+    units = json.loads((folder / "out/manifest.json").read_text())["units"]
+    assert (units["kept"], units["computed"]) == (4, 0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--backbone", "nut"), "there are no labels 'nut' for filters to take; there is net"),
+        (("--backbone", "net", "--filter", "ema:0.6+smooth"), "filter 'smooth' is not known"),
+        (("--predict", "nothing"), "backbone 'nothing' is not known"),
+    ],
+)
+def test_bad_input_is_one_line(done, words, said):
+    folder, _ = done
+    command = ["remedies", "--data", folder / "flight", *words, "--voxel-size", "0.1", "--out", folder / "bad"]
+    result = CliRunner().invoke(app, [str(word) for word in command])
+    assert result.exit_code == 2
+    assert said in result.output
+    assert len(result.output.strip().splitlines()) == 1
