@@ -5,9 +5,9 @@ BIN := .venv/bin
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
-	@echo 'make test    set up, then lint, types, import contract and the whole test suite'
+	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the whole test suite'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: a minute'
-	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, and see that none of it is lost'
+	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, fill their disk, and see that nothing is lost'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
 	@echo 'make clean   remove .venv and what tools left behind'
@@ -21,7 +21,8 @@ setup-dev:
 bench: setup
 	$(BIN)/semstab-bench --backend open3d
 
-test: setup-dev lint
+test: setup-dev
+	$(MAKE) --no-print-directory -j2 --output-sync=target lint fuzz-short
 	$(BIN)/pytest -n auto --maxprocesses 4
 
 FUZZ_SECONDS := 3600
@@ -34,6 +35,7 @@ fuzz-short: setup-dev
 
 faults: setup-dev
 	$(BIN)/python tests/faults/kills.py 100
+	$(BIN)/python tests/faults/disk.py
 
 lint: setup-dev
 	$(BIN)/ruff check .

@@ -15,6 +15,7 @@ from posed_config import configure
 from posed_scene import fails
 
 import semstab
+from semstab.comparison.baseline import LARGEST
 from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.sampling import value
@@ -133,3 +134,7 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("summary.json", json.dumps({"kind": "else"}))
     fails(DataError, re.escape("of another kind or version"), open_contender, file)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("summary.json", b" " * (LARGEST + 1))
+    assert file.stat().st_size < 200_000
+    fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_contender, file)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from transformers import AutoImageProcessor, SegformerImageProcessorPil
 
 from semstab.backbones.pretrained.checkpoint import Checkpoint, ModelOptions
 from semstab.errors import ConfigError, DataError
+from semstab.runtime.files import parse_json
 
 Processing = Literal["pil", "torchvision"]
 
@@ -56,7 +56,7 @@ def model_type(checkpoint: Checkpoint) -> str:
 
 def _kind(file: Path) -> str | None:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = parse_json(file.read_text(encoding="utf-8"))
     except ValueError:
         return None  # the loader says it better
     kind = content.get("image_processor_type") or content.get("feature_extractor_type")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from semstab.backbones import Image
 from semstab.backbones.pretrained.checkpoint import Checkpoint, bilinear
 from semstab.backbones.pretrained.preprocessing import ImageModelOptions, load_processor
 from semstab.errors import DataError
+from semstab.runtime.files import parse_json
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -67,7 +67,7 @@ class Sam2:
         self._model = model
         side = int(model.config.prompt_encoder_config.image_size)
         file = checkpoint.folder / "preprocessor_config.json"
-        said = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        said = parse_json(file.read_text(encoding="utf-8")) if file.is_file() else {}
         self._size = (side, side)
         self._mean, self._std = (
             torch.tensor(said.get(key) or usual)[:, None, None]

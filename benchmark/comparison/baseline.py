@@ -17,14 +17,14 @@ from semstab.errors import DataError, one_line
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace
 from semstab.model.results import UnitSummary
-from semstab.runtime.files import atomic_path, read_limited
+from semstab.runtime.files import atomic_path, parse_json, read_limited
 from semstab.runtime.json_form import from_json, to_json
 from semstab.statistics.sampling import InfluenceSums
 
 SCHEMA, KIND = 1, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
-"""Bytes of a file that is looked into."""
+"""Bytes of a file that is looked into, and of all that is packed in it."""
 
 MANY_GROUPS = 32
 """Groups of frames down to which these are joined, before cubes are."""
@@ -106,7 +106,9 @@ def load_baseline(path: str | Path) -> Baseline:
     """Read what `save_baseline` wrote. Raises DataError where it is damaged, or something else."""
     try:
         with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:
-            text = json.loads(archive.read(CONTENT))
+            if sum(member.file_size for member in archive.infolist()) > LARGEST:
+                raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
+            text = parse_json(archive.read(CONTENT))
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("of another kind or version")
             content = from_json(_Content, text, path)

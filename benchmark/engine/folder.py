@@ -13,7 +13,6 @@ import uuid
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import yaml
 
@@ -42,6 +41,7 @@ from semstab.model.records import (
 )
 from semstab.model.results import SCHEMA, Unit, slug
 from semstab.runtime.files import (
+    DAMAGED_ARRAYS,
     TEMPORARY,
     FolderLock,
     atomic_path,
@@ -135,7 +135,7 @@ class Folder:
         """What an earlier start left of a portion, if its files are there as they were."""
         try:
             found = Finished.load(self.path / PORTIONS / key / f"{name}.npz")
-        except (OSError, ValueError, LookupError, EOFError, BadZipFile, DataError):
+        except (*DAMAGED_ARRAYS, DataError):
             return None
         return found if self._are_whole(found.about.files) else None
 
@@ -261,6 +261,10 @@ def _contradiction(result: Result) -> str | None:
     """What in a result refers to something that is not in it; None where nothing does."""
     if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
         return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
+    for record in result.records:
+        table = record.summary.table
+        if not table.strata or (table.voxels and not table.classes):
+            return f"{record.unit} has no {'classes' if table.strata else 'strata'}"
     quantities = {"op", "evidence", *(measure.key for measure in measures())}
     for row in result.agreement:
         if lost := quantities - row.differences.keys():

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
 from semstab.model.evidence import Evidence
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import atomic_path, parse_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -94,7 +94,9 @@ def _about(path: Path) -> dict[str, Any]:
     import pyarrow.parquet as pq
 
     with reading(path):
-        content: dict[str, Any] = json.loads((pq.read_schema(path).metadata or {})[b"semstab"])
+        content = parse_json((pq.read_schema(path).metadata or {})[b"semstab"])
+        if not isinstance(content, dict):
+            raise ValueError("its metadata are no mapping")
         return content
 
 
@@ -144,7 +146,7 @@ def read(path: str | Path, names: Iterable[str]) -> dict[str, Any]:
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path) as content:
-        about = json.loads((content.schema_arrow.metadata or {})[b"semstab"])
+        about = parse_json((content.schema_arrow.metadata or {})[b"semstab"])
         if about["schema"] != SCHEMA:
             raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
         parts: dict[str, list[Any]] = {name: [] for name in names}

@@ -65,12 +65,16 @@ class Interval(Estimate):
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
+Level = Literal[
+    "stable", "partly stable", "usable", "unstable", "undecided", "too coarse", "misleading", "no verdict",
+]  # fmt: skip
+
 
 @dataclass(frozen=True)
 class StabilityVerdict:
-    """What the evidence says of a backbone on a scene: a key of ADVICE, and the line that gives the reason."""
+    """What the evidence says of a backbone on a scene: a level, see ADVICE, and the line that gives the reason."""
 
-    level: str
+    level: Level
     line: str
 
 

@@ -9,8 +9,11 @@ import json
 import math
 import os
 import stat
+import struct
 import tempfile
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
@@ -26,6 +29,12 @@ from semstab.runtime.json_form import to_json
 
 TEMPORARY = ".semstab-"
 """How names of files begin that are not whole yet."""
+
+DAMAGED_ARRAYS = (
+    OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
+    struct.error, tokenize.TokenError, SyntaxError,
+)  # fmt: skip
+"""What numpy raises on a damaged .npz file of our own."""
 
 MAX_YAML_BYTES = 2**24
 MAX_ALIASED = 10**5
@@ -147,13 +156,21 @@ def keep_only(written: Collection[Path], folder: Path) -> None:
             path.unlink()
 
 
+def parse_json(text: str | bytes) -> Any:
+    """The content of JSON. Raises ValueError where it is none, or nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
 def read_json(path: str | Path) -> Any:
     """Read a JSON file; raise DataError with the file's name where it cannot be read."""
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return parse_json(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
 
 

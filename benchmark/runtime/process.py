@@ -1,4 +1,4 @@
-"""What a process that fuses frame after frame asks of its threads and of the system's memory."""
+"""What a process that fuses frame after frame asks of its threads, of the system's memory, and of rerun."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ def settle() -> None:
 
     Threads that wait do not spin, for they would take the time of those that decode the next frames. Memory of a
     decoded image is used for the next one, instead of being returned to the system, which clears it each time (glibc).
+    Rerun logs nothing of its own to the terminal: what cannot be recorded is said in one line.
     """
+    os.environ.setdefault("RUST_LOG", "off")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if sys.platform != "linux":
         return

@@ -11,6 +11,7 @@ from semstab.model.statistics import (
     Flipping,
     Interval,
     Judged,
+    Level,
     Reach,
     StabilityVerdict,
 )
@@ -31,7 +32,7 @@ DANGEROUS = 0.05
 LEAST_VOXELS, LEAST_BLOCKS = 100, 16
 """Voxels seen twice or more, and blocks of them, below which there is no verdict."""
 
-ADVICE = {
+ADVICE: dict[Level, str] = {
     "stable": "its labels agree from frame to frame; act on them",
     "partly stable": "act on its labels but for those of the class named",
     "usable": "act on a label only where several frames agree",
@@ -128,7 +129,7 @@ def _class_share(row: ClassReach) -> str:
     return f"{chance}{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
 
 
-def _level(judged: Judged, reach: Reach | None) -> str:
+def _level(judged: Judged, reach: Reach | None) -> Level:
     basis = _basis(judged, reach)
     if math.isnan(basis.low):
         return "no verdict"

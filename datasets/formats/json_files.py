@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from semstab.datasets.formats.disk import read_bytes
 from semstab.datasets.views.poses import Poses
 from semstab.errors import DataError, one_line
+from semstab.runtime.files import parse_json
 
 MAX_JSON_BYTES = 2**28
 
@@ -21,8 +21,8 @@ def read_object(path: Path) -> dict[str, Any]:
     """The object in a file. Raises DataError where there is none."""
     data = read_bytes(path, MAX_JSON_BYTES)
     try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(data)
+    except ValueError as error:
         raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected an object with named values, found a {type(content).__name__}")

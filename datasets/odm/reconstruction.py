@@ -5,7 +5,6 @@ Source: opensfm.org, Reconstruction Format and Geometric Models; OpenDroneMap ha
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from semstab.datasets.views.lenses import Lens
 from semstab.datasets.views.poses import Poses
 from semstab.errors import DataError, one_line
 from semstab.model.frames import Intrinsics
+from semstab.runtime.files import parse_json
 
 MAX_BYTES = 2**32
 """With the points of thousands of photographs."""
@@ -75,8 +75,8 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
 def _reconstructions(path: Path) -> Sequence[Mapping[str, Any]]:
     data = read_bytes(path, MAX_BYTES)
     try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(data)
+    except ValueError as error:
         raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
     if not isinstance(content, list) or not content or not all(isinstance(one, dict) for one in content):
         raise DataError(f"{path}: expected a list of reconstructions; run the reconstruction again")

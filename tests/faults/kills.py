@@ -3,7 +3,8 @@
     python tests/faults/kills.py [COUNT [SEED]]         make faults: 100
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
-machine, a kill may come after the end: those are counted apart.
+machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
+once: one of the two is refused in one line, or both end well.
 """
 
 from __future__ import annotations
@@ -66,6 +67,21 @@ def killed(words: Words, log: Path, wait: Callable[[], None]) -> bool:
     os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     return os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+
+
+def beside(words: Words, logs: tuple[Path, Path], seconds: float) -> str | None:
+    """Start it twice, the second a while after the first; what is wrong with their ends."""
+    children = [in_a_child(words, logs[0])]
+    time.sleep(seconds)
+    children.append(in_a_child(words, logs[1]))
+    ends = [
+        (os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), log.read_text())
+        for child, log in zip(children, logs, strict=True)
+    ]
+    refused = [said for code, said in ends if code == 2 and "another process works on it" in said]
+    if any(code for code, _ in ends) and (len(refused) != 1 or len(refused[0].splitlines()) != 1):
+        return str(ends)
+    return None
 
 
 def of_run(out: Path) -> Any:
@@ -138,6 +154,14 @@ def main(count: int, seed: int) -> None:
                 told[f"{kind}, {'birth' if birth else 'later'}{'' if at_work else ', had ended'}"] += 1
                 if left(out) != whole[kind]:
                     wrong.append(f"{kind} {k}: differs, killed at {moment:.3f} s{' of its birth' if birth else ''}")
+            for k in range(count // 5):
+                kind = list(made)[k % len(made)]
+                (words, left), out = made[kind], base / f"twice {kind}{k}"
+                fault = beside(words(out), (base / "log", base / "log2"), rng.random() * seconds[kind])
+                finished(words(out), base / "log")
+                told[f"{kind}, twice at once"] += 1
+                if fault or left(out) != whole[kind]:
+                    wrong.append(f"{kind} {k}, twice at once: {fault or 'differs'}")
     for what, times in sorted(told.items()):
         print(f"{times:3} {what}")
     print(f"{told.total() - len(wrong)} of {told.total()} left what one without a kill leaves")

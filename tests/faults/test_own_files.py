@@ -123,3 +123,27 @@ def test_a_damaged_file_is_one_line_or_still_whole(folder, pattern, read: Callab
     assert [line for line in refused if str(file.parent) not in line or len(line) > LONGEST_LINE] == []
     read(file)
     assert len(refused) > DAMAGES / 10
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        (("strata",), [], "has no strata"),
+        (("classes",), [], "has no classes"),
+        (("statistics", "verdict", "level"), "fine", "level"),
+    ],
+)
+def test_a_summary_that_lacks_what_its_tables_are_made_of_is_refused(folder, place, value, said) -> None:
+    file = folder / "run" / "summary.json"
+    whole = file.read_text()
+    content = json.loads(whole)
+    part = content["runs"][0]
+    for key in place[:-1]:
+        part = part[key]
+    part[place[-1]] = value
+    file.write_text(json.dumps(content))
+    try:
+        with pytest.raises(SemstabError, match=rf"summary\.json: .*{said}"):
+            read_again(file)
+    finally:
+        file.write_text(whole)

@@ -156,7 +156,8 @@ def of_npz(content: bytes, rng: random.Random) -> bytes:
         for name in old.namelist():
             body = old.read(name)
             called = rng.choice((name, name, name, "x", "../x.npy")) if name == chosen else name
-            new.writestr(called, of_bytes(body, rng) if name == chosen else body)
+            damage = {".json": of_json, ".parquet": of_parquet}.get(name[name.rfind(".") :], of_bytes)
+            new.writestr(called, damage(body, rng) if name == chosen else body)
     return out.getvalue()
 
 

@@ -35,9 +35,9 @@ from kinds import Kind, kinds  # noqa: E402
 from semstab.errors import LONGEST_LINE, SemstabError  # noqa: E402
 
 SLOW = 2.0
-"""Seconds of computing after which an input hangs; of waiting, ten times as many: others use the machine."""
+"""Seconds of computing after which an input hangs; of waiting, thirty times as many: others use the machine."""
 
-DEAD = 30.0
+DEAD = 90.0
 """Seconds after which a worker that does not even hear the alarm is killed."""
 
 PEAK = 500
@@ -62,7 +62,7 @@ class Outcome:
 def tried(kind: Kind, file: Path, slow: float) -> Outcome:
     """Read a damaged file."""
     signal.setitimer(signal.ITIMER_PROF, slow)
-    signal.setitimer(signal.ITIMER_REAL, 10 * slow)
+    signal.setitimer(signal.ITIMER_REAL, 30 * slow)
     try:
         kind.read(file)
     except SemstabError as error:

@@ -26,6 +26,9 @@ from rich.console import Console
 import semstab
 from semstab.backbones.sam.heuristic import read_rules
 from semstab.backbones.segearth.prompts import read_prompts
+from semstab.comparison.contrasts import contrasts
+from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
+from semstab.comparison.pairing import pair
 from semstab.convert import convert
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.codecs import reads_exr
@@ -35,6 +38,10 @@ from semstab.datasets.formats.images import color_size, read_color, read_depth, 
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.surfaces.surface import Surface
 from semstab.engine import load_result
+from semstab.engine.tiling.sights import Sights, look_at
+from semstab.engine.units import make_plan
+from semstab.gating import gate_config
+from semstab.gating.rules import parse
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.georeference import Georeference, wkt
 from semstab.model.labels import LabelSpace
@@ -48,6 +55,7 @@ from semstab.predict.folder import PredictionFolder
 from semstab.runtime.files import read_json
 from semstab.runtime.json_form import from_json
 from semstab.settings import load_config, load_study
+from semstab.statistics.commit import Commit
 from semstab.statistics.looks import Looks
 from semstab.statistics.sampling.influence import InfluenceSums
 
@@ -58,9 +66,9 @@ CAMERA = Intrinsics(12, 12, 7.5, 5.5)
 SWEEPS = {"voxel_size": [0.1, 0.2], "depth_noise": {"values": [0, 0.1], "repeats": 2}}
 RGB = np.random.default_rng(1).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
 BY_SUFFIX: dict[str, Damage] = {
-    ".png": damages.of_png, ".npz": damages.of_npz, ".json": damages.of_json, ".geojson": damages.of_json,
-    ".yaml": damages.of_yaml, ".txt": damages.of_words, ".csv": damages.of_words, ".tsv": damages.of_words,
-    ".obj": damages.of_words, ".parquet": damages.of_parquet,
+    ".png": damages.of_png, ".npz": damages.of_npz, ".semstab": damages.of_npz, ".json": damages.of_json,
+    ".geojson": damages.of_json, ".yaml": damages.of_yaml, ".txt": damages.of_words, ".csv": damages.of_words,
+    ".tsv": damages.of_words, ".obj": damages.of_words, ".parquet": damages.of_parquet,
 }  # fmt: skip
 
 
@@ -164,12 +172,22 @@ def of_settings(folder: Path) -> Iterator[Kind]:
         "rules.yaml": (read_rules(None).model_dump(mode="json"), read_rules),
         "prompts.yaml": (read_prompts(None).model_dump(mode="json"), read_prompts),
     }
+    rules = ["alpha drop < 0.02", "class wall: recall > 0.6", "scene wall: class *: recall drop < 1 %"]
+    contents["gate.yaml"] = ({"rules": rules, "level": 0.05, "undecided": "pass"}, read_gate)
+    wall = {"by": "op", "at_least": 3, "precision": 0.97, "low": 0.95, "voxels": 200, "left": 0.7}
+    commit = {"schema": 1, "precision": 0.95, "confidence": 0.95, "voxel_size": 0.25, "left": 0.6}
+    contents["commit.yaml"] = (commit | {"classes": {"wall": wall, "door": {"never": True}}}, Commit.load)
     for name, (content, read) in contents.items():
         (folder / name).write_text(yaml.safe_dump(content))
         yield Kind(name, (folder / name,), read)
     table = folder / "scannet.tsv"
     table.write_text("id\traw_category\tnyu40id\n1\twall\t1\n2\tchair\t5\n3\tfloor\t\n")
     yield Kind("scannet classes", (table,), functools.partial(read_class_table, column="nyu40id"))
+
+
+def read_gate(file: Path) -> None:
+    for rule in gate_config(file).rules:
+        parse(rule)
 
 
 def of_datasets(folder: Path) -> Iterator[Kind]:
@@ -234,6 +252,17 @@ def of_results(folder: Path) -> Iterator[Kind]:
     for pattern, read in first.items():
         if found := sorted(run.glob(pattern)):
             yield Kind(f"run {pattern}", (found[0],), read)
+    tiled = config.model_copy(update={"tile_size": 8, "events": False, "statistics": False})
+    semstab.run(tiled, out=folder / "tiled", report=False)
+    tile = min((folder / "tiled").glob("voxels/*/*.parquet"))
+    yield Kind("tile of a map", (tile,), lambda file: VoxelTable.load(file.parent))
+    sights = folder / "sights.npz"
+    look_at(make_plan(tiled).tasks[0], 0.25).save(sights)
+    yield Kind("sights", (sights,), Sights.load)
+    small = folder / "small.semstab"
+    small = folder / "small.semstab"
+    save_summary(open_contender(f"{run}:a"), small)
+    yield Kind("small summary", (small,), lambda file: compared(file, f"{run}:b"))
     conversion = folder / "converted/wall/conversion.json"
     yield Kind("conversion.json", (conversion,), lambda _: list(convert(config, folder / "converted")))
     yield Kind("predictions.json", (folder / "labels/net/predictions.json",), lambda _: predict(folder))
@@ -253,6 +282,13 @@ def read_result(folder: Path) -> None:
     tables(result)
     if result.select():
         print_summary(result, Console(file=StringIO()))
+
+
+def compared(*named: Path | str) -> None:
+    contenders = open_contenders(named)
+    for scene in shared_scenes(contenders):
+        entries = [each.scenes[scene] for each in contenders]
+        contrasts(pair(entries, [each.name for each in contenders]), *entries, 1)
 
 
 def predict(folder: Path) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 import fuzz
 import kinds
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from image_files import npy_bytes, npz_bytes
@@ -17,11 +19,16 @@ from semstab.backbones.segearth.prompts import read_prompts
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.las_files import opened
 from semstab.datasets.surfaces.surface import Surface
+from semstab.engine.tiling.sights import Sights
 from semstab.errors import ConfigError, DataError, one_line
+from semstab.model.voxels import VoxelTable
 from semstab.outputs.export.ply import Header
 from semstab.outputs.loaded import read_series
 from semstab.outputs.plots.maps import Overview
+from semstab.runtime.files import parse_json
 from semstab.settings import load_config, resolve
+from semstab.statistics.looks import Looks
+from semstab.statistics.sampling import InfluenceSums
 
 EACH = 8
 """Inputs of a kind."""
@@ -185,3 +192,20 @@ def test_a_series_whose_columns_have_no_names_is_refused(tmp_path, text) -> None
 def test_no_exceptions_name_is_told() -> None:
     assert one_line(OSError("Couldn't read: TProtocolException: Invalid data")) == "Couldn't read: Invalid data"
     assert "Error" not in one_line(EOFError())
+
+
+def test_json_nested_too_deeply_is_refused_wherever_it_stands(tmp_path) -> None:
+    deep = b"[" * 100_000
+    pq.write_table(pa.table({"x": [1]}).replace_schema_metadata({"semstab": deep}), tmp_path / "a.parquet")
+    for load in (VoxelTable.load, Looks.load, InfluenceSums.load):
+        with pytest.raises(DataError, match=r"a\.parquet: "):
+            load(tmp_path / "a.parquet")
+    with pytest.raises(ValueError, match="nested too deeply"):
+        parse_json(deep)
+
+
+def test_sights_whose_header_ends_early_are_made_again(tmp_path) -> None:
+    body = npy_bytes(np.zeros(3)).replace(b"'shape': (3,)", b"'shape': (((")
+    with zipfile.ZipFile(tmp_path / "sights.npz", "w") as archive:
+        archive.writestr("size.npy", body)
+    assert Sights.load(tmp_path / "sights.npz") is None

@@ -16,7 +16,7 @@ from semstab.engine.series import FrameRow
 from semstab.engine.tiling.partition import Part
 from semstab.model.records import FrameQuality, ImageSpace
 from semstab.model.results import Agreement, FrameReport, SizeAlpha
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import atomic_path, parse_json
 from semstab.runtime.json_form import from_json, to_json
 
 PORTIONS = "parts"
@@ -96,9 +96,9 @@ class Finished:
 
     @classmethod
     def load(cls, path: Path) -> Finished:
-        """What `save` wrote. Raises OSError, ValueError or BadZipFile where it is not there or damaged."""
+        """What `save` wrote. Raises DAMAGED_ARRAYS or DataError where it is not there or damaged."""
         with path.open("rb") as file, np.load(file) as content:
-            about = from_json(About, json.loads(content["about"].tobytes()), path)
+            about = from_json(About, parse_json(content["about"].tobytes()), path)
             sums = {name[5:]: content[name] for name in content.files if name.startswith("sums ")}
             return cls(about, content["series"], sums, content["reduced"], content["poses"])
 

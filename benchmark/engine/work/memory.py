@@ -88,7 +88,7 @@ def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
 
 def result_bytes(voxels: int, num_classes: int, *, soft: bool) -> int:
     """A voxel table, and what comes from it when it is measured and written."""
-    return voxels * (120 + (10 * num_classes if soft else 0))
+    return voxels * (200 + (10 * num_classes if soft else 0))
 
 
 def _keeps_observations(backend: str) -> bool:

@@ -18,7 +18,7 @@ from semstab.errors import DataError, one_line
 from semstab.metrics.matching import shared_observations, voxel_keys
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import atomic_path, parse_json
 
 CELLS = 4
 """Cells along a voxel's edge."""
@@ -156,7 +156,7 @@ class Looks:
 
         try:
             content = pq.read_table(path)
-            about = json.loads((content.schema.metadata or {})[b"semstab"])
+            about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("Looks", SCHEMA):
                 raise DataError("of another kind or version")
             views = tuple(View(int(row[0]), np.array(row[1:4]), float(row[4])) for row in about.pop("views"))

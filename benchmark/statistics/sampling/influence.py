@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.runtime.files import atomic_path
+from semstab.runtime.files import atomic_path, parse_json
+from semstab.runtime.json_form import from_json
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
 from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
 
@@ -152,10 +153,10 @@ class InfluenceSums:
 
         try:
             content = pq.read_table(path)
-            about = json.loads((content.schema.metadata or {})[b"semstab"])
+            about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
                 raise DataError("of another kind or version")
-            about["classes"] = tuple(about["classes"])
+            about = dataclasses.asdict(from_json(About, about, path))
             part, *keys = (content.column(name).to_numpy() for name in KEYS)
             columns = np.stack([column.to_numpy() for column in content.columns[len(KEYS) :]], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
@@ -169,6 +170,8 @@ class InfluenceSums:
                 made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
                 found.append(made if own.any() or not number else None)
             whole, seen, limit = found
+            if seen is not None and (limit is None or not _same_rows(seen, limit)):
+                raise DataError("what was seen of the sample and its limit are of other rows")
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of influence sums ({one_line(error)})") from error
         assert whole is not None
@@ -177,6 +180,26 @@ class InfluenceSums:
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
 """The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 its limit."""
+
+
+@dataclass(frozen=True)
+class About:
+    """What the file says of its sums; see `InfluenceSums`."""
+
+    edge: float
+    step: int
+    voxel_size: float
+    K: int
+    classes: tuple[str, ...]
+    truth: bool
+
+    def __post_init__(self) -> None:
+        if not (self.edge > 0 and self.voxel_size > 0 and self.step >= 0 and len(self.classes) in (0, self.K)):
+            raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size:g} m")
+
+
+def _same_rows(one: InfluenceSums, other: InfluenceSums) -> bool:
+    return np.array_equal(one.cell, other.cell) and np.array_equal(one.frame, other.frame)
 
 
 def merged(*parts: InfluenceSums) -> InfluenceSums:
