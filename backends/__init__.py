@@ -186,13 +186,17 @@ def keeps_log(name: str) -> bool:
     return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
 
 
-def expected_bytes(name: str, voxels: int, observations: int, num_classes: int) -> int:
+def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, *, soft: bool = False) -> int:
     """Bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
 
-    A backend says it with a static method of that name and the last three parameters.
+    A backend says it with a static method of that name, those three parameters, and `soft` where evidence from scores
+    takes more than that from labels.
     """
     says = getattr(REGISTRY.load(name), "expected_bytes", None)
-    return int(says(voxels, observations, num_classes)) if says else 0
+    if says is None:
+        return 0
+    more = {"soft": soft} if "soft" in inspect.signature(says).parameters else {}
+    return int(says(voxels, observations, num_classes, **more))
 
 
 def _options(cls: Any) -> list[str]:

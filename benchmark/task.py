@@ -17,12 +17,14 @@ from semstab.model.labels import LabelMapping, LabelSpace
 from semstab.model.results import Unit
 from semstab.pixels.exclusion import leave_out
 from semstab.pixels.perturbation import perturb
+from semstab.pixels.top_k import keep_largest
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """A backbone on a scene: which frames, and how its labels become rows of evidence.
 
+    top_k     how many scores of each pixel are fused, the largest; all where not given
     left_out  how many frames were selected but lack a file or a pose
     """
 
@@ -33,6 +35,7 @@ class Task:
     backends: tuple[str, ...]
     perturbation: Perturbation | None = None
     exclude: Exclusion = dataclasses.field(default_factory=Exclusion)
+    top_k: int | None = None
     left_out: int = 0
 
     @property
@@ -65,8 +68,9 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
         _require_classes(config.exclude.classes, mapping, scene.name)
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
         yield Task(
-            scene, backbone, frames.indices, mapping, fused_by, config.perturbation, config.exclude, frames.left_out
-        )
+            scene, backbone, frames.indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
+            frames.left_out,
+        )  # fmt: skip
 
 
 def applies(part: Part, scene: str, backbone: str) -> bool:
@@ -119,6 +123,8 @@ def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) 
 def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
     """The scene's frame without what moves, its labels as rows 0..K-1 of the run's label space, noise, pixel stride."""
     frame = in_label_space(task.mapping, _still(task, frame))
+    if task.top_k is not None and frame.scores is not None:
+        frame = keep_largest(frame, task.top_k)
     if task.perturbation is not None:
         frame = perturb(frame, task.perturbation, task.scene.name)
     return frame.every(pixel_stride)

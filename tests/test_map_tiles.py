@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import shutil
 from collections.abc import Generator
 
 import numpy as np
@@ -13,6 +14,7 @@ import tiny_scene
 from compare_summaries import differences
 from posed_config import configure
 from posed_writer import write_posed
+from pyarrow import dataset, parquet
 
 import semstab
 from semstab import backends
@@ -22,7 +24,9 @@ from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.model.extent import Extent
+from semstab.model.parquet import Tile
 from semstab.model.voxels import VoxelTable
+from semstab.outputs.export import export
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
 
@@ -118,26 +122,84 @@ def series_of(folder):
         return [{key: row[key] for key in row if not key.endswith("_ms")} for row in csv.DictReader(file)]
 
 
-@pytest.mark.parametrize(("scene", "backend"), [("wall", "numba"), ("soft_wall", "numba"), ("wall", "numpy")])
-def test_a_run_in_tiles_says_what_a_whole_one_says(scene, backend, tmp_path, request) -> None:
-    """Every column of every voxel to the last bit, every number of the summary to 1e-12, the series but for times."""
-    root = request.getfixturevalue(scene)
-    settings = {"backends": [backend], "check": "sample"}
-    whole = semstab.engine.run(configure(root, **settings), out=tmp_path / "whole")
+SETTINGS = {"check": "sample", "backends": ["numba"]}
+
+
+@pytest.fixture(scope="module")
+def both(wall, tmp_path_factory):
+    """Folders of a run at once, and of one in tiles."""
+    return run_both(wall, tmp_path_factory.mktemp("runs"), **SETTINGS)
+
+
+def run_both(root, folder, **settings):
     executor = Several()
-    tiles = semstab.engine.run(configure(root, **settings, tile_size=8), out=tmp_path / "tiles", executor=executor)
+    semstab.engine.run(configure(root, **settings), out=folder / "whole")
+    semstab.engine.run(configure(root, **settings, tile_size=8), out=folder / "tiles", executor=executor)
     assert len(executor.done) > 4
     assert "frames" in executor.done
-    assert len(list((tmp_path / "tiles" / "voxels").glob("*/tile=*.parquet"))) > 4
-    found = differences(summary_of(tmp_path / "whole"), summary_of(tmp_path / "tiles"), tolerance=1e-12)
+    return folder / "whole", folder / "tiles"
+
+
+def assert_same_run(whole, tiles) -> None:
+    """Every column of every voxel to the last bit, every number of the summary to 1e-12, the series but for times."""
+    assert len(list((tiles / "voxels").glob("*/tile=*.parquet"))) > 4
+    assert not (tiles / "parts").exists()
+    found = differences(summary_of(whole), summary_of(tiles), tolerance=1e-12)
     assert [line for line in found if "voxels_file" not in line] == []
-    assert_same_bits(tiles.records[0].table(), whole.records[0].table())
-    for one, other in zip(series_of(tmp_path / "tiles"), series_of(tmp_path / "whole"), strict=True):
-        assert {key: float(value or "nan") for key, value in one.items()} == pytest.approx(
-            {key: float(value or "nan") for key, value in other.items()}, rel=1e-12, abs=1e-12, nan_ok=True
+    one, other = (semstab.load(folder).table() for folder in (tiles, whole))
+    assert_same_bits(one, other)
+    for row, expected in zip(series_of(tiles), series_of(whole), strict=True):
+        assert {key: float(value or "nan") for key, value in row.items()} == pytest.approx(
+            {key: float(value or "nan") for key, value in expected.items()}, rel=1e-12, abs=1e-12, nan_ok=True
         )
-    assert tiles.up == whole.up
-    assert not (tmp_path / "tiles" / "parts").exists()
+
+
+def test_a_run_in_tiles_says_what_a_whole_one_says(both) -> None:
+    assert_same_run(*both)
+
+
+@pytest.mark.parametrize(("scene", "backend"), [("soft_wall", "numba"), ("wall", "numpy")])
+def test_so_it_does_with_soft_scores_and_other_backends(scene, backend, tmp_path, request) -> None:
+    assert_same_run(*run_both(request.getfixturevalue(scene), tmp_path, **SETTINGS | {"backends": [backend]}))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".ply", ".laz"])
+def test_an_export_of_tiles_holds_the_same_voxels(suffix, both, tmp_path) -> None:
+    """In another order."""
+    if suffix == ".laz":
+        pytest.importorskip("laspy")
+    written = []
+    for folder in both:
+        (exported,) = export(folder, tmp_path / f"{folder.name}{suffix}", min_op=2)
+        assert exported.content.startswith("210 voxels")
+        written.append(exported.path)
+    rows = [sorted(READ[suffix](path)) for path in written]
+    assert rows[0] == rows[1]
+    with pytest.raises(ConfigError, match="no voxel with OP >= 99; OP goes up to"):
+        export(both[1], tmp_path / f"none{suffix}", min_op=99)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def rows_of_ply(path):
+    head, body = path.read_bytes().split(b"end_header\n")
+    assert b"element vertex 210\n" in head
+    return [body[start : start + len(body) // 210] for start in range(0, len(body), len(body) // 210)]
+
+
+READ = {
+    ".csv": lambda path: path.read_text().splitlines(),
+    ".parquet": lambda path: [str(row) for row in parquet.read_table(path).to_pylist()],
+    ".ply": rows_of_ply,
+    ".laz": lambda path: [str(point) for point in laspy_points(path)],
+}
+
+
+def laspy_points(path):
+    import laspy
+
+    cloud = laspy.read(path)
+    names = [name for name in cloud.point_format.dimension_names if name not in ("X", "Y", "Z")]
+    return zip(*(cloud[name] for name in ("x", "y", "z", *names)), strict=True)
 
 
 def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
@@ -171,17 +233,21 @@ def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path)
         assert [path.name for path in voxels.iterdir()] == [there]
 
 
-def test_tiles_of_two_maps_are_no_table(wall, tmp_path) -> None:
-    for name, size in (("a", 8), ("b", 16)):
-        semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=size), out=tmp_path / name)
-    a, b = (tmp_path / name / "voxels" / "wall__a__numba" for name in "ab")
-    assert sum(map(len, VoxelTable.iter_tiles(a))) == len(VoxelTable.load(b)) == 222
-    measured = VoxelTable.columns(a, ["vss", "ix"])
-    np.testing.assert_array_equal(measured["ix"], VoxelTable.load(b).ix)
-    foreign = next(b.glob("tile=2_*.parquet"))
-    (a / foreign.name.replace("tile=2_", "tile=9_")).write_bytes(foreign.read_bytes())
-    with pytest.raises(DataError, match=r"tile=9_.* is a tile of another map than .*; remove it"):
-        VoxelTable.load(a)
+def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
+    tiles = tmp_path / "tiles"
+    shutil.copytree(both[1] / "voxels" / "wall__a__numba", tiles)
+    table = VoxelTable.load(tiles)
+    assert sum(map(len, VoxelTable.iter_tiles(tiles))) == len(table) == 222
+    np.testing.assert_array_equal(VoxelTable.columns(tiles, ["vss", "ix"])["vss"], semstab.metrics.vss(table))
+    some = next(VoxelTable.iter_tiles(tiles))
+    some.save(tiles / "tile=9_9.parquet", tile=Tile(9, 9, 8, "another"))
+    with pytest.raises(DataError, match=r"tile=9_9.* is a tile of another map than .*; remove it"):
+        VoxelTable.load(tiles)
+    (tiles / "tile=9_9.parquet").unlink()
+    first = next(tiles.iterdir())
+    first.rename(tiles / "tile=9_9.parquet")
+    with pytest.raises(DataError, match=r"tile=9_9.*: holds tile .*; it was renamed"):
+        VoxelTable.load(tiles)
     with pytest.raises(DataError, match="a folder without tiles"):
         VoxelTable.load(tmp_path)
 
@@ -233,12 +299,10 @@ def test_parts_are_rectangles_within_the_budget_that_share_nothing() -> None:
     assert tiled(sights, lambda voxels, observations: voxels, 1600).size == 128  # four parts a budget, at most
 
 
-def test_other_programs_read_the_tiles_as_one_table(wall, tmp_path) -> None:
+def test_other_programs_read_the_tiles_as_one_table(both) -> None:
     """The queries of docs/large-scenes.md."""
-    from pyarrow import dataset
-
-    run = semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=8), out=tmp_path / "run")
-    table, folder = run.records[0].table(), tmp_path / "run" / "voxels" / "wall__a__numba"
+    folder = both[1] / "voxels" / "wall__a__numba"
+    table = VoxelTable.load(folder)
     expected = {
         k: float(semstab.metrics.vss(table)[(table.op >= 3) & (semstab.metrics.dominant(table) == k)].mean())
         for k in range(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numba
 import numpy as np
@@ -100,6 +101,25 @@ def test_the_largest_evidence_of_a_dense_row_is_the_lowest_on_ties() -> None:
     backend = backends.create("numba", voxel_size=0.3, num_classes=8)
     backend.integrate(flat)
     assert np.array_equal(backend.changes.after, np.zeros(len(backend)))
+
+
+@pytest.mark.parametrize("K", [7, 150])
+def test_a_map_of_scores_takes_what_is_expected(K) -> None:
+    """Within a factor of three; the frame's own work space, which does not grow with the map, is left out."""
+    rng = np.random.default_rng(7)
+    backend = backends.create("numba", voxel_size=0.02, num_classes=K)
+    frame = soft_frame(rng, 0, K, "float16", (60, 200))
+    frame = dataclasses.replace(frame, scores=np.nan_to_num(frame.scores))
+    backend.integrate(frame)
+    tracemalloc.start()
+    for index in range(1, 4):
+        pose = np.array(frame.T_wc)
+        pose[0, 3] += 10.0 * index
+        voxels = backend.integrate(dataclasses.replace(frame, index=index, T_wc=pose)).map_voxels
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert voxels > 15_000
+    assert held / 3 < backends.expected_bytes("numba", voxels, voxels, K, soft=True) < 3 * held
 
 
 @serial

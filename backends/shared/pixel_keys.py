@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.backends.shared.keys import HALF
 from semstab.runtime.compiled import compiled, serial
+
+Float64 = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating]
 
 BLOCK = 256
 """Pixels whose keys are computed again where one of them is in doubt."""
@@ -101,7 +105,7 @@ def columns_of(within, origin):
     return np.clip(edges, 0, 2 * HALF).astype(np.int64)
 
 
-def frame_terms(ray_x, T, size):
+def frame_terms(ray_x: Floats, T: Float64, size: float) -> tuple[Float64, float]:
     """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of `keys_fused`.
 
     The margin bounds what rounding can move a point by, voxels. Of a point within reach no term is above

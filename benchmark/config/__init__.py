@@ -127,6 +127,9 @@ class Config(Settings):
         description="edge of a voxel, metres; where it is not given, what `check` suggests for data of files",
     )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
+    top_k: int | None = Field(
+        None, ge=1, description="fuse the so many largest scores of each pixel; null: all, without loss"
+    )
     frames: FrameSelection = FrameSelection()
     scene_frames: dict[str, FrameSelection] = Field(
         default_factory=dict, description="frames of single scenes, instead of `frames`"

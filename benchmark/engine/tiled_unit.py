@@ -66,7 +66,7 @@ class TiledUnit:
     def _assembled(self) -> Outcome:
         identity = self.planned.identity
         frames = self._there["frames"]
-        parts = [found for name, found in self._there.items() if name != "frames"]
+        parts = [self._there[name] for name in self._requests if name != "frames"]  # sums do not hang on who was first
         try:
             return Outcome(identity, assembled(self.planned, frames, parts, self._folder.path))
         except SemstabError as error:

@@ -34,7 +34,7 @@ from semstab.task import Task, applies, frame_indices, selected, tasks_of
 FORMAT = 4
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
-IN_KEYS = ("voxel_size", "pixel_stride", "exclude", "perturbation", "strata", "statistics", "critical_classes")
+IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes")
 """Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
 the input, frames, classes, the backend."""
 

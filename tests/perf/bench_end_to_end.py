@@ -2,20 +2,23 @@
 
     python tests/perf/bench_end_to_end.py --backend open3d --json end_to_end.json
 
-The folder is made once a noise level: views of the built-in city, rendered at half the size and scaled up (depth
-linearly, labels to the nearest), 16-bit depth with Gaussian noise of so many mm, as sensors have it, and 8-bit labels.
-Noise 0 compresses best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page
-cache, and are bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured
-start compiles what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop`
-is what manifest.json says of reading, flicker, fusion and observers.
+A folder is made for each kind of depth and noise level: views of the built-in city, rendered at half the size and
+scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as
+16-bit PNGs or as .npy in metres, and 8-bit labels. A bare read of .npy looks at each value once. Noise 0 compresses
+best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page cache, and are
+bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured start compiles
+what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop` is what
+manifest.json says of reading, flicker, fusion and observers.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import platform
+import shutil
 import statistics
 import subprocess
 import sys
@@ -44,11 +47,12 @@ def main() -> None:
     results = []
     with tempfile.TemporaryDirectory() as folder:
         views = rendered(width, height, arguments.frames)
-        for noise in arguments.noise:
-            root = Path(folder) / f"noise{noise:g}"
-            write_scene(root, views, (width, height), noise)
+        for depth, noise in itertools.product(arguments.depth, arguments.noise):
+            root = Path(folder) / f"{depth}{noise:g}"
+            write_scene(root, views, (width, height), noise, depth)
             for backend in arguments.backend:
-                results.append({"noise_mm": noise, **measured(root, backend, arguments)})
+                results.append({"depth": depth, "noise_mm": noise, **measured(root, backend, arguments)})
+            shutil.rmtree(root)
     report = {
         "command": " ".join(["python", *sys.argv]),
         "machine": f"{platform.processor() or platform.machine()}, {arguments.threads} cores",
@@ -66,7 +70,10 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--backend", nargs="+", default=["numba"])
     parser.add_argument("--size", default="3840x2160")
     parser.add_argument("--frames", type=int, default=24)
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 10.0], help="of the depth, mm")
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 10.0, 50.0], help="of the depth, mm")
+    parser.add_argument(
+        "--depth", nargs="+", default=["png"], choices=["png", "npy"], help="16-bit PNG, or float32 metres"
+    )
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2, help="cores for both sides, and decoding threads")
     parser.add_argument("--json", type=Path)
@@ -82,7 +89,7 @@ def rendered(width: int, height: int, frames: int) -> list[Any]:
     return [scene.frame(index, "sim-flicker") for index in range(frames)]
 
 
-def write_scene(root: Path, views: list[Any], size: tuple[int, int], noise: float) -> None:
+def write_scene(root: Path, views: list[Any], size: tuple[int, int], noise: float, kind: str) -> None:
     for part in ("depth", "pose", "labels/net"):
         (root / part).mkdir(parents=True)
     (root / "scene.yaml").write_text(f"taxonomy: uavid8\ndepth_scale: {DEPTH_SCALE}\n", encoding="utf-8")
@@ -93,8 +100,11 @@ def write_scene(root: Path, views: list[Any], size: tuple[int, int], noise: floa
         depth = cv2.resize(view.depth, size, interpolation=cv2.INTER_LINEAR).astype(np.float64)
         depth += (depth > 0) * rng.normal(0, noise / 1000, depth.shape)
         name = f"{view.index:04d}"
-        units = np.clip(np.round(depth * DEPTH_SCALE), 0, 65535).astype(np.uint16)
-        cv2.imwrite(str(root / "depth" / f"{name}.png"), units)
+        if kind == "npy":
+            np.save(root / "depth" / f"{name}.npy", depth.astype(np.float32))
+        else:
+            units = np.clip(np.round(depth * DEPTH_SCALE), 0, 65535).astype(np.uint16)
+            cv2.imwrite(str(root / "depth" / f"{name}.png"), units)
         labels = cv2.resize(view.labels, size, interpolation=cv2.INTER_NEAREST)
         cv2.imwrite(str(root / "labels/net" / f"{name}.png"), labels)
         np.savetxt(root / "pose" / f"{name}.txt", view.T_wc)
@@ -104,7 +114,7 @@ def write_scene(root: Path, views: list[Any], size: tuple[int, int], noise: floa
 
 
 def measured(root: Path, backend: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    files = sorted([*root.glob("depth/*.png"), *root.glob("labels/net/*.png")], key=lambda path: path.stem)
+    files = sorted([*root.glob("depth/*"), *root.glob("labels/net/*.png")], key=lambda path: path.stem)
     run_command(root, backend, arguments.threads)
     runs, bare = [], []
     for _ in range(arguments.runs):
@@ -128,7 +138,10 @@ def measured(root: Path, backend: str, arguments: argparse.Namespace) -> dict[st
 
 def decode_all(files: list[Path], threads: int) -> None:
     def decode(path: Path) -> None:
-        assert cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) is not None
+        if path.suffix == ".npy":
+            assert np.load(path).max() > 0  # to have read it
+        else:
+            assert cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) is not None
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(decode, files))
@@ -161,12 +174,23 @@ def print_report(report: dict[str, Any]) -> None:
     console = Console(width=120)
     table = Table(title=f"end to end, {report['size']}, {report['frames']} frames, {report['machine']}")
     stages = Table(title="mean ms a frame by stage (decode: in the workers, beside the rest)")
-    for name in ("backend", "noise mm", "MB", "bare decode ms", "loop ms", "ratio", "whole s", "start s", "results s"):
+    for name in (
+        "backend",
+        "depth",
+        "noise mm",
+        "MB",
+        "bare decode ms",
+        "loop ms",
+        "ratio",
+        "whole s",
+        "start s",
+        "results s",
+    ):
         table.add_column(name, justify="right")
-    for name in ("backend", "noise mm", *report["results"][0]["stages_ms"]):
+    for name in ("backend", "depth", "noise mm", *report["results"][0]["stages_ms"]):
         stages.add_column(name, justify="right")
     for row in report["results"]:
-        lead = (row["backend"], f"{row['noise_mm']:g}")
+        lead = (row["backend"], row["depth"], f"{row['noise_mm']:g}")
         spent = row["seconds"]
         table.add_row(
             *lead, f"{row['megabytes_a_frame']:.1f}", f"{row['bare_decode_ms']:.1f}", f"{row['loop_ms']:.1f}",

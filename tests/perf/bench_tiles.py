@@ -5,7 +5,7 @@
 A flight goes to and fro over a field, in legs 40 m apart, with a frame every 30 m: a frame adds about 30,000 voxels of
 0.2 m. It is written as a posed folder and run without report and recording. Peak is resident memory of the command,
 with `--jobs` of its largest process; CPU time is user and system, of all processes. All columns of both maps are
-compared bit by bit, their summaries to 1e-12.
+compared bit by bit, their summaries to 1e-12, ends of intervals (which rest on numerical derivatives) to 1e-9.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from compare_summaries import differences  # noqa: E402
 from posed_writer import write_posed  # noqa: E402
 
 WIDTH, HEIGHT, K = 640, 480, 7
+ENDS = (".low", ".high", ".p_value", "voxels_file")
 LEG, BESIDE, STEP = 10, 40.0, 30.0
 COLUMNS = ("ix", "iy", "iz", "op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum",
            "vss", "sbd", "entropy", "margin", "label")  # fmt: skip
@@ -75,8 +76,9 @@ def same(whole: Path, tiles: Path) -> bool:
     if any(not np.array_equal(a, b) for a, b in zip(evidence[0].entries, evidence[1].entries, strict=True)):
         print("evidence differs")
         return False
-    summaries = (json.loads((run / "summary.json").read_text()) for run in (whole, tiles))
-    found = [line for line in differences(*summaries, tolerance=1e-12) if "voxels_file" not in line]
+    summaries = [json.loads((run / "summary.json").read_text()) for run in (whole, tiles)]
+    found = [line for line in differences(*summaries, tolerance=1e-12) if not line.partition(":")[0].endswith(ENDS)]
+    found += [line for line in differences(*summaries, tolerance=1e-9) if "voxels_file" not in line]
     print(*found, sep="\n", end="\n" if found else "")
     return not found
 

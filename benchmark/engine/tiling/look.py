@@ -6,52 +6,48 @@ import numpy as np
 
 from semstab.backends.shared.hashing import mix
 from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.pixel_keys import keys_of_row
 from semstab.runtime.compiled import serial
 
 RECENT = 64
 """Cells that are remembered, so that hardly any is named twice."""
 
+NO_ROOM, LOST = -1, -2
+"""Instead of a number of cells."""
+
 
 @serial
-def look(depth, ray_x, ray_y, T, size, origin, shift, share, cells, keys, drawn):
+def look(depth, labels, ray_x, ray_y, T, size, origin, rays, margin, shift, share, row, cells, keys, drawn):
     """Cells and sampled voxels of the pixels with depth, in order of appearance, some of them more than once.
 
     A cell is 2^shift by 2^shift columns, packed into 64 bits; a voxel is in the sample where its hash is below `share`.
-    The order of operations is the protocol's, so that no pixel falls into another voxel here than when it is fused.
-    Returns how many cells and voxels there are; -1 where there is no room for them, or an index is beyond 32 bits (-2).
+    Pixels become voxels by the very loop that fuses them; labels (W,) say that all count.
+    Returns how many cells and voxels there are: NO_ROOM for them, or LOST where a pixel is out of the keys' reach.
     """
     n, m = np.int64(0), np.int64(0)
     recent = np.full(RECENT, np.int64(-1) << np.int64(62))
-    q, before = np.empty(3), np.full(3, np.nan)
+    before, mask = np.int64(-1), np.int64(2 * HALF - 1)
+    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
     for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            z = np.float64(depth[v, u])
-            if not (z > 0.0 and z < np.inf):
+        if keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 255, rays, margin, row):
+            return np.int64(LOST), m
+        for u in range(row.shape[0]):
+            key = row[u]
+            if key == before or key < 0:
                 continue
-            x, y = ray_x[u] * z, ray_y[v] * z
-            for i in range(3):
-                q[i] = np.floor((((T[i, 0] * x + T[i, 1] * y) + T[i, 2] * z) + T[i, 3]) / size)
-            if q[0] == before[0] and q[1] == before[1] and q[2] == before[2]:
-                continue
-            before[:] = q
-            if np.abs(q).max() >= 2147483648.0:
-                return np.int64(-2), m
-            cell = ((np.int64(q[0]) >> shift) << np.int64(32)) | ((np.int64(q[1]) >> shift) & np.int64(0xFFFFFFFF))
+            before = key
+            ix, iy = (key >> 42) - HALF + origin[0], ((key >> 21) & mask) - HALF + origin[1]
+            cell = ((ix >> shift) << np.int64(32)) | ((iy >> shift) & np.int64(0xFFFFFFFF))
             at = np.int64(mix(cell) >> np.uint64(58))
             if recent[at] != cell:
                 if n == cells.shape[0]:
-                    return np.int64(-1), m
+                    return np.int64(NO_ROOM), m
                 recent[at] = cells[n] = cell
                 n += 1
-            key, inside = np.int64(0), True
-            for i in range(3):
-                k = np.int64(q[i]) - origin[i] + HALF
-                inside = inside and k >= 0 and k < 2 * HALF
-                key = (key << np.int64(21)) | k
             hashed = mix(key) >> np.uint64(32)
-            if inside and hashed < share:
+            if hashed < share:
                 if m == keys.shape[0]:
-                    return np.int64(-1), m
+                    return np.int64(NO_ROOM), m
                 keys[m], drawn[m] = key, hashed
                 m += 1
     return n, m

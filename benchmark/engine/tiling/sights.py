@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.association import back_project, check_depth, voxel_index
-from semstab.backends.shared.keys import index_of_keys
-from semstab.engine.tiling.look import look
-from semstab.errors import DataError
+from semstab.backends.shared.association import check_depth
+from semstab.backends.shared.keys import index_of_keys, out_of_reach
+from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.pixels.perturbation import perturb
@@ -89,7 +89,7 @@ def look_at(
 ) -> Sights:
     """What the frames of a task see, by cells of that edge in voxels, or wider ones.
 
-    Raises DataError where a frame cannot be read, or has no finite depth.
+    Raises DataError where a frame cannot be read, has no finite depth, or reaches too far for a map.
     """
     origin = _origin(task, voxel_size)
 
@@ -130,17 +130,18 @@ def _look(frame: Frame, voxel_size: float, origin: Int64, size: int) -> _Seen:
     H, W = frame.shape
     camera = frame.intrinsics
     ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
+    rays, margin = frame_terms(ray_x, frame.T_wc, voxel_size)
+    everything, row = np.zeros(W, np.uint8), np.empty(W, np.int64)
     room = min(H * W, 1 << 14)
     while True:
         cells, keys, drawn = (np.empty(room, np.int64) for _ in range(3))
         n, m = look(
-            fixed(frame.depth), ray_x, ray_y, fixed(frame.T_wc), voxel_size, origin, size.bit_length() - 1, SHARE,
-            cells, keys, drawn,
+            fixed(frame.depth), everything, ray_x, ray_y, fixed(frame.T_wc), voxel_size, origin, rays, margin,
+            size.bit_length() - 1, SHARE, row, cells, keys, drawn,
         )  # fmt: skip
-        if n == -2:
-            voxel_index(back_project(frame), voxel_size, frame)
-            raise DataError(f"{frame.where('depth')}: depth beyond 2^31 voxels; leave it out, or use larger voxels")
-        if n >= 0:
+        if n == LOST:
+            raise out_of_reach(frame, origin, voxel_size)
+        if n != NO_ROOM:
             break
         room = min(H * W, 8 * room)
     packed = np.unique(cells[:n])

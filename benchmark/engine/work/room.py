@@ -70,4 +70,5 @@ def end_bytes(one: UnitMap) -> int:
 
 def _bytes(one: UnitMap) -> int:
     (backend,) = one.task.backends
-    return expected_bytes(backend, one.rows[-1].report.map_voxels, one.observations, len(one.task.mapping.target))
+    K, voxels = len(one.task.mapping.target), one.rows[-1].report.map_voxels
+    return expected_bytes(backend, voxels, one.observations, K, soft=one.soft)

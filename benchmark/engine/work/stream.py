@@ -153,8 +153,8 @@ def streams_of(maps: Iterable[UnitMap]) -> list[Stream]:
     groups: dict[Any, list[UnitMap]] = {}
     for one in maps:
         config = one.request.config
-        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, tuple(one.task.indices))
-        groups.setdefault(same, []).append(one)
+        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
+        groups.setdefault((*same, tuple(one.task.indices)), []).append(one)
     return [Stream(group) for group in groups.values()]
 
 

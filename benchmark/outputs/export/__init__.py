@@ -13,7 +13,7 @@ from semstab.errors import ConfigError
 from semstab.outputs.export import las, mesh, ply, raster, tabular
 from semstab.outputs.export.onto import MEASURES as ONTO_MEASURES
 from semstab.outputs.export.onto import classify
-from semstab.outputs.export.voxels import Voxels, crs_name, voxels_of
+from semstab.outputs.export.voxels import Voxels, crs_name, iter_voxels, voxels_of
 from semstab.statistics.commit import Commit
 
 __all__ = ["SUFFIXES", "Exported", "export"]
@@ -39,16 +39,23 @@ class Settings:
 Writer = Callable[[Voxels, Path, Settings], None]
 
 WRITERS: Mapping[str, Writer] = {
-    ".ply": lambda voxels, path, settings: ply.write(voxels, path),
-    ".las": lambda voxels, path, settings: las.write(voxels, path, settings.asprs),
-    ".laz": lambda voxels, path, settings: las.write(voxels, path, settings.asprs),
     ".tif": lambda voxels, path, settings: raster.write(voxels, path, settings.cell),
     ".glb": lambda voxels, path, settings: mesh.write(voxels, path),
-    ".parquet": lambda voxels, path, settings: tabular.write_parquet(voxels, path),
-    ".csv": lambda voxels, path, settings: tabular.write_csv(voxels, path),
 }
+"""Of formats that are made of a whole map."""
 
-SUFFIXES = tuple(WRITERS)
+Parts = Callable[[], Iterator[Voxels]]
+
+STREAMS: Mapping[str, Callable[[Parts, Path, Settings], int]] = {
+    ".ply": lambda parts, path, settings: ply.write(parts(), path, sum(len(part.table) for part in parts())),
+    ".las": lambda parts, path, settings: las.write(parts(), path, settings.asprs),
+    ".laz": lambda parts, path, settings: las.write(parts(), path, settings.asprs),
+    ".parquet": lambda parts, path, settings: tabular.write_parquet(parts(), path),
+    ".csv": lambda parts, path, settings: tabular.write_csv(parts(), path),
+}
+"""Of formats that take a map tile by tile; each says how many voxels it wrote."""
+
+SUFFIXES = (".ply", ".las", ".laz", ".tif", ".glb", ".parquet", ".csv")
 
 
 def export(
@@ -82,7 +89,7 @@ def export(
     """
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
-        if file.suffix.lower() not in WRITERS:
+        if file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
@@ -95,17 +102,34 @@ def export(
 
     if onto is not None:
         return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]
+
+    def parts() -> Iterator[Voxels]:
+        if record.in_tiles:
+            return iter_voxels(result, record, columns=measures, min_op=min_op, classes=classes, commit=thresholds)
+        return iter([chosen(None)])
+
     return [
-        _written(chosen(raster.MEASURES if file.suffix.lower() == ".tif" else None), file, settings) for file in files
+        _streamed(parts, file, settings)
+        if file.suffix.lower() in STREAMS
+        else _written(chosen(raster.MEASURES if file.suffix.lower() == ".tif" else None), file, settings)
+        for file in files
     ]
 
 
+def _streamed(parts: Parts, file: Path, settings: Settings) -> Exported:
+    written = STREAMS[file.suffix.lower()](parts, file, settings)
+    return _exported(next(parts()), written, file, settings)
+
+
 def _written(voxels: Voxels, file: Path, settings: Settings) -> Exported:
-    kind = file.suffix.lower()
-    WRITERS[kind](voxels, file, settings)
+    WRITERS[file.suffix.lower()](voxels, file, settings)
+    return _exported(voxels, len(voxels.table), file, settings)
+
+
+def _exported(some: Voxels, voxels: int, file: Path, settings: Settings) -> Exported:
     where = "coordinates of the scene, which has no georeference"
-    where = where if voxels.georeference is None else crs_name(voxels.georeference)
-    return Exported(file, f"{len(voxels.table):,} voxels, {where}", tuple(_remarks(voxels, kind, settings)))
+    where = where if some.georeference is None else crs_name(some.georeference)
+    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_remarks(some, file.suffix.lower(), settings)))
 
 
 def _classified(voxels: Voxels, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:

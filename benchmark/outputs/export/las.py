@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.resources
+import itertools
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -32,26 +33,47 @@ FORMAT = 7
 FIRST_OF_1_4 = 6
 
 
-def write(voxels: Voxels, path: Path, asprs: Path | None = None) -> None:
-    """The voxels' centres, to the millimetre; raises MissingDependencyError, and ConfigError for a table of codes."""
-    las = library(path)
-    points = voxels.points
+def write(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) -> int:
+    """The voxels' centres, to the millimetre, part after part; how many there are.
+
+    Raises MissingDependencyError, and ConfigError for a table of codes.
+    """
+    las, left = library(path), iter(parts)
+    first = next(left)
+    header, written = _header(first), 0
+    compress = path.suffix.lower() == ".laz"
+    with (
+        atomic_path(path) as temporary,
+        las.open(str(temporary), mode="w", header=header, do_compress=compress) as cloud,
+    ):
+        for voxels in itertools.chain([first], left):
+            cloud.write_points(_points(voxels, header, asprs))
+            written += len(voxels.table)
+    return written
+
+
+def _header(voxels: Voxels) -> laspy.LasHeader:
+    """Of a cloud that begins with these voxels."""
+    las = library(Path("header"))
     header = las.LasHeader(point_format=FORMAT, version="1.4")
     header.scales = np.full(3, MILLIMETRE)
-    header.offsets = np.floor(points.min(axis=0))
+    header.offsets = np.floor(voxels.points.min(axis=0))
     declare(header, "class", voxels.classified.dtype, "1 to K; 0 unclassified")
     for name, column in voxels.columns.items():
         declare_column(header, name, column)
     describe(header, voxels)
-    cloud = las.LasData(header)
-    cloud.x, cloud.y, cloud.z = points.T
-    cloud.red, cloud.green, cloud.blue = (voxels.colors[voxels.classified - 1].astype(np.uint16) * 257).T
-    cloud.classification = codes(voxels, asprs)[voxels.classified]
-    cloud["class"] = voxels.classified
+    return header
+
+
+def _points(voxels: Voxels, header: laspy.LasHeader, asprs: Path | None) -> laspy.ScaleAwarePointRecord:
+    points = library(Path("points")).ScaleAwarePointRecord.zeros(len(voxels.table), header=header)
+    points.x, points.y, points.z = voxels.points.T
+    points.red, points.green, points.blue = (voxels.colors[voxels.classified - 1].astype(np.uint16) * 257).T
+    points.classification = codes(voxels, asprs)[voxels.classified]
+    points["class"] = voxels.classified
     for name, column in voxels.columns.items():
-        cloud[name] = as_stored(column.values)
-    with atomic_path(path) as temporary:
-        cloud.write(str(temporary), do_compress=path.suffix.lower() == ".laz")
+        points[name] = as_stored(column.values)
+    return points
 
 
 def library(path: Path) -> Any:

@@ -87,8 +87,20 @@ class Header:
         return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def write(voxels: Voxels, path: Path) -> None:
-    """The voxels' centres with colour, class and measures; which class is which stands in comments."""
+def write(parts: Iterable[Voxels], path: Path, voxels: int) -> int:
+    """The centres of so many voxels with colour, class and measures; which class is which stands in comments."""
+    written = 0
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        for part in parts:
+            rows = _rows(part)
+            if not written:
+                file.write(Header(rows.dtype, voxels, 0, tuple(legend(part))).text())
+            file.write(rows.tobytes())
+            written += len(rows)
+    return written
+
+
+def _rows(voxels: Voxels) -> npt.NDArray[np.void]:
     red, green, blue = voxels.colors[voxels.classified - 1].T
     x, y, z = voxels.points.T
     columns = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue, "class": voxels.classified}
@@ -97,9 +109,7 @@ def write(voxels: Voxels, path: Path) -> None:
     rows = np.empty(len(voxels.table), dtype)
     for name, values in columns.items():
         rows[name] = values
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(Header(dtype, len(rows), 0, tuple(legend(voxels))).text())
-        file.write(rows.tobytes())
+    return rows
 
 
 def legend(voxels: Voxels) -> Iterable[str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from semstab.metrics import CATEGORIES
 from semstab.outputs.export.voxels import Voxels
@@ -14,10 +16,33 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-def write_parquet(voxels: Voxels, path: Path) -> None:
-    """Columns, and in the metadata entry 'semstab' what they mean; what is undefined is null."""
+def write_parquet(parts: Iterable[Voxels], path: Path) -> int:
+    """Columns, part after part, and in the metadata entry 'semstab' what they mean; what is undefined is null."""
     import pyarrow.parquet as pq
 
+    return _written(parts, path, lambda file, schema: pq.ParquetWriter(file, schema, compression="zstd"))
+
+
+def write_csv(parts: Iterable[Voxels], path: Path) -> int:
+    """Columns, part after part; what is undefined is an empty field."""
+    from pyarrow import csv
+
+    return _written(parts, path, csv.CSVWriter)
+
+
+def _written(parts: Iterable[Voxels], path: Path, opened: Callable[[Path, pa.Schema], Any]) -> int:
+    """How many voxels went into the file that a writer of Arrow opens."""
+    voxels, writer = 0, None
+    with atomic_path(path) as temporary, ExitStack() as open_files:
+        for part in parts:
+            table = arrow(part).replace_schema_metadata(_about(part))
+            writer = writer or open_files.enter_context(opened(temporary, table.schema))
+            writer.write_table(table)
+            voxels += len(part.table)
+    return voxels
+
+
+def _about(voxels: Voxels) -> dict[str, str]:
     about = {
         "voxel_size": voxels.table.voxel_size,
         "crs": None if voxels.georeference is None else voxels.georeference.crs,
@@ -25,17 +50,7 @@ def write_parquet(voxels: Voxels, path: Path) -> None:
         "classes": list(voxels.classes),
         "units": {name: column.unit for name, column in voxels.columns.items() if column.unit},
     }
-    table = arrow(voxels).replace_schema_metadata({"semstab": json.dumps(about)})
-    with atomic_path(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
-
-
-def write_csv(voxels: Voxels, path: Path) -> None:
-    """Columns; what is undefined is an empty field."""
-    from pyarrow import csv
-
-    with atomic_path(path) as temporary:
-        csv.write_csv(arrow(voxels), temporary)
+    return {"semstab": json.dumps(about)}
 
 
 def arrow(voxels: Voxels) -> pa.Table:

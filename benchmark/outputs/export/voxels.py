@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,17 +95,62 @@ def voxels_of(
     if record.voxels_file is None:
         raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
     table = record.table()
+    found = _chosen(result, record, table, record.voxels_file, columns, min_op, classes, commit)
+    if not len(found.table):
+        raise _none_left(record, min_op, classes, commit, int(table.op.max(initial=0)))
+    return found
+
+
+def iter_voxels(
+    result: Result,
+    record: Record,
+    *,
+    columns: Sequence[str] | None = None,
+    min_op: int = 1,
+    classes: Sequence[str] = (),
+    commit: Commit | None = None,
+) -> Iterator[Voxels]:
+    """Those of `voxels_of` tile by tile, where the map is in tiles; a tile without any is left out."""
+    if not record.in_tiles or record.voxels_file is None:
+        yield voxels_of(result, record, columns=columns, min_op=min_op, classes=classes, commit=commit)
+        return
+    left, highest = False, 0
+    for file in parquet.files_of(record.voxels_file):
+        table = VoxelTable.load(file)
+        highest = max(highest, int(table.op.max(initial=0)))
+        found = _chosen(result, record, table, file, columns, min_op, classes, commit)
+        left = left or len(found.table) > 0
+        if len(found.table):
+            yield found
+    if not left:
+        raise _none_left(record, min_op, classes, commit, highest)
+
+
+def _none_left(record: Record, min_op: int, classes: Sequence[str], commit: Commit | None, highest: int) -> ConfigError:
+    limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
+    limits += " and the evidence that --commit asks for" if commit is not None else ""
+    return ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {highest}")
+
+
+def _chosen(
+    result: Result,
+    record: Record,
+    table: VoxelTable,
+    file: Path,
+    columns: Sequence[str] | None,
+    min_op: int,
+    classes: Sequence[str],
+    commit: Commit | None,
+) -> Voxels:
+    """Of a table, which is in a file."""
+    assert record.voxels_file is not None
     names = table.classes or tuple(str(k) for k in range(table.K))
     keep = table.op >= min_op
     if classes:
         keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
     if commit is not None:
         keep &= commit.decide(table) >= 0
-    if not keep.any():
-        limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
-        limits += " and the evidence that --commit asks for" if commit is not None else ""
-        raise ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {int(table.op.max(initial=0))}")
-    chosen = {name: _column(name, table, record.voxels_file) for name in columns or usual()}
+    chosen = {name: _column(name, table, file) for name in columns or usual()}
     scene, backbone = record.unit.scene, record.unit.backbone
     georeference = result.georeference.get(scene)
     return Voxels(
