@@ -28,6 +28,7 @@ LEAST = 8
 """Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
 
 AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
+NOTHING = "it has no value: nothing that it is of was seen twice"
 UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
 FEW = "{frames} frames are too few: fly {least} or more"
 
@@ -97,6 +98,8 @@ def of_frames(found: Interval, frames: int) -> Interval:
     reasons = [reason for reason in found.undecided.split("; ") if reason and reason != few]
     if not reasons and found.question == NEXT_FLIGHT and found.degrees < LEAST_DEGREES:
         reasons.append(AS_LONG)
+    if math.isnan(found.value):
+        reasons.append(NOTHING)
     if frames < LEAST:
         reasons.append(FEW.format(frames=frames, least=LEAST) if frames else UNKNOWN_FRAMES)
     return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))

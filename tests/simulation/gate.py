@@ -1,6 +1,6 @@
 """How often does a gate err, and how much does it take to be decided?
 
-    python tests/simulation/gate.py [--trials 200] [--seed 0] [--only TEXT]
+    python tests/simulation/gate.py [--trials 200] [--seed 0] [--only TEXT] [--frames random|fixed]
 
 Two models on the same frames of the same scene; scenes, frames and errors are drawn anew for each trial. Prints a table
 in Markdown of the rule 'alpha drop < margin' at the 5 % level: without a difference, which must not fail, and with a
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 from flights import Flight, World, fly, sums_of, world
 
-from semstab.gating.judging import change, negative, verdict
+from semstab.gating.judging import Frames, change, negative, verdict
 from semstab.gating.rules import parse
 from semstab.model.statistics import Interval
 from semstab.statistics.sampling import InfluenceSums
@@ -56,7 +56,7 @@ def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[Influen
     return found
 
 
-def rates(flight: Flight, same: bool, trials: int, seed: int) -> list[float]:
+def rates(flight: Flight, same: bool, trials: int, seed: int, frames: Frames = "random") -> list[float]:
     """The margin, then shares of trials: without a difference failed, passed; with it passed, failed, undecided."""
     found: list[list[Interval]] = []
     totals = np.zeros((len(EASES), 3 + 2))
@@ -64,7 +64,7 @@ def rates(flight: Flight, same: bool, trials: int, seed: int) -> list[float]:
         rng = np.random.default_rng([seed, trial])
         base, *new = own = models(flight, same, rng)
         totals += [each.of(FUNCTIONALS["alpha"].names).sum(axis=0) for each in own]
-        found.append([change(each, base, ALPHA, None, LEVEL) for each in new])
+        found.append([change(each, base, ALPHA, None, LEVEL, frames) for each in new])
     alphas = FUNCTIONALS["alpha"].of(totals)
     margin = float(alphas[0] - alphas[2])
     rule = dataclasses.replace(parse("alpha drop < 0.02"), limit=margin)
@@ -84,12 +84,13 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="")
+    parser.add_argument("--frames", choices=["random", "fixed"], default="random")
     arguments = parser.parse_args()
     print("|", " | ".join(HEAD), "|")
     print("|", " | ".join("---" for _ in HEAD), "|")
     for name, flight, same in conditions():
         if arguments.only in name:
-            row = rates(flight, same, arguments.trials, arguments.seed)
+            row = rates(flight, same, arguments.trials, arguments.seed, arguments.frames)
             print("|", " | ".join([name, *(f"{x:.3f}" for x in row)]), "|", flush=True)
 
 
