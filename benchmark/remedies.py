@@ -41,15 +41,19 @@ def remedies_config(
     predictors = [*models, *(PredictorConfig(backbone=STORED, options={"source": name}) for name in names)]
     config, _ = with_voxel_size(config)
     shipped = load_study(STUDY).dataset.options["remedies"]
-    grid = ["+".join(str(parse(text)) for text in chain.split("+")) for chain in filters] or [
-        f"map-prior:{config.voxel_size:g}" if "map-prior" in text else text for text in shipped
-    ]
+    grid = [_in_voxels(text, config.voxel_size) for text in filters or shipped]
     able, left_out = _able(grid, predictors, scene)
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "backbones": None})
     more = {"remedies": able, "kept": None if kept is None else str(kept)}
     dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, **more}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
+
+
+def _in_voxels(chain: str, size: float) -> str:
+    """A chain with the numbers of its filters; the map prior has the run's voxels where none is said."""
+    texts = (f"map-prior:{size:g}" if text == "map-prior" else text for text in chain.split("+"))
+    return "+".join(str(parse(text)) for text in texts)
 
 
 def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Scene) -> tuple[list[str], list[str]]:

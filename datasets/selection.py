@@ -65,7 +65,8 @@ def select_frames(
 def _tell_missing(scene: Scene, paths: list[str], complete: int, selected: int, needs: Sequence[str]) -> None:
     where = str(scene.folder or scene.name)
     if not scene.skips_incomplete:
-        raise DataError(f"{where}: {listed(paths, where)}; add them, or set incomplete: skip to leave such frames out")
+        skip = "set incomplete: skip (--option incomplete=skip) to leave such frames out"
+        raise DataError(f"{where}: {listed(paths, where)}; add them, or {skip}")
     if not complete:
         raise DataError(
             f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths, where)})"

@@ -10,11 +10,14 @@ import pytest
 from posed_config import dataset_of
 from typer.testing import CliRunner
 
+from semstab.backbones import Backbone, Prediction
 from semstab.cli import app
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
+from semstab.model.labels import LabelSpace
 from semstab.predict.filters import REGISTRY, parse
+from semstab.predict.kept import Kept
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import filtered_config, predicted_config, resolve
@@ -135,6 +138,33 @@ def test_labels_that_change_on_disk_are_filtered_again(scene):
 
     Image.fromarray(np.zeros((48, 80), np.uint8)).save(scene / "labels/noisy/000.png")
     assert live(filtered_config(["ema:0.6"], None, config))[1] != before
+
+
+def test_what_is_kept_on_disk_is_asked_once(tmp_path):
+    class Counted(Backbone):
+        label_space = LabelSpace("two", ("a", "b"))
+        gives_scores = True
+        asked = 0
+
+        def predict(self, images, *, scores=False):
+            self.asked += len(images)
+            half = np.full((*images[0].shape[:2], 2), 0.5, np.float32)
+            return [Prediction(image[..., 0] % 2, half if scores else None) for image in images]
+
+        def identity(self):
+            return {"counted": 1}
+
+    model, images = Counted(), [predicted_scene.image(k) for k in range(3)]
+    first = Kept(model, tmp_path).predict(images)
+    again = Kept(model, tmp_path).fit([]).predict(images, scores=True)
+    assert model.asked == 3
+    for a, b, image in zip(first, again, images, strict=True):
+        np.testing.assert_array_equal(a.labels, image[..., 0] % 2)
+        np.testing.assert_array_equal(a.labels, b.labels)
+        assert a.scores is None
+        assert (b.scores == 0.5).all()
+    Kept(model, tmp_path).fit(images[:1]).predict(images[:1])  # fitted to something else it is another model
+    assert model.asked == 4
 
 
 # --- The command line -------------------------------------------------------------------------------------------------

@@ -157,6 +157,14 @@ def test_a_rule_of_each_class_shares_the_level(run):
     assert closer.found.low == pytest.approx(each[0].found.low)
 
 
+def test_a_class_that_is_nowhere_has_no_value():
+    labels, truth = models()
+    log = log_of(labels, K=3, index=grid(16))
+    found = judging.value(influence_sums(log.table(), log, truth), parse("class c: recall > 0.5").measure, 2, 0.05)
+    assert "nothing that it is of was seen" in found.undecided
+    assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
+
+
 def test_ends_are_one_sided_and_of_the_sums_differences():
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)

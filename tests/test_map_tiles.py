@@ -24,6 +24,7 @@ from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.model.extent import Extent
+from semstab.model.frames import Frame, Intrinsics
 from semstab.model.parquet import Tile
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.export import export
@@ -57,6 +58,28 @@ def test_the_maps_of_tiles_are_the_parts_of_the_whole_map(name) -> None:
         assert_same_bits(part, whole.rows(tile.holds(whole.index.T)))
         found += len(part)
     assert found == len(whole) > 500
+
+
+@pytest.mark.parametrize("name", ["numba", "open3d"])
+def test_soft_scores_are_rounded_as_in_the_whole_map(name) -> None:
+    """Where many voxels share a table that gives way, sums hang on all of them; and keys on where the map begins."""
+    rng, frames = np.random.default_rng(0), []
+    for index, shift in enumerate((7.3, 0.0, 0.4)):
+        T_wc = np.eye(4)
+        T_wc[:3, 3] = shift, 0.1, 0.2
+        depth = (5 * (0.3 + 0.7 * rng.random((96, 1)) * rng.random(128) ** 2)).astype(np.float32)
+        scores = rng.random((96, 128, K), dtype=np.float32)
+        frames.append(Frame(index, depth * (index > 0), Intrinsics(128, 128, 64, 48), T_wc, scores=scores))
+    backend = backends.create(name, voxel_size=0.05, num_classes=K)
+    for frame in frames:
+        backend.integrate(frame)
+    whole = backend.table()
+    tile = Extent((-16, -16), (16, 16), (146, 2, 4))
+    part = backends.create(name, voxel_size=0.05, num_classes=K, within=tile)
+    for frame in frames[1:]:
+        part.integrate(frame)
+    assert len(part.table()) > 1000
+    assert_same_bits(part.table(), whole.rows(tile.holds(whole.index.T)))
 
 
 def test_a_frame_that_reaches_far_is_restricted_too() -> None:

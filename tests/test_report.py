@@ -291,6 +291,11 @@ def agreement(name, agrees):
     return Agreement("s", "m", ("numpy", name), (1, 1), (0, 0), {}, agrees)
 
 
+def test_hardly_any_voxels_seen_once_need_no_sentence():
+    few = study(record(voxels((5, 1, SURE), (3 * ENOUGH, 4, SPLIT)), backbone="net"))
+    assert not any("seen once" in sentence for sentence in read(few))
+
+
 def test_the_reading_says_which_implementations_agree():
     rows = (agreement("numba", True), agreement("open3d", True), agreement("mine", True), agreement("mine", False))
     sentences = read(study(record(voxels((5, 1, SURE)))))
@@ -299,6 +304,8 @@ def test_the_reading_says_which_implementations_agree():
     sentences = reading(found, ())
     assert "numba and open3d leave the same maps as numpy." in sentences
     assert "mine and numpy disagree in 1 of 2 comparisons." in sentences
+    drawn = dataclasses.replace(found, agreement=tuple(dataclasses.replace(row, one_in=16) for row in rows[:1]))
+    assert "numba leaves the same maps as numpy, as far as one voxel in 16 tells." in reading(drawn, ())
 
 
 def test_the_reading_says_what_became_of_each_finding(walls):

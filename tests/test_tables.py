@@ -91,6 +91,22 @@ def test_a_study_of_nothing_has_no_table():
     assert tables(study()) == []
 
 
+def test_drift_that_few_places_tell_of_is_not_shown(walls):
+    """Of soft scores without a log only places where every frame says one class tell what a random order gives."""
+    few = [
+        dataclasses.replace(found, drift=dataclasses.replace(found.drift, voxels=found.repeated.voxels // 5))
+        for found in (row.statistics for row in walls.select())
+    ]
+    rows = [
+        dataclasses.replace(row, summary=dataclasses.replace(row.summary, statistics=found))
+        for row, found in zip(walls.select(), few, strict=True)
+    ]
+    assert "drift" in {table.name for table in tables(walls)}
+    assert "drift" not in {table.name for table in tables(dataclasses.replace(walls, records=tuple(rows)))}
+    assert math.isnan(pooled(rows).drift.value)
+    assert math.isnan(pooled(rows).settling.value)
+
+
 def voxels_of(walls, backbone):
     """All voxels of a backbone, straight from the maps: OP, VSS, SBD, entropy."""
     maps = [row.table() for row in walls.select(backbone=backbone)]

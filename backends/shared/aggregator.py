@@ -56,7 +56,8 @@ class Aggregator:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.within = within
-        self.origin: Int64 | None = None
+        known = None if within is None else within.origin
+        self.origin: Int64 | None = None if known is None else np.array(known, dtype=np.int64)
         self._band_room = FIRST_ROOM
         self._space = WorkSpace()
         self._tiles = Tiles(voxel_size, num_classes, within)

@@ -30,6 +30,16 @@ class Observed:
     weight: npt.NDArray[np.float64]
     bounds: Int64
 
+    def only(self, some: npt.NDArray[np.bool_]) -> Observed:
+        """Those of some of the voxels (n,)."""
+        size = np.diff(self.start)
+        entries = np.repeat(some, size)
+        start = np.concatenate([[0], np.cumsum(size[some])])
+        return Observed(
+            self.key[some], self.pixels[some], start, self.label[entries], self.weight[entries],
+            _bounds_of(self.bounds, some),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class ObservedScores:
@@ -55,12 +65,23 @@ class ObservedScores:
         sums: npt.NDArray[np.float64] = self.sums[self.row[some, None] + np.arange(self.K)]
         return sums
 
+    def only(self, some: npt.NDArray[np.bool_]) -> ObservedScores:
+        """Those of some of the voxels (n,)."""
+        own = self.key[some], self.pixels[some], self.row[some]
+        return ObservedScores(*own, self.sums, _bounds_of(self.bounds, some), self.K)
+
     def sparse(self) -> Observed:
         """The same by entries, of which there are none for classes without evidence."""
         sums = self.rows()
         voxel, label = np.nonzero(sums)
         start = np.searchsorted(voxel, np.arange(len(self.key) + 1))
         return Observed(self.key, self.pixels, start, label.astype(np.uint16), sums[voxel, label], self.bounds)
+
+
+def _bounds_of(bounds: Int64, some: npt.NDArray[np.bool_]) -> Int64:
+    """First voxel of each partition among some of the voxels."""
+    before: Int64 = np.concatenate([[0], np.cumsum(some)])[bounds]
+    return before
 
 
 LINE = 64

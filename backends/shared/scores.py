@@ -11,7 +11,7 @@ import numpy.typing as npt
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.merging import group, scatter
 from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import columns_of, frame_terms
+from semstab.backends.shared.pixel_keys import columns_of, frame_terms, keep_columns
 from semstab.backends.shared.score_loops import ROWS, TABLE_BITS, merge_sums, sum_scores
 from semstab.backends.shared.score_vectors import LANES
 from semstab.model.extent import Extent
@@ -41,6 +41,8 @@ class Scores:
         """The observations of scores, or None where a pixel with depth is out of reach.
 
         As dense rows where the voxels have evidence for most of the classes, else by its entries.
+
+        What is restricted is left out at the end: in which order sums are rounded hangs on all of the frame's voxels.
         """
         space, (H, W), camera, K = self._space, frame.shape, frame.intrinsics, self.num_classes
         ray_x = (np.arange(W) - camera.cx) / camera.fx
@@ -57,7 +59,7 @@ class Scores:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             sum_scores(
                 fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, K, ray_x, ray_y, fixed(frame.T_wc),
-                self.voxel_size, origin, columns_of(self.within, origin), rays, margin, room,
+                self.voxel_size, origin, columns_of(None, origin), rays, margin, room,
                 space.room("keys", threads, ROWS, W), space.room("table", threads, 1 << TABLE_BITS),
                 space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32),
                 space.room("scale", threads, W, dtype=np.float64), key, count, sums, entries, lost, spread,
@@ -67,7 +69,8 @@ class Scores:
             if entries.min() >= 0:
                 break
             self._band_room *= 4
-        return _lean(self._merged(key, count, sums, room, entries, spread))
+        seen = _lean(self._merged(key, count, sums, room, entries, spread))
+        return seen if self.within is None else seen.only(keep_columns_of(seen.key, columns_of(self.within, origin)))
 
     def _merged(
         self, key: Int64, count: Any, sums: npt.NDArray[np.float64], room: int, entries: Int64, spread: Int64
@@ -87,6 +90,14 @@ class Scores:
         stride = -(-self.num_classes // LANES) * LANES
         merge_sums(order, edges, voxel, bounds, *merged[:2], sums, self.num_classes, stride, keys, pixels, row)
         return ObservedScores(keys, pixels, row, sums, bounds, self.num_classes)
+
+
+def keep_columns_of(key: Int64, columns: Int64) -> npt.NDArray[np.bool_]:
+    """Which of the keys (n,) are within columns, see `keep_columns`."""
+    kept = key.copy()
+    keep_columns(kept, columns)
+    inside: npt.NDArray[np.bool_] = kept >= 0
+    return inside
 
 
 def _lean(seen: ObservedScores) -> Observed | ObservedScores:

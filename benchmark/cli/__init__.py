@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import sys
 from typing import Annotated, Any
 
@@ -122,9 +123,25 @@ for command, name in (
     app.command(name, cls=Command)(command)
 
 
+class _Once(logging.Filter):
+    """What the check and the run would both warn of is said once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it was not said before."""
+        message = record.getMessage()
+        new = message not in self._said
+        self._said.add(message)
+        return new
+
+
 def main() -> None:
     """Entry point of the console script."""
     settle()
+    logging.getLogger("semstab").addFilter(_Once())
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names may hold what the terminal's encoding does not

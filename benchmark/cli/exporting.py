@@ -40,6 +40,10 @@ def export(
     radius: Annotated[
         float | None, typer.Option(min=0, help="Metres from a point to the voxel that it may take; a voxel's edge.")
     ] = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """The fused map as a point cloud, raster, mesh or table, with how far to trust each place."""
@@ -50,7 +54,7 @@ def export(
     unit = {"scene": scene, "backbone": backbone, "backend": backend}
     written = write(
         run, to, **unit, measures=measure, min_op=min_op, classes=classes or (),
-        commit=commit, cell=cell, asprs=asprs, onto=onto, radius=radius,
+        commit=commit, cell=cell, asprs=asprs, onto=onto, radius=radius, beside=beside,
     )  # fmt: skip
     console = Console(quiet=quiet)
     for file in written:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from semstab.comparison.contrasts import by_class, contrasts, over_scenes, tested
+from semstab.comparison.contrasts import by_class, contrasts, corrected, over_scenes
 from semstab.comparison.opening import Contender, open_contenders, shared_scenes
 from semstab.comparison.pairing import Common, pair
 from semstab.comparison.places import Changes, worse_places
@@ -66,8 +66,8 @@ def _scene(scene: str, contenders: Sequence[Contender]) -> tuple[SceneComparison
     entries, names = [each.scenes[scene] for each in contenders], [each.name for each in contenders]
     common = pair(entries, names)
     numbers = range(1, len(entries))
-    everything = tested([contrasts(common, entries[0], entries[n], n) for n in numbers])
-    classes = tested([by_class(common, entries[0], entries[n], n) for n in numbers])
+    everything = corrected([contrasts(common, entries[0], entries[n], n) for n in numbers])
+    classes = corrected([by_class(common, entries[0], entries[n], n) for n in numbers])
     against, changes = [], {}
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
         found = Against(names[n], own, of_classes)
@@ -99,8 +99,8 @@ def _over_all(scenes: Sequence[SceneComparison]) -> tuple[Against, ...]:
     if len(scenes) == 1:
         return tuple(Against(own.other, own.contrasts, own.by_class) for own in scenes[0].against)
     runs = list(zip(*(scene.against for scene in scenes), strict=True))
-    everything = tested([over_scenes([own.contrasts for own in run]) for run in runs])
-    classes = tested([over_scenes([own.by_class for own in run]) for run in runs])
+    everything = corrected([over_scenes([own.contrasts for own in run]) for run in runs])
+    classes = corrected([over_scenes([own.by_class for own in run]) for run in runs])
     return tuple(
         Against(run[0].other, own, of_classes, *(sum(getattr(each, name) for each in run) for name in _COUNTS))
         for run, own, of_classes in zip(runs, everything, classes, strict=True)

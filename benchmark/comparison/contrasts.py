@@ -97,11 +97,11 @@ def over_scenes(found: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
     )
 
 
-def tested(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
+def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
     """Lists with p-values corrected for all that stand in them together, and what is said of each difference."""
-    corrected = iter(holm([row.difference.p_value for rows in lists for row in rows]))
+    p_values = iter(holm([row.difference.p_value for rows in lists for row in rows]))
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
-    return [tuple(_said(row, next(corrected), better[row.measure]) for row in rows) for rows in lists]
+    return [tuple(_said(row, next(p_values), better[row.measure]) for row in rows) for rows in lists]
 
 
 def _said(row: Contrast, p_holm: float, sign: float) -> Contrast:

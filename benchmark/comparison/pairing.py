@@ -197,7 +197,7 @@ def _fewer_frames(looks: Sequence[Looks]) -> tuple[str, ...]:
 
 def _truth(records: Sequence[Record]) -> VoxelTable | None:
     """The map of the ground truth, of the first run that fused it."""
-    files = [record.truth_file for record in records if record.truth_file is not None and record.truth_file.is_file()]
+    files = [record.truth_file for record in records if record.truth_file is not None and record.truth_file.exists()]
     truth = VoxelTable.load(files[0]) if files else None
     return truth if truth is not None and truth.classes == records[0].table().classes else None
 
@@ -223,7 +223,7 @@ def _no_voxels(entries: Sequence[Entry]) -> str:
     for entry in entries:
         if entry.record is None:
             return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"
-        if entry.record.voxels_file is None or not entry.record.voxels_file.is_file():
+        if entry.record.voxels_file is None or not entry.record.voxels_file.exists():
             return f"{entry.where} kept no voxels: {BY_CUBES}"
     return ""
 

@@ -35,7 +35,7 @@ LEAST = 4
 MOST = 20
 """Places that are told of, the largest loss first."""
 
-SHARE, MOST_FRAMES = 0.8, 8
+SHARE, MOST_FRAMES = 0.9, 8
 """The frames that account for this share of a place's loss are blamed, so many at most."""
 
 

@@ -11,10 +11,13 @@ from rich.table import Table
 
 from semstab.comparison.quantities import HEADLINES, by_key
 from semstab.comparison.reading import sentences
-from semstab.comparison.tables import IN_CLASSES, heading, scopes
+from semstab.comparison.tables import ALL_SCENES, IN_CLASSES, heading, scopes
 from semstab.model.contrast import Against, Contrast, Place, RunComparison
 from semstab.model.measures import Quantity
 from semstab.outputs.terminal import narrow_table
+
+MOST_SCENES = 4
+"""Scenes that are shown each by itself; of more the report has them."""
 
 MOST_PLACES = 8
 """Places of a run in a scene that are shown; the others are in the tables."""
@@ -28,16 +31,20 @@ COLORS = {"worse": "[red]worse[/]", "better": "[green]better[/]", "": ""}
 
 def print_comparison(found: RunComparison, console: Console) -> None:
     """Differences over all scenes and by scene, by class, the places that got worse, and how to read them."""
+    few = len(found.scenes) <= MOST_SCENES
     for scope, own in scopes(found):
-        console.print(_differences(heading(found, scope, own), own))
+        if few or scope == ALL_SCENES:
+            console.print(_differences(heading(found, scope, own), own))
     for own in found.overall:
         if own.by_class:
             console.print(_classes(f"by class: {own.other} less {found.base}", own))
-    for scene in found.scenes:
+    for scene in found.scenes if few else ():
         for own in scene.against:
             for what, title in LOST.items():
                 if places := [place for place in own.places if place.what == what]:
                     console.print(_places(f"{scene.scene}: places where {own.other} {title}", places))
+    if not few:
+        console.print(f"{len(found.scenes)} scenes: each by itself, with its places, is in the report (--out DIR)\n")
     for sentence in sentences(found):
         console.print(f"- {sentence}", highlight=False, markup=False)
 

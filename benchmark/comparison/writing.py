@@ -121,7 +121,7 @@ def _recorded(found: Found) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]
     for scene in found.result.scenes:
         for own in scene.against:
             if (changes := found.changes.get((scene.scene, own.other))) is not None:
-                places = [(f"{place.number} {place.of}", place.centre) for place in own.places if place.number]
+                places = [(place.what, f"{place.number} {place.of}", place.centre) for place in own.places]
                 title = heading(found.result, scene.scene, own)
                 yield (scene.scene, own.other), (title, changes.table, changes.change, changes.right, places)
 

@@ -27,8 +27,14 @@ Frames = Literal["random", "fixed"]
 LEAST = 8
 """Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
 
+DOUBT = 0.1
+"""Where errors or the quality of frames may reach as far as the data, each end is missed so much less often: what holds
+even then is concluded."""
+
 AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
+NOTHING = "it has no value: nothing that it is of was seen twice"
 UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
+SCORES = "labels beside scores, which spread their evidence: run both as labels"
 FEW = "{frames} frames are too few: fly {least} or more"
 
 
@@ -86,6 +92,12 @@ def comparable(new: InfluenceSums, base: InfluenceSums) -> tuple[InfluenceSums, 
     return new.without_truth(), base.without_truth()
 
 
+def doubtful(found: Interval) -> bool:
+    """Whether nothing may be concluded only because errors, or the quality of frames, may reach as far as the data."""
+    final = ("frames are too few", NOTHING, UNKNOWN_FRAMES, SCORES)
+    return bool(found.undecided) and not any(reason in found.undecided for reason in final)
+
+
 def negative(found: Interval) -> Interval:
     """Of the opposite number."""
     return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
@@ -97,6 +109,8 @@ def of_frames(found: Interval, frames: int) -> Interval:
     reasons = [reason for reason in found.undecided.split("; ") if reason and reason != few]
     if not reasons and found.question == NEXT_FLIGHT and found.degrees < LEAST_DEGREES:
         reasons.append(AS_LONG)
+    if math.isnan(found.value):
+        reasons.append(NOTHING)
     if frames < LEAST:
         reasons.append(FEW.format(frames=frames, least=LEAST) if frames else UNKNOWN_FRAMES)
     return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))

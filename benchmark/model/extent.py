@@ -10,10 +10,14 @@ import numpy.typing as npt
 
 @dataclass(frozen=True)
 class Extent:
-    """The voxels with low <= (ix, iy) < high, whatever their iz."""
+    """The voxels with low <= (ix, iy) < high, whatever their iz.
+
+    origin  voxel of the first camera of the whole map, where that is known: soft scores are rounded as they are there
+    """
 
     low: tuple[int, int]
     high: tuple[int, int]
+    origin: tuple[int, int, int] | None = None
 
     def holds(self, index: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
         """Whether each of the voxels of these indices (3, n) is one of them: (n,)."""

@@ -438,6 +438,14 @@ class MapStatistics:
     beyond_coin: BeyondCoin
 
     @property
+    def order_known(self) -> bool:
+        """Whether a quarter of the places seen twice say what a random order of their observations gives.
+
+        Of soft scores without a log only a few do, and not just any.
+        """
+        return 4 * self.drift.voxels >= self.repeated.voxels
+
+    @property
     def sections(self) -> int:
         """How many of the sections that need more than the map could be computed."""
         return sum(section is not None for section in (self.geometry, self.correctness, self.fusion_rules))

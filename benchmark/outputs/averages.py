@@ -94,10 +94,10 @@ def pooled(records: Sequence[Record]) -> Pooled:
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
         psa=_estimate(records, lambda found: found.agreement.psa),
         alpha=_estimate(records, lambda found: found.agreement.alpha),
-        drift=_estimate(records, lambda found: found.drift.sbd),
-        drift_null=_macro(records, lambda found: found.drift.null),
+        drift=_estimate(records, lambda found: found.drift.sbd if found.order_known else UNDEFINED),
+        drift_null=_macro(records, lambda found: found.drift.null if found.order_known else UNDEFINED),
         disagreement=_together(records, lambda found: found.beyond_coin.disagreement),
-        settling=_together(records, lambda found: found.beyond_coin.settling),
+        settling=_together(records, lambda found: found.beyond_coin.settling if found.order_known else UNDEFINED),
         vss_error=_vss_error(records, voxels),
     )
 

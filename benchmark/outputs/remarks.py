@@ -18,6 +18,9 @@ ONE_CLASS, SEEN_AGAIN, FEW_BLOCKS = 0.9, 0.3, 60
 """Share of one class above which, share of voxels seen twice below which, and blocks of space below which an open
 verdict has its reason in them."""
 
+HARDLY_ANY = 0.1
+"""A share of voxels seen once below which they need no remark."""
+
 COARSE = 5.0
 """Voxels so many times the smallest that suits the data blur what the frames could tell apart."""
 

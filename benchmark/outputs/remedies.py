@@ -17,7 +17,10 @@ LEAST_COVERAGE = 0.95
 """Share of the model's labels that a recommended filter must leave."""
 
 ALIKE = 0.005
-"""Shares that differ by no more are taken for alike: then the steadier one is better."""
+"""Shares that differ by no more are not said to be worse."""
+
+LEVEL = 0.002
+"""Filters whose worth differs by no more are level: then the steadier one is better."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,14 @@ class Remedy:
 
     filters   '' for the model itself
     flicker   of places seen in two frames in a row, those whose label changes: motion-compensated
+    plain     the same at the same pixel, whatever it shows
     alpha     between frames, of the fused map
     better    in how many frames, of how many, the accuracy is above the model's; without truth the foresight
     """
 
     filters: str
     flicker: float
+    plain: float
     alpha: float
     foresight: float
     accuracy: float
@@ -90,13 +95,14 @@ class Remedies:
     def _best_of(self, rows: Sequence[Remedy]) -> Remedy | None:
         able = [row for row in rows if row.flicker < self.unfiltered.flicker and self.harmless(row)]
         most = max(map(self.worth, able), default=math.nan)
-        return min((row for row in able if self.worth(row) >= most - ALIKE), key=lambda row: row.flicker, default=None)
+        return min((row for row in able if self.worth(row) >= most - LEVEL), key=lambda row: row.flicker, default=None)
 
     @property
     def misleading(self) -> list[Remedy]:
-        """Filters that steady the labels and make them worse, the steadiest first."""
-        worse = [row for row in self.filtered if self.worth(row) < self.worth(self.unfiltered) - ALIKE]
-        return sorted((r for r in worse if r.flicker < self.unfiltered.flicker), key=lambda row: row.flicker)
+        """Filters that steady the labels, of places or of pixels, and make them worse; the worst first."""
+        base = self.unfiltered
+        worse = [row for row in self.filtered if self.worth(row) < self.worth(base) - ALIKE]
+        return sorted((r for r in worse if r.flicker < base.flicker or r.plain < base.plain), key=self.worth)
 
     @property
     def front(self) -> list[Remedy]:
@@ -190,15 +196,15 @@ def _why(found: Remedies, best: Remedy) -> str:
 
 def _harm(found: Remedies, row: Remedy) -> str:
     base = found.unfiltered
+    steady = f"has {100 * row.flicker:.1f} % flicker ({100 * base.flicker:.1f} % without)"
+    if row.flicker >= base.flicker:
+        steady = f"has {100 * row.plain:.1f} % flicker at the same pixel ({100 * base.plain:.1f} % without)"
     if not found.has_truth:
-        return (
-            f"has {100 * row.flicker:.1f} % flicker, but foresees {100 * row.foresight:.1f} % of the next labels"
-            f" ({100 * base.foresight:.1f} % without)"
-        )
-    late = f", {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
+        return f"{steady}, but foresees {100 * row.foresight:.1f} % of the next labels ({100 * base.foresight:.1f} %)"
+    late = f", and it follows changes {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
     return (
-        f"has {100 * row.flicker:.1f} % flicker, but {100 * row.stable_wrong:.0f} % of what it shows is stable and"
-        f" wrong ({100 * base.stable_wrong:.0f} % without){late}"
+        f"{steady}, but {100 * row.stable_wrong:.0f} % of what it shows is stable and wrong"
+        f" ({100 * base.stable_wrong:.0f} %){late}"
     )
 
 
@@ -212,6 +218,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
     return Remedy(
         filters=qualities[0].filters,
         flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
+        plain=macro_mean([record.image_space.flicker_percent for record in records]) / 100,
         alpha=macro_mean([row.alpha_between.value for row in judged]),
         **{
             name: mean(name)

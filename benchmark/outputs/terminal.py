@@ -16,13 +16,10 @@ from semstab.model.measures import VSS, measures
 from semstab.model.records import Record, Result
 from semstab.model.results import STAGES, Agreement, Means, UnitSummary
 from semstab.outputs.averages import Sweep, describe, levels, over_all, over_recurrent, pooled
-from semstab.outputs.remarks import remarks
+from semstab.outputs.remarks import HARDLY_ANY, remarks
 from semstab.outputs.statistics_text import comparison_lines, lines
 
 NOTHING = "-"
-
-HARDLY_ANY = 0.1
-"""A share of voxels seen once below which they need no remark."""
 
 FUSION_STAGES = ("association", "update")
 """Parts of fusion; frames are decoded beside it, and waited for where that takes longer."""

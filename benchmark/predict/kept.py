@@ -40,16 +40,18 @@ class Kept(Wrapped):
         return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
 
     def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
-        file = self._folder / f"{self._key(image, scores, frame)}.npz"
+        """Scores are kept wherever there are some: whoever asks later may want them."""
+        file = self._folder / f"{self._key(image, frame)}.npz"
         if not file.is_file():
-            (prediction,) = self.ask([image], scores, frame)
-            held: dict[str, Any] = {"labels": prediction.labels} | ({"scores": prediction.scores} if scores else {})
+            (prediction,) = self.ask([image], self.gives_scores, frame)
+            held: dict[str, Any] = {"labels": prediction.labels}
+            held |= {"scores": prediction.scores} if self.gives_scores else {}
             with atomic_path(file) as temporary:
                 np.savez(temporary, **held)
-            return prediction
+            return prediction if scores else Prediction(prediction.labels)
         with np.load(file) as there:
             return Prediction(there["labels"], there["scores"] if scores else None)
 
-    def _key(self, image: Image, scores: bool, frame: Sequence[Frame]) -> str:
-        seen = {"fitted": self._fitted_to, "shown": shown_digest(image, frame), "scores": scores}
+    def _key(self, image: Image, frame: Sequence[Frame]) -> str:
+        seen = {"fitted": self._fitted_to, "shown": shown_digest(image, frame)}
         return content_key({"model": self.identity(), **seen})

@@ -103,13 +103,13 @@ def _middle(at: npt.NDArray[np.int32], weight: npt.NDArray[np.float64]) -> int:
 
 
 def _part(tiles: Sights, rows: npt.NDArray[np.int64]) -> Part:
-    place = tiles.place[rows]
+    place, (x, y, z) = tiles.place[rows], tiles.origin
     low, high = place.min(axis=0), place.max(axis=0) + 1
     inside = ((tiles.cell >= low) & (tiles.cell < high)).all(axis=1)
     frames = np.unique(tiles.frame[inside])
     corner, end = (tuple(int(edge) * tiles.size for edge in edges) for edges in (low, high))
     return Part(
-        Extent((corner[0], corner[1]), (end[0], end[1])),
+        Extent((corner[0], corner[1]), (end[0], end[1]), (int(x), int(y), int(z))),
         tiles.size,
         tuple(frames.tolist()),
         round(float(tiles.voxels[rows].sum())),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,7 @@ class Sights:
     frame   (m,) int32 index of a frame, cell (m, 2) int32 a cell that it sees: ix // size, iy // size; sorted
     place   (c, 2) int32 all cells, voxels and observations (c,) in each, estimated from a sample of the voxels
     frames  how many were looked at
+    origin  (3,) voxel of the first camera
     """
 
     size: int
@@ -57,6 +58,7 @@ class Sights:
     voxels: Float64
     observations: Float64
     frames: int
+    origin: Int64 = field(default_factory=lambda: np.zeros(3, np.int64))
 
     def in_tiles(self, size: int) -> Sights:
         """The same for cells of that size, a multiple of this one."""
@@ -66,7 +68,7 @@ class Sights:
         of, cells = of.ravel(), len(place)
         voxels = np.bincount(of, weights=self.voxels, minlength=cells).astype(np.float64)
         observations = np.bincount(of, weights=self.observations, minlength=cells).astype(np.float64)
-        return Sights(size, rows[:, 0], rows[:, 1:], place, voxels, observations, self.frames)
+        return Sights(size, rows[:, 0], rows[:, 1:], place, voxels, observations, self.frames, self.origin)
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
@@ -91,7 +93,7 @@ def look_at(
 
     Raises DataError where a frame cannot be read, has no finite depth, or reaches too far for a map.
     """
-    origin = _origin(task, voxel_size)
+    origin = np.floor(_geometry(task, task.indices[0], pixel_stride).T_wc[:3, 3] / voxel_size).astype(np.int64)
 
     def seen(index: int) -> _Seen:
         return _look(_geometry(task, index, pixel_stride), voxel_size, origin, cell)
@@ -100,11 +102,6 @@ def look_at(
     for fetched in prefetch(seen, task.indices, threads=threads):
         collected.add(fetched.item)
     return collected.sights()
-
-
-def _origin(task: Task, voxel_size: float) -> Int64:
-    first = task.scene.T_wc(task.indices[0])[:3, 3]
-    return np.floor(first / voxel_size).astype(np.int64)
 
 
 def _geometry(task: Task, index: int, pixel_stride: int) -> Frame:
@@ -188,7 +185,7 @@ class _Collected:
         of, scale = of.ravel()[: len(index)], ALL / self._share
         voxels = (scale * np.bincount(of, minlength=len(place))).astype(np.float64)
         observations = (scale * np.bincount(of, weights=self._looks, minlength=len(place))).astype(np.float64)
-        return Sights(self._size, rows[:, 0], rows[:, 1:], place, voxels, observations, self._frames)
+        return Sights(self._size, rows[:, 0], rows[:, 1:], place, voxels, observations, self._frames, self._origin)
 
     def _widen(self) -> None:
         self._size *= 2

@@ -73,6 +73,7 @@ def export(
     asprs: str | Path | None = None,
     onto: str | Path | None = None,
     radius: float | None = None,
+    beside: str | Path | None = None,
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
@@ -84,6 +85,7 @@ def export(
     asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
     onto      a cloud: what is written is this cloud, classified; a point outside of all voxels takes the nearest one
               within `radius` metres, a voxel's edge where not given
+    beside    a Parquet file with further columns of the same voxels, such as `compare` writes
 
     Raises ConfigError, DataError, MissingDependencyError, each with the file.
     """
@@ -95,17 +97,23 @@ def export(
     record = result.record(scene=scene, backbone=backbone, backend=backend)
     thresholds = None if commit is None else Commit.load(commit)
     settings = Settings(cell, None if asprs is None else Path(asprs))
+    further = None if beside is None else Path(beside)
 
     @functools.cache
     def chosen(usual: tuple[str, ...] | None) -> Voxels:
-        return voxels_of(result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds)
+        return voxels_of(
+            result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds,
+            beside=further,
+        )  # fmt: skip
 
     if onto is not None:
         return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]
 
     def parts() -> Iterator[Voxels]:
         if record.in_tiles:
-            return iter_voxels(result, record, columns=measures, min_op=min_op, classes=classes, commit=thresholds)
+            return iter_voxels(
+                result, record, columns=measures, min_op=min_op, classes=classes, commit=thresholds, beside=further
+            )
         return iter([chosen(None)])
 
     return [

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from semstab.config import nearest
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import categories
-from semstab.metrics.matching import rows_of
+from semstab.metrics.matching import rows_of, voxel_keys
 from semstab.model import palette as colors
 from semstab.model import parquet
 from semstab.model.georeference import Georeference
@@ -28,6 +28,8 @@ from semstab.statistics import psa
 from semstab.statistics.commit import Commit
 
 Float64 = npt.NDArray[np.float64]
+
+INDEX = ("ix", "iy", "iz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,19 +85,21 @@ def voxels_of(
     columns: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
+    beside: Path | None = None,
     commit: Commit | None = None,
 ) -> Voxels:
     """Those of a unit with OP >= min_op and one of these dominant classes, all where none is named.
 
     With thresholds, of those the ones whose label has enough evidence.
 
-    `columns` names measures, op, category, psa, or columns of the unit's Parquet file; where not given, see `usual`.
+    `columns` names measures, op, category, psa, columns of the unit's Parquet file, or of one `beside` it, which has
+    some of the same voxels; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
     """
     if record.voxels_file is None:
         raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
     table = record.table()
-    found = _chosen(result, record, table, record.voxels_file, columns, min_op, classes, commit)
+    found = _chosen(result, record, table, record.voxels_file, columns, min_op, classes, commit, beside)
     if not len(found.table):
         raise _none_left(record, min_op, classes, commit, int(table.op.max(initial=0)))
     return found
@@ -109,16 +113,17 @@ def iter_voxels(
     min_op: int = 1,
     classes: Sequence[str] = (),
     commit: Commit | None = None,
+    beside: Path | None = None,
 ) -> Iterator[Voxels]:
     """Those of `voxels_of` tile by tile, where the map is in tiles; a tile without any is left out."""
     if not record.in_tiles or record.voxels_file is None:
-        yield voxels_of(result, record, columns=columns, min_op=min_op, classes=classes, commit=commit)
+        yield voxels_of(result, record, columns=columns, min_op=min_op, classes=classes, commit=commit, beside=beside)
         return
     left, highest = False, 0
     for file in parquet.files_of(record.voxels_file):
         table = VoxelTable.load(file)
         highest = max(highest, int(table.op.max(initial=0)))
-        found = _chosen(result, record, table, file, columns, min_op, classes, commit)
+        found = _chosen(result, record, table, file, columns, min_op, classes, commit, beside)
         left = left or len(found.table) > 0
         if len(found.table):
             yield found
@@ -141,6 +146,7 @@ def _chosen(
     min_op: int,
     classes: Sequence[str],
     commit: Commit | None,
+    beside: Path | None,
 ) -> Voxels:
     """Of a table, which is in a file."""
     assert record.voxels_file is not None
@@ -150,7 +156,11 @@ def _chosen(
         keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
     if commit is not None:
         keep &= commit.decide(table) >= 0
-    chosen = {name: _column(name, table, file) for name in columns or usual()}
+    further = {} if beside is None else columns_beside(table, beside)
+    chosen = {
+        name: further[name] if name in further else _column(name, table, file)
+        for name in columns or (*usual(), *further)
+    }
     scene, backbone = record.unit.scene, record.unit.backbone
     georeference = result.georeference.get(scene)
     return Voxels(
@@ -162,6 +172,30 @@ def _chosen(
         result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
         georeference,
     )
+
+
+def columns_beside(table: VoxelTable, file: Path) -> dict[str, Column]:
+    """The columns of a file with rows of these voxels, as `compare` writes it; 0, or NaN, where it has no row.
+
+    Raises DataError where it is no such file, or has voxels of another size.
+    """
+    import pyarrow.parquet as pq
+
+    with parquet.reading(file):
+        names = [name for name in pq.read_schema(file).names if name not in INDEX]
+        content = parquet.read(file, (*INDEX, *names))
+        own, theirs = voxel_keys(table.index, np.stack([content[name] for name in INDEX], axis=1))
+    if content["voxel_size"] != table.voxel_size:
+        raise DataError(f"{file}: has voxels of {content['voxel_size']:g} m, the map of {table.voxel_size:g} m")
+    at = np.minimum(np.searchsorted(own, theirs), len(own) - 1)
+    there = own[at] == theirs
+    found = {}
+    for name in names:
+        empty = np.nan if content[name].dtype.kind == "f" else 0
+        values = np.full(len(table), empty, dtype=content[name].dtype)
+        values[at[there]] = content[name][there]
+        found[name] = Column(values)
+    return found
 
 
 def crs_name(georeference: Georeference) -> str:

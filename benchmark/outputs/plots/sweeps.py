@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from semstab.model.measures import measures
 from semstab.model.statistics import Estimate
 from semstab.outputs.averages import ENOUGH, Level, Pooled, Sweep, over_all, over_recurrent
@@ -59,6 +61,10 @@ def positions(values: Sequence[float], levels: Sequence[Level], k: int, series: 
 
 def settle_scale(axes: Axes, *, from_zero: bool) -> None:
     """Widen the y axis to hold 0, or `LEAST_SPAN`; what is drawn, intervals too, stays inside with its markers."""
+    if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=np.float64)).any() for line in axes.lines):
+        axes.text(0.5, 0.5, "not known\nwithout --statistics", transform=axes.transAxes, ha="center", va="center")
+        axes.set_yticks([])
+        return
     low, high = axes.get_ylim()
     if from_zero:
         axes.set_ylim(min(low, -0.04 * high), high)

@@ -20,8 +20,8 @@ log                                     TextLog: each unit's final numbers
 
 and in the recording of a comparison
 
-change/RUN/agreement, .../truth         VoxelGridMap: what each voxel lost or gained
-places/RUN                              Points3D: the places that got worse, with their numbers
+change/RUN/agreement, .../truth         VoxelGridMap: what each voxel that changed lost or gained
+change/RUN/.../same, .../places         Points3D: the other voxels; the places that got worse, with their numbers
 """
 
 from semstab.outputs.recording.observer import Recording

@@ -17,11 +17,15 @@ from semstab.outputs.recording.layout import BACKGROUND, Scenery, eye
 from semstab.outputs.recording.target import Target
 from semstab.outputs.recording.voxel_maps import packed, thinned
 
-WORSE, SAME, BETTER = (213, 94, 0), (150, 150, 150), (86, 180, 233)
+WORSE, SAME, BETTER, WHITE = (213, 94, 0), (150, 150, 150), (86, 180, 233), (255, 255, 255)
+LEAST = 0.05
+"""A change from which on a voxel is drawn as one."""
+
 ASPECT = 1.2
 
-Change = tuple[str, VoxelTable, npt.NDArray[Any], npt.NDArray[Any] | None, Sequence[tuple[str, tuple[float, ...]]]]
-"""A title, the voxels, what each gained (n,), -1 to 1, in agreement and where truth tells, and named places."""
+Change = tuple[str, VoxelTable, npt.NDArray[Any], npt.NDArray[Any] | None, Sequence[tuple[str, str, tuple[float, ...]]]]
+"""A title, the voxels, what each gained (n,), -1 to 1, in agreement and where truth tells; and places: in which of the
+two they lost, their names and centres."""
 
 
 def record_changes(
@@ -56,29 +60,33 @@ def _logged(
     views = {"agreement": ("Agreement between frames", agreement)}
     if right is not None:
         views["truth"] = ("Right and wrong", right)
+    points = ((index[rows] + 0.5) * table.voxel_size).astype(np.float64)
+    where = Scenery(points, np.zeros((0, 4, 4)), None if up is None else np.array(up))
     shown = []
     for name, (what, values) in views.items():
         entity = path(scene, "change", run, name)
-        cells = (index[rows] // factor).astype(np.int32)
-        colors = packed(_shades(values[rows]))
+        changed = np.abs(values[rows]) >= LEAST
+        cells = (index[rows][changed] // factor).astype(np.int32)
+        colors = packed(_shades(values[rows][changed]))
         stream.log(entity, rr.VoxelGridMap(cells, [table.voxel_size * factor] * 3, colors=colors), static=True)
-        points = ((index[rows] + 0.5) * table.voxel_size).astype(np.float64)
-        where = Scenery(points, np.zeros((0, 4, 4)), None if up is None else np.array(up))
+        rest = rr.Points3D(points[~changed], colors=SAME, radii=rr.Radius.ui_points(1.0))  # they do not hide the others
+        stream.log(f"{entity}/same", rest, static=True)
+        own = [place for place in places if place[0] == name]
+        if own:
+            at = np.array([centre for *_, centre in own]) - origin * table.voxel_size
+            labels = rr.Points3D(
+                at, labels=[label for _, label, _ in own], colors=WHITE, radii=rr.Radius.ui_points(4.0)
+            )
+            stream.log(f"{entity}/places", labels, static=True)
         shown.append(
             rrb.Spatial3DView(
                 origin=path(scene),
-                contents=[entity, path(scene, "places", run)],
-                name=f"{what}: orange worse, blue better",
+                contents=[f"{entity}/**"],
+                name=f"{what}: orange worse, blue better, grey points as before",
                 background=BACKGROUND,
                 line_grid=False,
                 eye_controls=eye(where, ASPECT),
             )
-        )
-    if places:
-        centres = np.array([centre for _, centre in places]) - origin * table.voxel_size
-        labels = [label for label, _ in places]
-        stream.log(
-            path(scene, "places", run), rr.Points3D(centres, labels=labels, radii=rr.Radius.ui_points(4.0)), static=True
         )
     return rrb.Vertical(*shown, name=title)
 

@@ -11,7 +11,7 @@ from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.outputs.averages import ENOUGH, Pooled, by_backbone, pooled
 from semstab.outputs.findings import Answer, Finding
-from semstab.outputs.remarks import mixed, remarks
+from semstab.outputs.remarks import HARDLY_ANY, mixed, remarks
 from semstab.outputs.tables.stability import comparable
 
 
@@ -40,7 +40,7 @@ def verdicts(result: Result) -> list[str]:
 
 
 def _once(voxels: Pooled) -> Iterator[str]:
-    if not math.isnan(voxels.once):
+    if voxels.once >= HARDLY_ANY:
         yield (
             f"{voxels.once:.0%} of the voxels were seen once. They look stable because no second look could contradict"
             " them: read every measure where voxels recur (OP>=3)."
@@ -132,7 +132,10 @@ def _implementations(result: Result) -> Iterator[str]:
         for name in dict.fromkeys(row.backends[1] for row in result.agreement)
     }
     if same := [name for name, agrees in rows.items() if all(agrees)]:
-        yield f"{' and '.join(same)} {'leaves' if len(same) == 1 else 'leave'} the same maps as {result.backend}."
+        drawn = max(row.one_in for row in result.agreement if row.backends[1] in same)
+        sample = f", as far as one voxel in {drawn} tells" if drawn > 1 else ""
+        leave = "leaves" if len(same) == 1 else "leave"
+        yield f"{' and '.join(same)} {leave} the same maps as {result.backend}{sample}."
     for name, agrees in rows.items():
         if not all(agrees):
             yield f"{name} and {result.backend} disagree in {agrees.count(False)} of {len(agrees)} comparisons."

@@ -9,7 +9,7 @@ from typing import TypeVar
 from semstab.metrics import macro_mean
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.records import Record, Result
-from semstab.model.statistics import UNDEFINED, DriftTests, Estimate, MapStatistics, Reach
+from semstab.model.statistics import UNDEFINED, DriftStatistics, DriftTests, Estimate, MapStatistics, Reach
 from semstab.outputs.averages import by_backbone
 from semstab.outputs.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
@@ -104,10 +104,10 @@ def drift(result: Result) -> list[Table]:
         Column("tested_voxels", "tested", 0, over="Voxels"),
     )
     numbers: tuple[Number, ...] = (
-        lambda found: found.drift.voxels,
-        lambda found: found.drift.sbd.value,
-        lambda found: found.drift.null.value,
-        lambda found: found.drift.excess,
+        ordered(lambda drift: drift.voxels),
+        ordered(lambda drift: drift.sbd.value),
+        ordered(lambda drift: drift.null.value),
+        ordered(lambda drift: drift.excess),
         tested(lambda tests: tests.sbd_p),
         tested(lambda tests: tests.trend),
         tested(lambda tests: tests.trend_null),
@@ -225,6 +225,11 @@ def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics
 def tested(take: Callable[[DriftTests], float]) -> Number:
     """A number of the drift's tests; NaN where there are none."""
     return lambda found: math.nan if found.drift.tests is None else take(found.drift.tests)
+
+
+def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
+    """A number of drift beside random order; NaN where too few places tell what that gives."""
+    return lambda found: take(found.drift) if found.order_known else math.nan
 
 
 def reached(take: Callable[[Reach], float | Estimate]) -> Number:

@@ -1,0 +1,220 @@
+"""Runs side by side: nothing where nothing changed; a planted fault with its place, class and frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import bench
+from posed_config import configure
+from posed_writer import write_posed
+from rich.console import Console
+
+import semstab
+from semstab.comparison.contrasts import corrected, over_scenes
+from semstab.comparison.opening import open_contenders
+from semstab.comparison.pairing import pair
+from semstab.comparison.terminal import print_comparison
+from semstab.comparison.writing import load_comparison, markdown
+from semstab.errors import ConfigError, DataError
+from semstab.model.contrast import Against, Contrast, RunComparison
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.georeference import Georeference
+from semstab.model.statistics import Interval
+
+FAULTY = (2, 5, 8)
+CLASSES = ["wall", "door", "window", "floor"]
+
+
+def write_scene(folder: Path, sources: dict[str, set[int]], name: str = "wall") -> Path:
+    """A wall that nine frames see from one place to the next; in those of a source its doors are called windows."""
+    size, focal, depth = (48, 64), 64.0, np.full((48, 64), 2.03, np.float32)
+    seen: dict[str, list[Frame]] = {key: [] for key in ("gt", *sources)}
+    for i in range(9):
+        columns = (np.arange(64) + i * 0.25 * focal / 2.03).astype(int)
+        truth = np.tile((columns // 12 % 3).astype(np.uint8), (48, 1))
+        pose = np.eye(4)
+        pose[:3, 3] = [0.25 * i + 0.003, 0.003, 0.0]
+        wrong = np.kron(np.random.default_rng(i).random((12, 16)) < 0.1, np.ones((4, 4), bool))
+        for key, frames in seen.items():
+            labels = truth if key == "gt" else np.where(wrong, (truth + 1) % 3, truth)
+            labels = np.where((labels == 1) & (i in sources.get(key, ())), 2, labels).astype(np.uint8)
+            frames.append(Frame(i, depth, Intrinsics(focal, focal, size[1] / 2, size[0] / 2), pose, labels=labels))
+    write_posed(folder / name, [f"{i:04d}" for i in range(9)], seen, classes=CLASSES, up_axis="-y")
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Path:
+    """old with the label source net; new with net, whose doors are windows in FAULTY, and same, as net was."""
+    base = tmp_path_factory.mktemp("compare")
+    write_scene(base / "a", {"net": set()})
+    write_scene(base / "b", {"net": set(FAULTY), "same": set()})
+    for name, scene, more in (
+        ("old", base / "a", {}), ("new", base / "b", {}), ("coarse", base / "a", {"voxel_size": 0.25}),
+    ):  # fmt: skip
+        settings = {"check": None, "voxel_size": 0.125, "statistics": True, "backends": ["numba"], **more}
+        semstab.run(configure(scene, **settings), out=base / name, report=False)
+    return base
+
+
+@pytest.fixture(scope="module")
+def fault(runs) -> RunComparison:
+    return semstab.compare([runs / "old", f"{runs}/new:net"], runs / "compared")
+
+
+def rows(own: Against, of: str = "") -> dict[str, Contrast]:
+    return {row.measure: row for row in (*own.contrasts, *own.by_class) if row.of == of}
+
+
+def test_a_run_and_itself_do_not_differ_anywhere(runs):
+    (own,) = semstab.compare([runs / "old", f"{runs}/new:same"]).overall
+    assert {row.difference.value for row in (*own.contrasts, *own.by_class)} == {0.0}
+    assert {row.change for row in (*own.contrasts, *own.by_class)} == {""}
+    assert all(row.difference.low == row.difference.high == 0 for row in own.contrasts)
+
+
+def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault):
+    (own,) = fault.scenes[0].against
+    assert fault.scenes[0].basis == "looks"
+    found = rows(own)
+    assert found["alpha_between"].difference.value < -0.05
+    assert found["accuracy"].other < found["accuracy"].base
+    assert found["coverage"].difference.value == 0
+    assert rows(own, "door")["alpha_between"].difference.value < rows(own, "wall")["alpha_between"].difference.value
+    assert own.places
+    assert {(place.of, place.instead) for place in own.places} == {("door", "window")}
+    assert {blame.frame for place in own.places for blame in place.frames} <= set(FAULTY)
+    assert {FAULTY[0], FAULTY[1]} <= {blame.frame for blame in own.blamed} <= set(FAULTY)
+    assert own.worse > 10 * own.better
+
+
+def test_the_numbers_are_those_of_the_runs_where_all_looks_are_common(runs, fault):
+    record = semstab.load_result(runs / "old").record(backbone="net")
+    found = rows(fault.overall[0])
+    judged, right = record.statistics.judged, record.statistics.correctness
+    assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
+    assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
+    assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
+    assert found["reached"].base == pytest.approx(record.statistics.reach.reached.value, abs=1e-9)
+    assert found["flicker_percent"].base == pytest.approx(record.image_space.flicker_percent)
+    assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
+    assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
+
+
+def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):
+    folder = runs / "compared"
+    again = load_comparison(folder)
+    assert [row.measure for row in again.overall[0].contrasts] == [row.measure for row in fault.overall[0].contrasts]
+    assert again.scenes[0].against[0].places == fault.scenes[0].against[0].places
+    for name in ("comparison.md", "report.html", "recording.rrd", "tables/comparison.csv", "figures/comparison.svg",
+                 "figures/comparison_classes.png", "figures/comparison_map__wall__new.png"):  # fmt: skip
+        assert (folder / name).stat().st_size > 0
+    page = (folder / "report.html").read_text()
+    assert "new against old" in page
+    assert page.count("<figure") == 3
+    assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")
+
+
+def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
+    import pyarrow.parquet as pq
+
+    own = fault.scenes[0].against[0]
+    assert own.columns is not None
+    columns = pq.read_table(runs / "compared" / own.columns)
+    assert columns.num_rows == own.compared
+    assert (columns["change"].to_numpy() <= -0.2).sum() == own.worse
+    listed = [place.number for place in own.places if place.what == "agreement"]
+    assert set(listed) <= set(columns["place"].to_numpy().tolist())
+    file = runs / "compared" / own.columns
+    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "place"], beside=file)
+    exported = pq.read_table(tmp_path / "map.parquet")
+    assert (exported["place"].to_numpy() > 0).sum() == (columns["place"].to_numpy() > 0).sum()
+    assert exported["change"].null_count == exported.num_rows - own.compared
+    with pytest.raises(DataError, match=r"voxels of 0\.125 m"):
+        semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], beside=file)
+
+
+def test_of_other_voxel_sizes_only_what_does_not_depend_on_them_is_compared(runs):
+    (scene,) = semstab.compare([runs / "old", runs / "coarse"]).scenes
+    assert scene.basis == "cubes"
+    assert set(rows(scene.against[0])) == {"reached", "flicker_percent", "accuracy", "miou"}
+    assert not scene.against[0].places
+    assert "voxels of 0.125 m and 0.25 m" in scene.remarks[0]
+
+
+def test_of_other_frames_of_reference_nothing_is_paired(runs):
+    entries = [each.scenes["wall"] for each in open_contenders([runs / "old", f"{runs}/new:net"])]
+    here = Georeference("PROJCRS", (0.0, 0.0, 0.0))
+    moved = dataclasses.replace(here, offset=(100.0, 0.0, 0.0))
+    for pairs in ((here, moved), (None, here)):
+        placed = [dataclasses.replace(entry, georeference=own) for entry, own in zip(entries, pairs, strict=True)]
+        found = pair(placed, ["old", "new"])
+        assert found.basis == "flights"
+        assert "nothing can be paired" in found.remarks[0]
+
+
+def contrast(value: float, error: float, measure: str = "psa") -> Contrast:
+    p = math.erfc(abs(value) / error / math.sqrt(2))
+    interval = Interval(value, value - 2 * error, value + 2 * error, degrees=1e6, p_value=p)
+    return Contrast(measure, "", 0.5, 0.5 + value, interval, math.nan, "")
+
+
+def test_over_scenes_each_counts_once():
+    (mean,) = over_scenes([[contrast(0.1, 0.1)], [contrast(0.3, 0.1)]])
+    assert (mean.base, mean.other, mean.difference.value) == pytest.approx((0.5, 0.7, 0.2))
+    assert mean.difference.high == pytest.approx(0.2 + 0.2 / math.sqrt(2))
+
+
+def test_what_is_claimed_is_corrected_for_all_that_is_compared_together():
+    ((one, two, three),) = corrected(
+        [[contrast(-0.3, 0.1), contrast(0.3, 0.1, "sbd_excess"), contrast(0.2, 0.1, "vss")]]
+    )
+    assert (one.change, two.change, three.change) == ("worse", "worse", "better")
+    assert one.p_holm == pytest.approx(3 * one.difference.p_value)
+    many = corrected([[contrast(0.2, 0.1)] * 4])[0]
+    assert {row.change for row in many} == {""}
+
+
+def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
+    text = StringIO()
+    print_comparison(fault, Console(file=text, width=80))
+    assert max(map(len, text.getvalue().splitlines())) <= 80
+    for word in ("wall: new less old", "alpha b.f.", "door", "window", "frames"):
+        assert word in text.getvalue()
+    page = markdown(fault)
+    assert page.startswith("## new against old\n")
+    assert "| Measure | old | The run |" in page
+
+
+def test_the_command_writes_a_folder_and_refuses_bad_input_in_one_line(runs, tmp_path):
+    done = bench("compare", runs / "old", runs / "old", "--markdown", cwd=tmp_path, columns=80)
+    assert done.stdout.startswith("## net (2) against net\n")
+    done = bench("compare", runs / "old", runs / "new", cwd=tmp_path, code=2)
+    assert done.stderr.count("\n") == 1
+    assert "holds several label sources (net, same); name one" in done.stderr
+
+
+def test_bad_input_is_one_line(runs, tmp_path):
+    with pytest.raises(ConfigError, match="name two runs or more"):
+        semstab.compare([runs / "old"])
+    broken = shutil.copytree(runs / "old", tmp_path / "broken")
+    content = json.loads((broken / "summary.json").read_text())
+    (broken / "summary.json").write_text(json.dumps({**content, "runs": [3]}))
+    with pytest.raises(DataError, match=r"summary\.json"):
+        semstab.compare([runs / "old", broken])
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").touch()
+    with pytest.raises(ConfigError, match="holds no comparison"):
+        semstab.compare([runs / "old", runs / "old"], tmp_path / "full")
+    (runs / "old" / "voxels").rename(runs / "old" / "gone")
+    try:
+        assert semstab.compare([runs / "old", runs / "old"]).scenes[0].basis == "cubes"
+    finally:
+        (runs / "old" / "gone").rename(runs / "old" / "voxels")
