@@ -211,7 +211,8 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
         assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        assert row["sbd_p"] == base[row["backbone"]].drift.tests.sbd_p or row["backbone"] == "gt"
+        assert "sbd_p" not in row  # so few frames cannot tell how long errors last
+        assert row["trend"] == pytest.approx(base[row["backbone"]].drift.tests.trend, nan_ok=True)
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
         assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])

@@ -14,9 +14,11 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import vss
 from semstab.metrics.matching import shared_rows
 from semstab.model.measures import VSS
-from semstab.statistics import coverage, paired, psa, standardised
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
+from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
-from semstab.statistics.comparison import EDGES, holm, standard_weights
+from semstab.statistics.comparison import EDGES, standard_weights
+from semstab.statistics.differences import holm
 
 SIDE = 24
 
@@ -198,6 +200,33 @@ def test_maps_without_a_common_voxel_leave_everything_undefined():
 
 
 # --- Tests ------------------------------------------------------------------------------------------------------------
+
+
+def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():
+    found = compare_backbones(two_backbones(np.random.default_rng(4), 0.05, side=16))
+    (p,) = (row.p_value for row in found.paired.differences if row.measure == found.paired.primary)
+    unclaimed = tuple(dataclasses.replace(row, undecided="too few") for row in found.paired.differences)
+    silent = dataclasses.replace(found, paired=dataclasses.replace(found.paired, differences=unclaimed))
+    together = claimed_together([found, silent, found])
+    corrected = [
+        row.p_holm for scene in together for row in scene.paired.differences if row.measure == found.paired.primary
+    ]
+    assert corrected == [
+        pytest.approx(min(1, 2 * p)),
+        pytest.approx(math.nan, nan_ok=True),
+        pytest.approx(min(1, 2 * p)),
+    ]
+
+
+def test_what_describes_says_what_its_interval_answers():
+    """With logs of enough frames the next flight, where the sums tell; SBD for this map."""
+    rng = np.random.default_rng(6)
+    logs = {name: log_of(rng.integers(0, 2, size=(256, 30)), K=2, index=grid(16)) for name in "ab"}
+    result = paired({name: log.table() for name, log in logs.items()}, logs=logs)
+    answers = {row.measure: row.question for row in result.differences}
+    assert answers["psa"] == answers["alpha"] == answers["entropy"] == NEXT_FLIGHT
+    assert answers["sbd"] == answers["vss"] == THIS_MAP
+    assert all(row.difference.low < 0 < row.difference.high for row in result.differences)
 
 
 def test_holm_is_that_of_statsmodels():

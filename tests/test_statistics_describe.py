@@ -200,7 +200,7 @@ def test_the_line_says_what_to_do_and_why():
 def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames_are_said():
     events = backbone(0.1, 3)
     few = describe(events.table(), events).verdict.line
-    assert "intervals are for these 8 frames: fly 60 or more to tell of the next flight" in few
+    assert "intervals are for these 8 frames: fly 30 or more to tell of the next flight" in few
     assert "these frames: keep a log" in describe(events.table()).verdict.line
     alike = Interval(0.9, 0.85, 0.95, undecided="errors reach as far as the scene: fly more of it")
     found = verdict("net", judged=Judged(*[alike] * 5, UNKNOWN), reach=None, voxels=5000, share=0.5, blocks=40)

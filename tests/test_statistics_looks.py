@@ -182,6 +182,23 @@ def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
     assert describe(log.table(), sample=sample, critical=["0"]).verdict.level == "stable"
 
 
+def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict():
+    """No class is at fault, and each has an alpha of 0.96: only the places tell."""
+    rng = np.random.default_rng(5)
+    n = 10404
+    own, coin = np.arange(n)[:, None] % 3, np.arange(n)[:, None] % 50 == 0
+    log = log_of(np.where(coin, rng.integers(0, 2, size=(n, 8)), own), K=3, index=grid(102))
+    found = describe(log.table())
+    assert found.flipping.share.low < 0.02 < found.flipping.share.high < 0.03
+    assert (found.flipping.a, found.flipping.b) == ("0", "1")
+    assert found.flipping.part > 0.9
+    assert found.verdict.level == "stable"
+    assert "not to act on: 1.9% of the places of this map flip" in found.verdict.line
+    assert "of that between 0 and 1" in found.verdict.line
+    twice = describe(log_of(np.repeat(own, 2, axis=1), K=3, index=grid(102)).table())
+    assert "seen too seldom to tell which of them flip" in twice.verdict.line
+
+
 @pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04, 0.08])
 def test_the_ground_truth_of_a_real_scene_is_stable_at_every_voxel_size(voxel_size, shelf):
     sampler = Sampler(voxel_size, 5)

@@ -30,8 +30,9 @@ from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
-from semstab.statistics.comparison import LEAST_VOXELS, holm
+from semstab.statistics.comparison import LEAST_VOXELS
 from semstab.statistics.correctness import ACCURACY, MIOU
+from semstab.statistics.differences import holm
 from semstab.statistics.sampling import (
     InfluenceSums,
     Places,

@@ -33,7 +33,7 @@ from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
-from semstab.statistics import BackboneComparison, Looks
+from semstab.statistics import BackboneComparison, Looks, claimed_together
 
 GB = 1e9
 
@@ -308,7 +308,8 @@ def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
         agreement = (*_samples(plan, contents), *_agreement(plan.config, records, tables))
         compared = tuple(_compared(plan.config, records, tables))
     with found.watch("comparisons"):
-        comparisons = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
+        scenes = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
+        comparisons = claimed_together(scenes)
     return Result(
         name=plan.config.name,
         backend=plan.config.backends[0].name,

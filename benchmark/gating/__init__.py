@@ -24,8 +24,6 @@ from semstab.statistics.sampling.influence import columns_of
 
 __all__ = ["GateConfig", "GateResult", "gate", "gate_config"]
 
-SCORES = "labels beside scores, which spread their evidence: run both as labels"
-
 
 def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> GateResult:
     """Judge a run, or 'FOLDER:BACKBONE', by rules; those on a drop or a rise need a baseline, a run or a small summary.
@@ -117,8 +115,15 @@ def _judged(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence
         (own.scenes[scene], None if base is None else base.scenes[scene])
         for scene in ([rule.scene] if rule.scene else scenes)
     ]
-    each = [_found(rule, new, old, ways) for new, old in pairs]
-    found = mean_of(each, 1 - 2 * ways.level)
+
+    def at(level: float) -> Interval:
+        chosen = dataclasses.replace(ways, level=level)
+        return mean_of([_found(rule, new, old, chosen) for new, old in pairs], 1 - 2 * level)
+
+    found = at(ways.level)
+    if judging.doubtful(found):
+        strict = dataclasses.replace(at(ways.level * judging.DOUBT), undecided="")
+        found = found if judging.verdict(rule, strict) == "undecided" else strict
     return Judgement(
         rule,
         judging.verdict(rule, found),
@@ -146,7 +151,7 @@ def _found(rule: Rule, new: Entry, base: Entry | None, ways: _Ways) -> Interval:
     else:
         found = judging.change(new.sums, base.sums, rule.measure, _k(rule, new), ways.level, ways.frames)
     if rule.measure.quantity in OF_EVIDENCE and (new.summary.reduced is None) != (base.summary.reduced is None):
-        found = dataclasses.replace(found, undecided=SCORES)
+        found = dataclasses.replace(found, undecided=judging.SCORES)
     return found if rule.change == "rise" else judging.negative(found)
 
 

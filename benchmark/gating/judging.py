@@ -27,9 +27,14 @@ Frames = Literal["random", "fixed"]
 LEAST = 8
 """Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
 
+DOUBT = 0.1
+"""Where errors or the quality of frames may reach as far as the data, each end is missed so much less often: what holds
+even then is concluded."""
+
 AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
 NOTHING = "it has no value: nothing that it is of was seen twice"
 UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
+SCORES = "labels beside scores, which spread their evidence: run both as labels"
 FEW = "{frames} frames are too few: fly {least} or more"
 
 
@@ -85,6 +90,12 @@ def comparable(new: InfluenceSums, base: InfluenceSums) -> tuple[InfluenceSums, 
     if new.truth == base.truth:
         return new, base
     return new.without_truth(), base.without_truth()
+
+
+def doubtful(found: Interval) -> bool:
+    """Whether nothing may be concluded only because errors, or the quality of frames, may reach as far as the data."""
+    final = ("frames are too few", NOTHING, UNKNOWN_FRAMES, SCORES)
+    return bool(found.undecided) and not any(reason in found.undecided for reason in final)
 
 
 def negative(found: Interval) -> Interval:

@@ -48,10 +48,10 @@ class Standardised:
 class PairedDifference:
     """A measure of backbone a minus that of b on the voxels that all saw twice or more.
 
-    p_value  that there is none, of the primary measure; p_holm corrects it for the number of pairs (Holm 1979). The
-             other measures describe: they have intervals and no test
-    question   what interval and p-value of the primary measure answer, see `Interval`
-    undecided  why nothing may be claimed of it; empty where something may
+    p_value  that there is none, of the primary measure; p_holm corrects it for all pairs, and all scenes of a study, of
+             which something may be claimed (Holm 1979). The other measures describe: they have intervals and no test
+    question   what interval and p-value answer, see `Interval`
+    undecided  why nothing may be claimed; empty where something may
     """
 
     measure: str

@@ -222,6 +222,23 @@ class Judged:
 
 
 @dataclass(frozen=True)
+class Flipping:
+    """Places about which frames do not agree: with OP >= 2, and two frames agree with a probability below 0.8.
+
+    share    of these places, each counting by how likely it is one, for this map
+    seen     the part of them that four frames or more saw: of fewer looks it cannot be told whether errors come again
+             at the same places
+    a, b     the two classes between which most of them flip, with the part of all flips that is between these
+    """
+
+    share: Interval
+    seen: float
+    a: str = ""
+    b: str = ""
+    part: float = math.nan
+
+
+@dataclass(frozen=True)
 class DriftTests:
     """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
 
@@ -408,6 +425,7 @@ class MapStatistics:
     blocks: BlockCut
     verdict: StabilityVerdict
     agreement: FrameAgreement
+    flipping: Flipping | None
     judged: Judged
     reach: Reach | None
     correlogram: Correlogram | None

@@ -8,7 +8,16 @@ from collections.abc import Iterable, Sequence
 
 from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
-from semstab.model.statistics import NEXT_FLIGHT, DriftTests, Estimate, LagBin, MapStatistics, Reach, RuleOutcome
+from semstab.model.statistics import (
+    NEXT_FLIGHT,
+    DriftTests,
+    Estimate,
+    Flipping,
+    LagBin,
+    MapStatistics,
+    Reach,
+    RuleOutcome,
+)
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -68,9 +77,8 @@ def comparison_lines(found: BackboneComparison) -> list[str]:
 
 
 def _tested(row: PairedDifference) -> str:
-    if math.isnan(row.p_holm):
-        return ""
-    return f"{_p('p', row.p_holm)}, {row.undecided or row.question}"
+    answers = row.undecided or row.question
+    return answers if math.isnan(row.p_holm) else f"{_p('p', row.p_holm)}, {answers}"
 
 
 def _looks(found: CommonLooks) -> list[str]:
@@ -93,6 +101,7 @@ def _agreement(found: MapStatistics) -> list[Row]:
         ("Fleiss' kappa", found.agreement.kappa, ""),
         ("Krippendorff's alpha", found.agreement.alpha, ""),
         ("VSS", found.agreement.vss, ""),
+        *([] if found.flipping is None else [("places that flip", found.flipping.share, _between(found.flipping))]),
         ("two looks differ within a frame", found.agreement.within, ""),
         ("  and between frames", found.agreement.between, ""),
         ("alpha between frames", found.agreement.alpha_between, ""),
@@ -100,6 +109,10 @@ def _agreement(found: MapStatistics) -> list[Row]:
         *([] if found.reach is None else _reach(found.reach)),
         *([] if found.correlogram is None else _standard(found.correlogram.standard)),
     ]
+
+
+def _between(flips: Flipping) -> str:
+    return f"{_share(flips.part)} of it {flips.a} - {flips.b}" if flips.a else ""
 
 
 def _judged(found: MapStatistics) -> list[Row]:
@@ -126,7 +139,7 @@ def _reach(reach: Reach) -> list[Row]:
 
 
 def _standard(found: LagBin) -> list[Row]:
-    ceiling = "" if math.isnan(found.ceiling) else f"ceiling {found.ceiling:.2f}; {found.pairs} pairs"
+    ceiling = "" if math.isnan(found.ceiling) else f"ceiling {found.ceiling:.2f}; {found.pairs} pairs; this map"
     return [(f"alpha b.f., views {found.low:g} to {found.high:g} deg.", found.alpha, ceiling)]
 
 

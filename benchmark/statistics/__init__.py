@@ -36,6 +36,7 @@ from semstab.statistics.correctness import (
     stable_wrong,
 )
 from semstab.statistics.description import Analysis, analyse, describe
+from semstab.statistics.differences import claimed_together
 from semstab.statistics.drift import (
     Flips,
     VoxelDrift,
@@ -78,6 +79,7 @@ __all__ = [
     "analyse",
     "benjamini_hochberg",
     "ceiling",
+    "claimed_together",
     "class_agreement",
     "compare_backbones",
     "correctness",

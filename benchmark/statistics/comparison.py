@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 
@@ -10,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.metrics.matching import observations, require_same_grid, rows_of, shared_rows
-from semstab.model.comparison import MapCoverage, Paired, PairedDifference, Rank, Ranking
+from semstab.metrics.matching import require_same_grid, shared_rows
+from semstab.model.comparison import MapCoverage, Paired, Rank, Ranking
 from semstab.model.measures import Quantity, dominant, measures
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import Estimate
+from semstab.model.statistics import UNDEFINED, Estimate
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import (
     ALPHA,
@@ -34,6 +33,7 @@ from semstab.statistics.blocks import (
     spatial_blocks,
 )
 from semstab.statistics.correctness import ACCURACY, join_truth
+from semstab.statistics.differences import OnCommonPlaces, differences
 
 Float64 = npt.NDArray[np.float64]
 Tables = Mapping[str, VoxelTable]
@@ -164,50 +164,26 @@ def paired(
 ) -> Paired:
     """Compare backbones voxel by voxel where all of them observed at least twice.
 
-    truth is the map of the ground truth labels; without it there is no accuracy. Intervals come from one spatial block
-    bootstrap, the same resamples for all; block_size is in metres. Only the primary measure is tested, alpha or alpha
-    between frames: for the next flight where the logs of the tables are given, else for this map. `whole` are the same
-    tables before looks were reduced to a class, where they were: of them is alpha between frames.
+    truth is the map of the ground truth labels; without it there is no accuracy. Only the primary measure is tested,
+    alpha or alpha between frames, for the next flight where the logs of the tables are given, else for this map; the
+    other differences describe. Ranks come from one bootstrap over blocks of space, of an edge of block_size metres.
+    `whole` are the same tables before looks were reduced to a class, where they were: of them is alpha between frames.
     """
     rows = repeated_rows(tables)
     first = next(iter(tables.values()))
     blocks = spatial_blocks(first.index[rows[0]], first.voxel_size, size=block_size, least=least_blocks)
     bootstrap = BlockBootstrap(blocks, replicates=replicates, seed=seed)
     columns, statistics = _columns(tables, rows, truth, whole or tables)
-    values, differences, rankings = {}, [], []
+    common = OnCommonPlaces.of(tables, rows, truth, logs or {}, reduced=whole is not None and primary == ALPHA)
+    values: dict[str, dict[str, Estimate]] = {}
     for measure, statistic in statistics.items():
-        sums = columns[measure]
-        bounds = (-1.0, 1.0) if measure in (ALPHA, ALPHA_BETWEEN) else (0.0, 1.0)
-        values[measure.key] = {name: bootstrap.estimate(sums[name], statistic, bounds) for name in tables}
-        differences += _differences(measure, statistic, sums, bootstrap)
-        rankings.append(_ranking(measure, statistic, sums, bootstrap))
-    tested = _tested(primary, tables, rows, logs or {})
-    differences = [tested.get((row.measure, row.a, row.b), row) for row in differences]
-    return Paired(primary.key, len(rows[0]), blocks.count, blocks.size, values, tuple(differences), tuple(rankings))
-
-
-def _tested(
-    primary: Quantity, tables: Tables, rows: Sequence[npt.NDArray[np.int64]], logs: Mapping[str, Events]
-) -> dict[tuple[str, str, str], PairedDifference]:
-    """The differences of the primary measure with their p-values, corrected for the number of pairs."""
-    from semstab.statistics.sampling import difference, influence_sums
-
-    if not len(rows[0]):
-        return {}
-    sums = {}
-    for (name, table), own in zip(tables.items(), rows, strict=True):
-        where = np.zeros(len(table), dtype=np.bool_)
-        where[own] = True
-        log = None if name not in logs else observations(logs[name], np.flatnonzero(where[logs[name].voxel]))
-        sums[name] = influence_sums(rows_of(table, where), log)
-    found = [(a, b, difference(sums[a], sums[b], primary.key)) for a, b in itertools.combinations(tables, 2)]
-    corrected = holm([interval.p_value for *_, interval in found])
-    return {
-        (primary.key, a, b): PairedDifference(
-            primary.key, a, b, Estimate(i.value, i.low, i.high), i.p_value, p_holm, i.question, i.undecided
-        )
-        for (a, b, i), p_holm in zip(found, corrected, strict=True)
-    }
+        own = columns[measure]
+        values[measure.key] = {
+            name: UNDEFINED if common is None else common.value(measure, name, own[name], statistic) for name in tables
+        }
+    rankings = tuple(_ranking(measure, of, columns[measure], bootstrap) for measure, of in statistics.items())
+    paired_rows = differences(primary, columns, statistics, common)
+    return Paired(primary.key, len(rows[0]), blocks.count, blocks.size, values, paired_rows, rankings)
 
 
 def _columns(
@@ -232,40 +208,6 @@ def _columns(
             right = np.stack([true.known & (dominant(table) == true.label), true.known], axis=1)
             columns[ACCURACY][name] = right[r].astype(np.float64)
     return columns, statistics
-
-
-def _differences(
-    measure: Quantity,
-    statistic: Statistic,
-    columns: Mapping[str, Float64],
-    bootstrap: BlockBootstrap,
-) -> list[PairedDifference]:
-    found = []
-    for a, b in itertools.combinations(columns, 2):
-        both = np.concatenate([columns[a], columns[b]], axis=1)
-        estimate = bootstrap.estimate(both, _difference_of(statistic, columns[a].shape[1]))
-        found.append(PairedDifference(measure.key, a, b, estimate, math.nan, math.nan))
-    return found
-
-
-def _difference_of(statistic: Statistic, C: int) -> Statistic:
-    """The statistic of the first C sums minus that of the others."""
-    return lambda sums: statistic(sums[..., :C]) - statistic(sums[..., C:])
-
-
-def holm(p: Sequence[float]) -> list[float]:
-    """P-values corrected for their number: rejecting those <= q keeps the chance of any false one at q (Holm 1979).
-
-    >>> [round(value, 2) for value in holm([0.01, 0.04, 0.03])]
-    [0.03, 0.06, 0.06]
-    """
-    corrected = [math.nan] * len(p)
-    tested = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
-    highest = 0.0
-    for rank, (value, i) in enumerate(tested):
-        highest = max(highest, min(1.0, value * (len(tested) - rank)))
-        corrected[i] = highest
-    return corrected
 
 
 def _ranking(

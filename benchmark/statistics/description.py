@@ -59,6 +59,7 @@ from semstab.statistics.drift import (
     trend_columns,
     voxel_drift,
 )
+from semstab.statistics.flipping import flipping
 from semstab.statistics.looks import Sample, correlogram, reach_from
 from semstab.statistics.map_sums import (
     BY_STRATUM,
@@ -156,6 +157,7 @@ def analyse(
         sbd_excess=maps["sbd_excess"],
         edge=places.edge,
     )
+    stable = steady(table)
     about = _About(name, seed, critical, TableSums.of(table, edges).summary(table.voxel_size, table.classes, edges))
     summary = _concluded(
         about,
@@ -163,13 +165,14 @@ def analyse(
         sums,
         sample,
         agreement=agreement,
+        flipping=flipping(table, stable, places),
         drift=_drift(means, by_log),
         strata=_strata(about.table, stratum_sums(table, maps, edges)),
         geometry=None if limit is None else losses(table, limit, seed=seed),
         correctness=right,
         fusion_rules=None if events is None else _fusion_rules(table, events, known),
     )
-    return Analysis(summary, {**maps, "stable": steady(table)}, sums)
+    return Analysis(summary, {**maps, "stable": stable}, sums)
 
 
 def analyse_sums(
@@ -259,6 +262,7 @@ def _concluded(
         about.name or "backbone",
         judged=judged,
         reach=reach,
+        flips=sections.get("flipping"),
         voxels=repeated.voxels,
         share=repeated.share,
         blocks=count,
@@ -279,7 +283,7 @@ def _concluded(
         correlogram=None if sample is None else correlogram(sample),
         uncertainty=EntropyParts(means.mean("entropy"), means.mean("entropy_within"), means.mean("entropy_between")),
         beyond_coin=BeyondCoin(means.sums.estimate("coin", _less, (-1.0, 1.0)), means.mean("steadier", (-1.0, 1.0))),
-        **({"geometry": None, "correctness": None, "fusion_rules": None} | sections),
+        **({"flipping": None, "geometry": None, "correctness": None, "fusion_rules": None} | sections),
     )
 
 

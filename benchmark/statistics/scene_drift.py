@@ -16,9 +16,13 @@ from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.drift import VoxelDrift, drift_tables, streams, trend_columns, variation, varying
+from semstab.statistics.sampling.reach import arrangement
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+
+CERTAIN, MOST_SPANS = 0.95, 128
+"""How certain it must be that errors last no longer, and by how many spans of time that is looked at."""
 
 SAMPLE, ORDERS = 30_000, 499
 """About so many observations are put into so many orders."""
@@ -123,7 +127,7 @@ def _sampled(table: VoxelTable, events: Events, seed: int) -> _Sampled:
     rows = np.arange(len(of)) + (first - np.cumsum(T) + T)[of]
     frames, rank = np.unique(events.frame[rows], return_inverse=True)
     lasting = _lasting(_departures(table, events, voxel, of, rows), rank, len(frames))
-    stretches = min(MOST_STRETCHES, len(frames) // lasting)
+    stretches = min(MOST_STRETCHES, int(len(frames) / (1 + 2 * lasting)))
     return _Sampled(voxel, first, T, rank * stretches // max(len(frames), 1), stretches)
 
 
@@ -138,26 +142,18 @@ def _departures(table: VoxelTable, events: Events, voxel: Int64, of: Int64, rows
     return departures
 
 
-def _lasting(departures: Float64, frame: Int64, frames: int) -> int:
-    """For how many frames what departs in one is seen to depart in the next ones, 1 where each errs anew.
-
-    Twice the sum of the autocorrelations of the frames' mean departures, as long as pairs of them are positive (Geyer
-    1992, Statistical Science 7).
-    """
+def _lasting(departures: Float64, frame: Int64, frames: int) -> float:
+    """For how many frames what departs in one may last in the next ones: the longest reach not excluded at 95 %."""
     if frames < 2:
-        return 1
-    series = np.bincount(frame, weights=departures, minlength=frames) / np.bincount(frame, minlength=frames)
-    series = series - series.mean()
-    length = float(series @ series)
-    if length <= 0:
-        return 1
-    rho = [float(series[lag:] @ series[:-lag]) / length for lag in range(1, frames)]
-    total = 0.0
-    for a, b in zip(rho[::2], rho[1::2], strict=False):
-        if a + b <= 2 / math.sqrt(frames):
-            break
-        total += a + b
-    return 1 + round(2 * total)
+        return 0.0
+    size = np.bincount(frame, minlength=frames).astype(np.float64)
+    series: Float64 = np.bincount(frame, weights=departures, minlength=frames).astype(np.float64)
+    series = series - size / size.sum() * series.sum()
+    span = -(-frames // MOST_SPANS)  # frames that are looked at as one, where there are many
+    starts = np.arange(0, frames, span)
+    sums: Float64 = np.add.reduceat(series, starts)
+    sizes: Float64 = np.add.reduceat(size, starts)
+    return span * arrangement(np.arange(len(starts))[:, None]).longest(sums, sizes, CERTAIN)
 
 
 def _total(values: Float64) -> float:

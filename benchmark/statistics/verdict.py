@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import math
 
-from semstab.model.statistics import NEXT_FLIGHT, ClassReach, Estimate, Interval, Judged, Level, Reach, StabilityVerdict
+from semstab.model.statistics import (
+    NEXT_FLIGHT,
+    ClassReach,
+    Estimate,
+    Flipping,
+    Interval,
+    Judged,
+    Level,
+    Reach,
+    StabilityVerdict,
+)
 from semstab.statistics.sampling import LEAST_FRAMES
 
 RELIABLE = 0.8
@@ -34,6 +44,9 @@ ADVICE: dict[Level, str] = {
 }
 """What to do at each level."""
 
+ACTED_ON, LEAST_FLIPS = ("stable", "partly stable", "usable"), 0.001
+"""Levels at which labels are acted on, and the share of places that flip from which on it is said beside them."""
+
 ONE_CLASS = "hardly more than one class was predicted, so that agreement says nothing"
 
 
@@ -42,6 +55,7 @@ def verdict(
     *,
     judged: Judged,
     reach: Reach | None,
+    flips: Flipping | None = None,
     voxels: int,
     share: float,
     blocks: int,
@@ -50,6 +64,7 @@ def verdict(
 
     judged         of these voxels
     reach          the same beside its ceiling; where it is not known, alpha between frames is judged as it is
+    flips          of them, the places about which frames do not agree: few of them hide in any mean
     voxels, share  how many they are, and of all voxels
     blocks         in how many cubes of space they lie
     """
@@ -63,6 +78,8 @@ def verdict(
     found += [_alpha(judged.alpha_between)] if reach is None else _reached(reach)
     if not math.isnan(wrong.low):
         found.append(f"{wrong.value:.0%} of the stable places are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
+    if flips is not None and level in ACTED_ON:
+        found += _flips(flips)
     basis = _basis(judged, reach)
     reason = basis.undecided if level == "undecided" and basis.undecided else ADVICE[level]
     return StabilityVerdict(level, f"{backbone}: {level}, {reason}: {', '.join(found)}; {support}; {_holds(basis)}")
@@ -83,6 +100,16 @@ def _holds(basis: Interval) -> str:
 
 def _alpha(alpha: Estimate) -> str:
     return f"alpha between frames {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}), its ceiling not known"
+
+
+def _flips(flips: Flipping) -> list[str]:
+    if flips.seen < 0.5:
+        return ["most places were seen too seldom to tell which of them flip"]
+    if not flips.share.value >= LEAST_FLIPS:
+        return []
+    share, part = flips.share, f", {flips.part:.0%} of that between {flips.a} and {flips.b}" if flips.a else ""
+    far = f"{share.value:.1%} of the places of this map flip ({share.low:.1%} to {share.high:.1%})"
+    return [f"not to act on: {far}{part}"]
 
 
 def _reached(reach: Reach) -> list[str]:

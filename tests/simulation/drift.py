@@ -3,7 +3,8 @@
     python tests/simulation/drift.py [--runs 200]
 
 Groups of 12 voxels that are first seen together, in frames whose errors are anew in each or last (autocorrelation 0.8),
-common to a group or to a frame. Share of scenes with p <= 0.05, of the test by SBD and of that by the trend.
+common to a group or to a frame. Share of scenes of which a p-value is told, and with p <= 0.05, of the test by SBD and
+of that by the trend.
 """
 
 from __future__ import annotations
@@ -41,16 +42,16 @@ def scene(rng: np.random.Generator, case: tuple[int, int, int], common: str, las
     return log_of(np.broadcast_to(labels, (groups, GROUP, F)).reshape(-1, F), K=2)
 
 
-def rejected(case: tuple[int, int, int], common: str, lasting: float, runs: int) -> tuple[float, float]:
-    """Share of the scenes that are found to drift, by SBD and by the trend."""
+def rejected(case: tuple[int, int, int], common: str, lasting: float, runs: int) -> tuple[float, float, float]:
+    """Share of the scenes that have a p-value, and that are found to drift, by SBD and by the trend."""
     rng, found = np.random.default_rng(1), []
     for _ in range(runs):
         events = scene(rng, case, common, lasting)
         table = events.table()
         test = scene_drift(table, events, voxel_drift(table, events, draws=1, most=1), frame_orders=99)
-        found.append((test.p_value <= 0.05, test.trend_p <= 0.05))
-    by_sbd, by_trend = np.mean(found, axis=0)
-    return float(by_sbd), float(by_trend)
+        found.append((not np.isnan(test.p_value), test.p_value <= 0.05, test.trend_p <= 0.05))
+    told, by_sbd, by_trend = np.mean(found, axis=0)
+    return float(told), float(by_sbd), float(by_trend)
 
 
 def main() -> None:
@@ -58,13 +59,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=200)
     runs = parser.parse_args().runs
-    print("| frames, seen in | errors | by SBD | by trend |\n|---|---|---|---|")
+    print("| frames, seen in | errors | told | by SBD | by trend |\n|---|---|---|---|---|")
     for case in CASES:
         for common in ("group", "frame"):
             for lasting in (0.0, 0.8):
-                by_sbd, by_trend = rejected(case, common, lasting, runs)
+                told, by_sbd, by_trend = rejected(case, common, lasting, runs)
                 errors = f"of a {common}, {'lasting' if lasting else 'anew'}"
-                print(f"| {case[0]}, {case[1]} | {errors} | {by_sbd:.3f} | {by_trend:.3f} |", flush=True)
+                print(f"| {case[0]}, {case[1]} | {errors} | {told:.2f} | {by_sbd:.3f} | {by_trend:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.looks import Sample
 from semstab.statistics.sampling import InfluenceSums, influence_sums
 
 ROUGH = 0.5
@@ -24,9 +25,12 @@ class Flight:
     frames   of the flight
     looks    frames that see a place, on average; all of them where it is as many as frames
     quality  of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with 0.8),
-             'view' (the farther from the middle of the frame, the worse)
+             'view' (the farther from the middle of the frame, the worse), 'direction' (each place is hard from a
+             direction of its own, which neighbours have in common)
     city     whether the floor is one of boxes with walls, in three dimensions
     coin     whether labels are drawn at random instead
+    K        classes
+    soft     whether frames give scores: as much for the label as the place is easy, the rest for all alike
     """
 
     side: int = 48
@@ -37,6 +41,8 @@ class Flight:
     quality: str = "alike"
     city: bool = False
     coin: bool = False
+    K: int = 2
+    soft: bool = False
 
 
 def field(side: int, reach: float, rng: np.random.Generator) -> np.ndarray:
@@ -76,21 +82,36 @@ def places(flight: Flight) -> np.ndarray:
 
 @dataclass(frozen=True)
 class World:
-    """A scene as it is: indices (n, 3), the true class (n,) of two, and how hard each place is (n,)."""
+    """A scene as it is.
+
+    index  (n, 3) of its voxels, truth (n,) their class
+    hard   (n,) how hard each is, turned (n,) the direction in radians from which it is hardest
+    mixed  (n,) the part of a voxel that is of the next class, as at a border
+    """
 
     index: np.ndarray
     truth: np.ndarray
     hard: np.ndarray
+    turned: np.ndarray
+    mixed: np.ndarray
 
 
 def world(flight: Flight, rng: np.random.Generator) -> World:
     """A scene of the kind that the flight says."""
     index = places(flight)
     x, y, z = index.T
-    classes, hard = field(flight.side, max(flight.reach, 0.5), rng), field(flight.side, flight.reach, rng)
-    turned = (x + z) % flight.side  # a wall continues the field of the floor
     order = np.lexsort(index.T[::-1])
-    return World(index[order], (classes[turned, y] > 0).astype(int)[order], hard[turned, y][order])
+    at = ((x + z)[order] % flight.side, y[order])  # a wall continues the field of the floor
+    classes = np.stack([field(flight.side, max(flight.reach, 0.5), rng)[at] for _ in range(max(flight.K - 1, 1))])
+    hard = field(flight.side, flight.reach, rng)[at]
+    truth = (classes[0] > 0).astype(int) if flight.K == 2 else _largest(classes)
+    turned = np.pi * field(flight.side, flight.reach, rng)[at]
+    return World(index[order], truth, hard, turned, np.where(np.abs(classes[0]) < 0.25, 0.3, 0.0))
+
+
+def _largest(classes: np.ndarray) -> np.ndarray:
+    """The class (n,) whose field (K - 1, n) is highest; the last one where all are low."""
+    return np.where(classes.max(axis=0) > 0, classes.argmax(axis=0), len(classes))
 
 
 def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | None = None) -> np.ndarray:
@@ -99,35 +120,61 @@ def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | Non
     off = over.index[:, :1] - (np.arange(F) + 0.5) / F * flight.side
     width = flight.side * flight.looks / F
     seen = np.ones((n, F), bool) if flight.looks >= F else np.abs(off) <= width / 2
-    harder = over.hard[:, None] - (flight.ease if ease is None else ease) + qualities(flight, rng)
+    voxel, frame = np.nonzero(seen)
+    off = off[seen] / width
+    harder = over.hard[voxel] - (flight.ease if ease is None else ease) + qualities(flight, rng)[frame]
     if flight.quality == "view":
-        harder = harder + 3 * np.abs(off) / width - 0.7
-    wrong = rng.random((n, F)) < (0.5 if flight.coin else 0.6 * norm.cdf(harder / ROUGH))
-    return np.where(seen, np.where(wrong, 1 - over.truth[:, None], over.truth[:, None]), -1)
+        harder = harder + 3 * np.abs(off) - 0.7
+    if flight.quality == "direction":
+        harder = harder + np.cos(2 * np.pi * off - over.turned[voxel])
+    wrong = rng.random(len(voxel)) < (0.5 if flight.coin else 0.6 * norm.cdf(harder / ROUGH))
+    other = 1 if flight.K == 2 else 1 + rng.integers(flight.K - 1, size=len(voxel))
+    labels = np.full((n, F), -1)
+    labels[voxel, frame] = np.where(wrong, (over.truth[voxel] + other) % flight.K, over.truth[voxel])
+    return labels
 
 
-def log_of(labels: np.ndarray, index: np.ndarray, voxel_size: float = 0.125) -> Events:
-    """The log of labels (n, F) of the voxels of these indices (n, 3), which are sorted."""
+def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = 0.125) -> Events:
+    """The log of labels (n, F), or of scores for them."""
     some = (labels >= 0).any(axis=1)
     voxel, frame = np.nonzero(labels[some] >= 0)
-    evidence = np.eye(2)[labels[some][voxel, frame]]
-    return Events(*index[some].T, voxel, frame, evidence, np.ones(len(voxel)), voxel_size)
+    evidence = np.eye(flight.K)[labels[some][voxel, frame]]
+    if flight.soft:
+        sure = norm.cdf(1.0 - over.hard[some][voxel])[:, None]
+        evidence = sure * evidence + (1 - sure) / flight.K
+    return Events(*over.index[some].T, voxel, frame, evidence, np.ones(len(voxel)), voxel_size)
 
 
 def table_of(log: Events) -> VoxelTable:
-    """The map of a log of labels; nothing here asks for its drift."""
-    op = np.bincount(log.voxel)
-    evidence = np.add.reduceat(log.evidence, log.starts, axis=0)
+    """The map of a log; nothing here asks for its drift."""
+    op, scores = np.bincount(log.voxel), log.evidence[:]
     rest = {"drift_sum": np.zeros(len(op)), "frame_entropy_sum": np.zeros(len(op))}
     frames = {"first_frame": np.zeros(len(op)), "last_frame": np.zeros(len(op))}
     return VoxelTable(
-        log.ix, log.iy, log.iz, op=op, evidence=evidence, pixels=op, self_sum=op.astype(float), **rest, **frames,
-        voxel_size=log.voxel_size,
+        log.ix, log.iy, log.iz, op=op, evidence=np.add.reduceat(scores, log.starts, axis=0), pixels=op,
+        self_sum=np.add.reduceat((scores**2).sum(axis=1), log.starts), **rest, **frames, voxel_size=log.voxel_size,
     )  # fmt: skip
 
 
-def sums_of(labels: np.ndarray, over: World) -> InfluenceSums:
+def sums_of(labels: np.ndarray, over: World, flight: Flight = Flight()) -> InfluenceSums:
     """The sums of a flight, with the truth."""
-    log = log_of(labels, over.index)
+    log = log_of(labels, over, flight)
     some = (labels >= 0).any(axis=1)
     return influence_sums(table_of(log), log, over.truth[some])
+
+
+def sample_of(labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator) -> Sample:
+    """What a sampler takes of a flight: at borders each frame sees another part of the next class.
+
+    A label that errs moves all that the frame sees of a voxel by as many classes.
+    """
+    some = (labels >= 0).any(axis=1)
+    voxel, frame = np.nonzero(labels[some] >= 0)
+    n, truth, mixed = len(voxel), over.truth[some][voxel], over.mixed[some][voxel]
+    part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(n), 0, 1), 0.0)[:, None]
+
+    def log(first: np.ndarray) -> Events:
+        evidence = (1 - part) * np.eye(flight.K)[first] + part * np.eye(flight.K)[(first + 1) % flight.K]
+        return Events(*over.index[some].T, voxel, frame, evidence, np.ones(n), 0.125)
+
+    return Sample(log(labels[some][voxel, frame]), log(truth), (), soft=False)

@@ -18,7 +18,7 @@ import numpy as np
 from flights import Flight, fly, sums_of, world
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
-from semstab.statistics.sampling import InfluenceSums, difference, estimate
+from semstab.statistics.sampling import difference, estimate
 from semstab.statistics.sampling.influence import FUNCTIONALS
 
 KEYS = ("alpha", "psa", "accuracy")
@@ -42,16 +42,23 @@ class Row:
         """As the table has them."""
         values = np.array([i.value for i in self.intervals])
         half = np.median([(i.high - i.low) / 2 for i in self.intervals])
-        decided = np.mean([i.decided for i in self.intervals])
-        share = self.covered()
-        error = np.sqrt(max(share * (1 - share), 0.01) / len(values))
+        decided = np.array([i.decided for i in self.intervals])
+        held = np.array([i.low <= self.target <= i.high for i in self.intervals])
+        above = np.array([i.low > self.target for i in self.intervals])
+        claimed = self.covered(lambda interval: interval.decided)
         return [
-            self.name, self.key, f"{self.target:.3f}", f"{values.std():.3f}", f"{half:.3f}", f"{share:.3f}",
-            f"{error:.3f}", f"{np.mean([i.low > self.target for i in self.intervals]):.3f}", f"{decided:.2f}",
+            self.name, self.key, f"{self.target:.3f}", f"{values.std():.3f}", f"{half:.3f}",
+            _share(held.mean(), len(held)), f"{decided.mean():.2f}", _share(claimed, int(decided.sum())),
+            f"{np.mean(decided & ~held):.3f}", f"{np.mean(decided & above):.3f}",
         ]  # fmt: skip
 
 
-HEAD = ["condition", "of", "target", "sd", "half width", "coverage", "mc error", "low end above", "decided"]
+def _share(share: float, of: int) -> str:
+    """With its standard error, no smaller than that of a share of 5 %."""
+    return f"{share:.3f} ± {np.sqrt(max(share * (1 - share), 0.0475) / of):.3f}" if of else ""
+
+
+HEAD = ["condition", "of", "target", "sd", "half width", "held", "claimed", "held of claimed", "wrong", "low end above"]
 
 
 def trials(
@@ -63,7 +70,7 @@ def trials(
     for trial in range(count):
         rng = np.random.default_rng([seed, trial])
         over = world(flight, rng)
-        sums = sums_of(fly(flight, over, rng), over)
+        sums = sums_of(fly(flight, over, rng), over, flight)
         for key in keys:
             found[key].append(estimate(sums, key, question=question))
             totals[key] = totals[key] + sums.of(FUNCTIONALS[key].names).sum(axis=0)
@@ -85,6 +92,9 @@ def this_map(count: int, seed: int) -> Iterator[Row]:
             Flight(80, reach, city=True), count, seed, THIS_MAP, ("alpha",), f"city 80 x 80, reach {reach:g}"
         )
     yield from trials(Flight(100, 2.0, coin=True), count, seed, THIS_MAP, KEYS, "floor 100 x 100, a coin")
+    for soft, K in ((True, 2), (False, 5)):
+        name = "floor 100 x 100, reach 2, " + ("scores" if soft else f"{K} classes")
+        yield from trials(Flight(100, 2.0, K=K, soft=soft), count, seed, THIS_MAP, ("alpha_between", "accuracy"), name)
     for ease in (2.0, 2.5, 3.0):
         yield from trials(
             Flight(100, 2.0, ease), count, seed, THIS_MAP, KEYS, f"floor 100 x 100, reach 2, ease {ease:g}"
@@ -95,15 +105,30 @@ def this_map(count: int, seed: int) -> Iterator[Row]:
 
 
 def next_flight(count: int, seed: int) -> Iterator[Row]:
-    """All frames see all, or each a strip; frames of five kinds."""
-    for frames in (20, 40, 60, 100):
-        for looks in (frames, 5):
-            for quality in ("alike", "bad", "uneven", "lasting", "view"):
-                flight = Flight(32, 1.5, 1.0, frames, looks, quality)
-                if quality == "view" and looks == frames:
-                    continue
-                name = f"{frames} frames, {quality}, {'all see all' if looks == frames else 'strips'}"
-                yield from trials(flight, count, seed, NEXT_FLIGHT, ("alpha",), name)
+    """All frames see all, or each a strip; frames of six kinds; and other scenes, classes, scores, shares of errors."""
+    for frames in (20, 30, 40, 60, 100):
+        for quality in ("alike", "bad", "uneven", "lasting"):
+            yield from _of_frames(Flight(45, 2.0, 1.0, frames, 5, quality), count, seed)
+    for frames in (30, 60):
+        for quality in ("alike", "bad", "uneven", "lasting"):
+            yield from _of_frames(Flight(45, 2.0, 1.0, frames, frames, quality), count, seed)
+        for quality in ("view", "direction"):
+            yield from _of_frames(Flight(45, 2.0, 1.0, frames, 5, quality), count, seed)
+    for quality in ("bad", "lasting", "direction"):
+        yield from _of_frames(Flight(60, 2.0, 1.0, 40, 5, quality, city=True), count, seed, "city 60 x 60")
+        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, K=5), count, seed, "five classes")
+        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, "scores", "alpha_between")
+        yield from _of_frames(Flight(45, 2.0, 2.2, 40, 5, quality), count, seed, "few errors")
+        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality), count, seed, "", "psa")
+    yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, coin=True), count, seed, "a coin")
+    for quality in ("bad", "lasting"):
+        yield from _of_frames(Flight(224, 4.0, 1.0, 40, 5, quality), count, seed, "floor 224 x 224, reach 4")
+
+
+def _of_frames(flight: Flight, count: int, seed: int, where: str = "", key: str = "alpha") -> Iterator[Row]:
+    seen = "all see all" if flight.looks == flight.frames else "strips"
+    name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, seen, where)))
+    yield from trials(flight, count, seed, NEXT_FLIGHT, (key,), name)
 
 
 # --- Differences ------------------------------------------------------------------------------------------------------
@@ -111,22 +136,28 @@ def next_flight(count: int, seed: int) -> Iterator[Row]:
 
 def differences(count: int, seed: int) -> Iterator[Row]:
     """Two models that err equally often, on the same scene: in the same frames, or in two flights."""
-    for quality in ("alike", "bad", "uneven", "lasting"):
-        for same in (True, False):
-            flight = Flight(32, 1.5, 1.0, 64, 64, quality)
-            found: list[Interval] = []
-            for trial in range(count):
-                rng = np.random.default_rng([seed, trial])
-                over = world(flight, rng)
-                other = dataclasses.replace(over, hard=world(flight, rng).hard)
-                pair = [sums_of(fly(flight, scene, rng), over) for scene in (over, other)]
-                found.append(_difference(pair, same))
-            where = "same frames" if same else "two flights"
-            yield Row(f"64 frames, {quality}, {where}", "alpha a - b", 0.0, tuple(found))
+    for side, looks in ((32, 60), (45, 5)):
+        for quality in ("alike", "bad", "uneven", "lasting"):
+            yield from _pairs(Flight(side, 1.5, 1.0, 60, looks, quality), count, seed)
+    yield from _pairs(Flight(32, 1.5, 1.0, 15, 5, "alike"), count, seed, THIS_MAP, "this map")
+    yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", K=5), count, seed, where="five classes")
+    yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", soft=True), count, seed, where="scores")
 
 
-def _difference(pair: Sequence[InfluenceSums], same: bool) -> Interval:
-    return difference(pair[0], pair[1], "alpha", same_frames=same)
+def _pairs(flight: Flight, count: int, seed: int, question: Question = NEXT_FLIGHT, where: str = "") -> Iterator[Row]:
+    key = "alpha_between" if flight.soft else "alpha"
+    found: dict[str, list[Interval]] = {"same frames": [], "two flights": []}
+    for trial in range(count):
+        rng = np.random.default_rng([seed, trial])
+        over = world(flight, rng)
+        other = dataclasses.replace(over, hard=world(flight, rng).hard)
+        pair = [sums_of(fly(flight, scene, rng), over, flight) for scene in (over, other)]
+        found["same frames"].append(difference(*pair, key, question=question, same_frames=True))
+        found["two flights"].append(difference(*pair, key, question=question, same_frames=False))
+    seen = "all see all" if flight.looks == flight.frames else "strips"
+    for flights, intervals in found.items():
+        parts = (f"{flight.side} x {flight.side}, {flight.frames} frames", flight.quality, seen, where, flights)
+        yield Row(", ".join(filter(None, parts)), f"{key} a - b", 0.0, tuple(intervals))
 
 
 # --- Table ------------------------------------------------------------------------------------------------------------

@@ -138,7 +138,7 @@ def _comparison(result: Result) -> Iterator[Figure]:
             "comparison",
             "Differences on the same places",
             "Differences of the backbones on the voxels that all of them saw twice or more, with intervals at 95%"
-            " from a bootstrap over blocks of space. An interval that holds 0 decides nothing.",
+            " whose question stands in the table. An interval that holds 0 decides nothing.",
             "One panel a measure with the difference of each pair of backbones in each scene and its interval, and 0.",
             lambda: draw_intervals(
                 panels,

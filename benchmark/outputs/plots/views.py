@@ -17,7 +17,7 @@ from semstab.model.results import Unit
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.histograms import Histograms, histograms, together
 from semstab.outputs.plots.statistics import DriftByOP
-from semstab.outputs.plots.topdown import FromAbove, topmost
+from semstab.outputs.plots.topdown import MOST, FromAbove, topmost
 from semstab.statistics import expected_sbd
 
 LARGEST = 2e8
@@ -76,7 +76,8 @@ class Views:
         if slug in self._above:
             return self._above[slug]
         if self._last is None or self._last[0] != slug:
-            table = topmost(record.tiles(), up) if record.in_tiles else self._tables.of(record)
+            large = record.in_tiles and record.summary.table.voxels > MOST
+            table = topmost(record.tiles(), up) if large else self._tables.of(record)
             self._last = slug, FromAbove.of(table, up)
         return self._last[1]
 

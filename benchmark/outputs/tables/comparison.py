@@ -29,11 +29,11 @@ def _differences(result: Result) -> Table:
         Column("measure", "Measure"),
         Column("difference", "Difference", 4, signed=True),
         Column("p_holm", "p (Holm)", 4),
-        Column("answers", "p answers"),
+        Column("answers", "interval answers"),
     )
     caption = (
-        f"{_COMMON} Only the first measure is tested, its p corrected for the number of pairs by Holm's method; the"
-        f" others describe. {INTERVALS}"
+        f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
+        f" which something may be claimed; the others describe. {INTERVALS}"
     )
     groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")

@@ -120,8 +120,8 @@ def drift(result: Result) -> list[Table]:
     seen = SEEN_TWICE if logged else one_class
     tests = (
         " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
-        " the frames. Trending: voxels whose own trend is significant at a false discovery rate of 5%, of those seen"
-        " six times or more."
+        " stretches of time; none where errors may last too long for six of them. Trending: voxels whose own trend is"
+        " significant at a false discovery rate of 5%, of those seen six times or more."
     )
     caption = (
         f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."

@@ -159,13 +159,15 @@ def _beyond_places(grid: Grid, places: Arrangement, by_place: Spread) -> Spread:
     by_frame = frames.spread(influence, size)
     if not by_frame.variance > 0:
         return NO_FRAMES
-    kernel = frames.kernel(by_frame.block)
     with one_thread():
-        plain = float(influence @ kernel @ influence)
-        inside = float((kernel * (grid.cell.T @ places.kernel(by_place.block) @ grid.cell)).sum())
-    if not plain > 0:
-        return NO_FRAMES
-    return dataclasses.replace(by_frame, variance=by_frame.variance * max(1 - inside / plain, 0.0))
+        together = grid.cell.T @ places.mean_kernel(by_place.parts) @ grid.cell
+    parts = []
+    for part in by_frame.parts:
+        kernel = frames.kernel(part.block)
+        plain, inside = float(influence @ kernel @ influence), float((kernel * together).sum())
+        beyond = max(1 - inside / plain, 0.0) if plain > 0 else 0.0
+        parts.append(dataclasses.replace(part, variance=part.variance * beyond))
+    return Spread.mean(parts)
 
 
 def apart(one: Grid, other: Grid, question: Question) -> TwoWay:

@@ -25,14 +25,20 @@ from semstab.statistics.sampling.influence import (
 
 Float64 = npt.NDArray[np.float64]
 
-LEAST_FRAMES = 60
-"""Of fewer frames nothing is said about the next flight: bad ones may all have been missed, and a quality that lasts
-looks constant."""
+LEAST_FRAMES = 30
+"""Of fewer frames nothing is said about the next flight: a kind of bad frame, one in ten, is missed by one flight of 20
+frames in eight, by one of 30 in 24."""
 
 LEAST_DEGREES = 3.0
-"""Of fewer places that err independently of each other nothing is said: errors reach as far as the scene."""
+"""Where it is more likely than not that fewer places err independently of each other, nothing is said: errors reach as
+far as the scene."""
+
+LEAST_OF_BOTH = 2.0
+"""Of fewer degrees of freedom, the doubt about reaches in them, nothing is said: of places errors reach as far as the
+scene, of places and frames together quality lasts as long as the flight."""
 
 AS_FAR = "errors reach as far as the scene: fly more of it"
+AS_LONG = "the quality of frames lasts about as long as the flight: fly longer"
 TOO_FEW = "too few frames to tell of the next flight: fly {least} or more"
 NO_PLACES = "nothing was seen twice in two places: fly with more overlap"
 
@@ -180,10 +186,14 @@ def _p_value(found: float, spread: TwoWay) -> float:
 
 def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay, question: Question) -> Interval:
     frames = len(grid.frames) * grid.step
-    far = spread.total > TINY and not spread.places.degrees >= LEAST_DEGREES
+    places = spread.places
+    few = places.with_fewer(LEAST_DEGREES) > 0.5 or not places.degrees >= LEAST_OF_BOTH
+    far = spread.total > TINY and few
     reasons = [AS_FAR] if far else []
     if question == NEXT_FLIGHT and frames < LEAST_FRAMES:
         reasons.append(TOO_FEW.format(least=LEAST_FRAMES))
+    elif spread.frames.variance > 0 and not far and not spread.degrees >= LEAST_OF_BOTH:
+        reasons.append(AS_LONG)
     return Interval(
         found,
         low,
@@ -191,7 +201,7 @@ def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay,
         question=question,
         frames=frames,
         places=len(grid.places),
-        block_size=spread.places.block * grid.edge,
+        block_size=places.block * grid.edge,
         degrees=spread.degrees,
         undecided="; ".join(reasons),
     )

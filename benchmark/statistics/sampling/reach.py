@@ -1,13 +1,15 @@
 """The variance of a sum over places, or over frames, that err alike where they are near each other.
 
-How far errors reach is found by likelihood; pairs within four times that count, by a kernel that is the mean of all
-shifted grids of blocks; and what the kernel misses, where blocks are few or errors reach far, is put back.
+How far errors reach is found by likelihood, and what is found is a weight of each reach, not one of them. Under each,
+pairs within four times the reach count, by a kernel that is the mean of all shifted grids of blocks; and what the
+kernel misses, where blocks are few or errors reach far, is put back.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -17,12 +19,15 @@ from threadpoolctl import ThreadpoolController
 
 Float64 = npt.NDArray[np.float64]
 
-REACHES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+REACHES = (0.4, 0.5, 0.6, 0.75, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """How far errors may reach, in cells, besides not at all."""
 
-ALONE, DOUBT = (0.0, 0.5), 2.0
+ALONE, DOUBT = (0.0, 0.5), 4.0
 """Shares of a cell's variance that it may have for itself, and by how much the log likelihood must be better for that:
 a weak correlation that reaches far is seldom real, and leaves hardly anything to say."""
+
+UNLIKELY = 1e-3
+"""A reach of a smaller weight does not count."""
 
 ROUNDING = 1e-13
 """Influences below are rounding's."""
@@ -33,24 +38,70 @@ BLOCK = 4.0
 GROWTH = 0.75
 """A cell's standard deviation grows with this power of what is in it: between independent parts and equal ones."""
 
+MOST_KNOWN = 96
+"""So many answers of an arrangement are kept for the next number of the same map."""
+
 
 @dataclass(frozen=True)
-class Spread:
-    """The variance of a sum, the degrees of freedom of that number, and the block it was taken in, in cells."""
+class Part:
+    """The variance of a sum as it is under one reach: its weight, degrees of freedom, and the block, in cells."""
 
+    weight: float
     variance: float
     degrees: float
     block: float
 
 
+@dataclass(frozen=True)
+class Spread:
+    """The variance of a sum, the degrees of freedom of that number, and the likeliest block, in cells.
+
+    parts  what it is the mean of
+    """
+
+    variance: float
+    degrees: float
+    block: float
+    parts: tuple[Part, ...] = ()
+
+    @classmethod
+    def mean(cls, parts: Sequence[Part]) -> Spread:
+        """The mean of the variances; degrees say how well its logarithm is known, with the doubt about the reach.
+
+        The variance of the logarithm of an estimate of d degrees is about 2 / d; to it is added how far the logarithms
+        of the parts lie apart (as in a mean over models: Hoeting et al. 1999, Statistical Science 14).
+        """
+        block = max(parts, key=lambda part: part.weight).block
+        weight = np.array([part.weight for part in parts])
+        variance = np.array([part.variance for part in parts])
+        found = float(weight @ variance)
+        if not found > 0:
+            return cls(0.0, math.inf, block, tuple(parts))
+        logs = np.log(np.maximum(variance, 1e-3 * found))
+        doubt = 2 / np.array([part.degrees for part in parts]) + (logs - weight @ logs) ** 2
+        return cls(found, 2 / float(weight @ doubt), block, tuple(parts))
+
+    def with_fewer(self, degrees: float) -> float:
+        """The weight of the parts that have fewer degrees of freedom."""
+        return sum(part.weight for part in self.parts if part.degrees < degrees)
+
+
 @dataclass(frozen=True, eq=False)
-class _Model:
-    """Correlations of cells: their reach, their matrix (G, G), its eigenvalues (G,) and eigenvectors (G, G)."""
+class _Correlation:
+    """Correlations of cells of a reach: Gaussian or exponential, their eigenvalues (G,) and eigenvectors (G, G)."""
 
     reach: float
-    matrix: Float64
+    gaussian: bool
     values: Float64
     vectors: Float64
+
+    def __call__(self, distance: Float64) -> Float64:
+        """(G, G) of cells that are so far apart."""
+        if not self.reach:
+            return np.eye(len(distance))
+        far = distance / self.reach
+        correlations: Float64 = np.exp(-0.5 * far**2) if self.gaussian else np.exp(-far)
+        return correlations
 
 
 class Arrangement:
@@ -59,25 +110,40 @@ class Arrangement:
     def __init__(self, at: npt.NDArray[np.integer]) -> None:
         self.at = at.astype(np.float64)
         self.count = len(at)
+        self._known: dict[tuple[int, float, bytes], tuple[float, float]] = {}
+        self._kernels: dict[float, Float64] = {}
 
     @functools.cached_property
-    def _models(self) -> list[_Model]:
-        distance = np.sqrt(((self.at[:, None] - self.at[None]) ** 2).sum(axis=2))
-        eye = np.eye(self.count)
-        models = [_Model(0.0, eye, np.ones(self.count), eye)]
-        far = max(distance.max(initial=0.0), REACHES[0])
+    def _distance(self) -> Float64:
+        distance: Float64 = np.sqrt(((self.at[:, None] - self.at[None]) ** 2).sum(axis=2))
+        return distance
+
+    @functools.cached_property
+    def _correlations(self) -> list[_Correlation]:
+        found = [_Correlation(0.0, True, np.ones(self.count), np.eye(self.count))]
+        far = max(self._distance.max(initial=0.0), REACHES[0])
         for reach in (reach for reach in REACHES if reach <= far):
-            for matrix in (np.exp(-distance / reach), np.exp(-0.5 * (distance / reach) ** 2)):
-                values, vectors = np.linalg.eigh(matrix)
-                models.append(_Model(reach, matrix, np.maximum(values, 1e-9), vectors))
-        return models
+            for gaussian in (False, True):
+                of = _Correlation(reach, gaussian, np.zeros(0), np.zeros(0))
+                values, vectors = np.linalg.eigh(of(self._distance))
+                found.append(_Correlation(reach, gaussian, np.maximum(values, 1e-9), vectors))
+        return found
 
     def kernel(self, block: float) -> Float64:
         """(G, G) in how many of the shifted grids of blocks of that edge, in cells, two cells share a block."""
-        shared = np.ones((self.count, self.count))
-        for axis in self.at.T:
-            shared *= np.maximum(1.0 - np.abs(axis[:, None] - axis) / block, 0.0)
-        return shared
+        if block not in self._kernels:
+            shared = np.ones((self.count, self.count))
+            for axis in self.at.T:
+                shared *= np.maximum(1.0 - np.abs(axis[:, None] - axis) / block, 0.0)
+            self._kernels[block] = shared
+        return self._kernels[block]
+
+    def mean_kernel(self, parts: Sequence[Part]) -> Float64:
+        """The mean (G, G) of the kernels of parts."""
+        total = np.zeros((self.count, self.count))
+        for part in parts:
+            total += part.weight * self.kernel(part.block)
+        return total
 
     def spread(self, influence: Float64, size: Float64) -> Spread:
         """Of the sum over cells of influences (G,), which are centred; size (G,) is how much is in each cell."""
@@ -86,41 +152,69 @@ class Arrangement:
         if np.abs(influence).max() < ROUNDING:
             return Spread(0.0, self.count - 1.0, 1.0)
         with one_thread():
-            return self._spread(influence, size)
+            parts = self._parts(influence, size)
+        return Spread.mean(parts) if parts else Spread(math.nan, 0.0, 1.0)
 
-    def _spread(self, influence: Float64, size: Float64) -> Spread:
-        reach, model = self._likeliest(influence, size)
-        scale = size**GROWTH
-        covariance = model * scale[:, None] * scale
-        block = max(1.0, BLOCK * reach)
-        kernel = self.kernel(block)
-        seen = _centred(kernel, size) @ covariance
-        expected = float(np.trace(seen))
-        if expected <= 0:
-            return Spread(math.nan, 0.0, block)
-        missed = float(covariance.sum()) / expected
-        degrees = expected**2 / float((seen * seen.T).sum())
-        return Spread(float(influence @ kernel @ influence) * missed, min(degrees, carriers(influence)), block)
+    def longest(self, influence: Float64, size: Float64, level: float) -> float:
+        """The reach, in cells, that errors exceed with no more than the weight 1 - level; 0 where they do not reach."""
+        if self.count < 2 or np.abs(influence).max() < ROUNDING:
+            return 0.0
+        with one_thread():
+            weights = self._weights(influence, size)
+        reaches, shares = np.array(
+            sorted((self._correlations[number].reach, weight) for number, _, weight in weights)
+        ).T
+        return float(reaches[min(np.searchsorted(np.cumsum(shares), level), len(reaches) - 1)])
 
-    def _likeliest(self, influence: Float64, size: Float64) -> tuple[float, Float64]:
-        """The reach, and the correlations (G, G), by the likelihood of what centring leaves (REML)."""
+    def _parts(self, influence: Float64, size: Float64) -> list[Part]:
+        """What the variance is under each reach that is not unlikely."""
+        most, found = carriers(influence), []
+        for number, alone, weight in self._weights(influence, size):
+            block = max(1.0, BLOCK * self._correlations[number].reach)
+            kernel = self.kernel(block)
+            missed, degrees = self._missed(number, alone, size)
+            variance = float(influence @ kernel @ influence) * missed
+            if variance > 0 and degrees > 0:
+                found.append(Part(weight, variance, min(degrees, most), block))
+        total = sum(part.weight for part in found)
+        return [Part(part.weight / total, part.variance, part.degrees, part.block) for part in found]
+
+    def _missed(self, number: int, alone: float, size: Float64) -> tuple[float, float]:
+        """By how much the kernel's sum falls short under a correlation, and the degrees of freedom that it has."""
+        key = (number, alone, size.tobytes())
+        if key not in self._known:
+            scale = size**GROWTH
+            correlation = self._correlations[number]
+            covariance = (1 - alone) * correlation(self._distance) * scale[:, None] * scale
+            covariance[np.diag_indices(self.count)] += alone * scale**2
+            seen = _centred(self.kernel(max(1.0, BLOCK * correlation.reach)), size) @ covariance
+            expected = float(np.trace(seen))
+            some = expected > 0
+            missed = float(covariance.sum()) / expected if some else math.nan
+            degrees = expected**2 / float((seen * seen.T).sum()) if some else 0.0
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            self._known[key] = missed, degrees
+        return self._known[key]
+
+    def _weights(self, influence: Float64, size: Float64) -> list[tuple[int, float, float]]:
+        """Correlations by their number, with the share that a cell has for itself, and how likely they are (REML)."""
         scale = size**GROWTH
         seen, mean = influence / scale, size / scale
-        best, found = -math.inf, self._models[0]
-        share = 0.0
-        for model in self._models:
-            a, b = model.vectors.T @ seen, model.vectors.T @ mean
-            for alone in ALONE if model.reach else (0.0,):
-                v = (1 - alone) * model.values + alone
+        found, likely = [], []
+        for number, correlation in enumerate(self._correlations):
+            a, b = correlation.vectors.T @ seen, correlation.vectors.T @ mean
+            for alone in ALONE if correlation.reach else (0.0,):
+                v = (1 - alone) * correlation.values + alone
                 within = float((b * b / v).sum())
                 left = float((a * a / v).sum()) - float((a * b / v).sum()) ** 2 / within
-                if left <= 0:
-                    continue
-                likely = -0.5 * (float(np.log(v).sum()) + math.log(within) + (self.count - 1) * math.log(left))
-                likely -= DOUBT if alone else 0.0
-                if likely > best:
-                    best, found, share = likely, model, alone
-        return found.reach, (1 - share) * found.matrix + share * np.eye(self.count)
+                if left > 0:
+                    log = float(np.log(v).sum()) + math.log(within) + (self.count - 1) * math.log(left)
+                    found.append((number, alone))
+                    likely.append(-0.5 * log - (DOUBT if alone else 0.0))
+        weight = np.exp(np.array(likely) - max(likely)) if likely else np.zeros(0)
+        weight = np.where(weight < UNLIKELY * weight.sum(), 0.0, weight)
+        return [(*key, float(w / weight.sum())) for key, w in zip(found, weight, strict=True) if w > 0]
 
 
 @functools.lru_cache(maxsize=4)
