@@ -40,7 +40,7 @@ def wkt(crs: str, where: str) -> str:
         raise MissingDependencyError(f"{where}: a georeference needs pyproj; {INSTALL}") from error
     try:
         known = CRS.from_user_input(crs)
-    except CRSError as error:
+    except (CRSError, RecursionError) as error:  # a text of braces is read as JSON
         hint = "write it as EPSG:32615, a PROJ string or WKT"
         raise ConfigError(f"{where}: {crs[:80]!r} is no reference system ({one_line(error)[:80]}); {hint}") from error
     units = {axis.unit_name for axis in known.axis_info[:2]}

@@ -21,6 +21,7 @@ from semstab.datasets.formats.las_files import opened
 from semstab.datasets.surfaces.surface import Surface
 from semstab.engine.tiling.sights import Sights
 from semstab.errors import ConfigError, DataError, one_line
+from semstab.model.georeference import wkt
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.export.ply import Header
 from semstab.outputs.loaded import read_series
@@ -202,6 +203,8 @@ def test_json_nested_too_deeply_is_refused_wherever_it_stands(tmp_path) -> None:
             load(tmp_path / "a.parquet")
     with pytest.raises(ValueError, match="nested too deeply"):
         parse_json(deep)
+    with pytest.raises(ConfigError, match="is no reference system"):
+        wkt('{"a":' * 50_000, "crs")
 
 
 def test_sights_whose_header_ends_early_are_made_again(tmp_path) -> None:
