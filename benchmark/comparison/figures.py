@@ -18,6 +18,7 @@ from semstab.outputs.plots.statistics import draw_intervals
 from semstab.outputs.plots.style import Figure
 from semstab.statistics.agreement import PSA
 from semstab.statistics.correctness import MIOU
+from semstab.statistics.sampling import LEAST_FRAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -43,8 +44,8 @@ def _forest(found: RunComparison) -> Iterator[Figure]:
     yield Figure(
         "comparison",
         "Differences",
-        f"Each run less {found.base}, with intervals at 95%: for the next flight where 60 frames tell of it, else for"
-        " this map. An interval that holds 0 decides nothing.",
+        f"Each run less {found.base}, with intervals at 95%: for the next flight where {LEAST_FRAMES} frames tell of it,"
+        " else for this map. An interval that holds 0 decides nothing.",
         f"One panel a measure with the difference of each run from {found.base} and its interval, beside 0.",
         lambda: draw_intervals(panels, dict.fromkeys(panels, (0.0,))),
     )

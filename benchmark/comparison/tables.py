@@ -12,6 +12,7 @@ from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Estimate, Interval
 from semstab.outputs.tables.comparison import coverage_table, ignored_table
 from semstab.outputs.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA_BETWEEN, PSA
+from semstab.statistics.sampling import LEAST_FRAMES
 
 ALL_SCENES = "all scenes"
 NAMED_FRAMES = 5
@@ -20,8 +21,8 @@ IN_CLASSES = (VERDICT, ALPHA_BETWEEN, PSA, RECALL, IOU)
 """What the table of classes has beside each other."""
 
 ANSWERS = (
-    "In brackets: intervals at 95%. They answer for the next flight where 60 frames or more tell of it, else for this"
-    " map: other places like these in these very frames. p (Holm): that there is no difference, corrected for all that"
+    f"In brackets: intervals at 95%. They answer for the next flight where {LEAST_FRAMES} frames or more tell of it,"
+    " else for this map: other places like these in these very frames. p (Holm): that there is no difference, corrected for all that"
     " is compared in the scene, or over all scenes."
 )
 

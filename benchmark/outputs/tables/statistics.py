@@ -14,11 +14,15 @@ from semstab.outputs.averages import by_backbone
 from semstab.outputs.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
 from semstab.statistics.drift import FLIP_RATE
+from semstab.statistics.sampling import LEAST_FRAMES
 from semstab.statistics.verdict import ADVICE
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
-INTERVALS = "In brackets: intervals at 95% for this map; those of verdicts for the next flight if 60 frames tell of it."
+INTERVALS = (
+    "In brackets: intervals at 95% for this map; those of verdicts for the next flight"
+    f" if {LEAST_FRAMES} frames tell of it."
+)
 SEEN_TWICE = "Over the voxels seen twice or more."
 
 T = TypeVar("T")
