@@ -22,8 +22,8 @@ IN_CLASSES = (VERDICT, ALPHA_BETWEEN, PSA, RECALL, IOU)
 
 ANSWERS = (
     f"In brackets: intervals at 95%. They answer for the next flight where {LEAST_FRAMES} frames or more tell of it,"
-    " else for this map: other places like these in these very frames. p (Holm): that there is no difference, corrected for all that"
-    " is compared in the scene, or over all scenes."
+    " else for this map: other places like these in these very frames. p (Holm): that there is no difference, corrected"
+    " for all that is compared in the scene, or over all scenes."
 )
 
 
