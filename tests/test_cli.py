@@ -61,7 +61,6 @@ def test_a_run_on_a_folder(wall, tmp_path) -> None:
         "check: open3d against the numpy reference",
         "seen once",
         "folder: run",
-        "report: run/report.html",
     ):
         assert word in result.stdout
     for name in ("config.yaml", "manifest.json", "summary.json", "recording.rrd", "voxels/wall__a__open3d.parquet"):

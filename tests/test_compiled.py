@@ -61,7 +61,7 @@ def test_a_read_only_install_without_a_home_keeps_its_code_in_the_temporary_fold
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     arguments = ["--data", tiny_scene.write(tmp_path / "wall"), "--out", tmp_path / "run", "--backend", "numpy"]
-    arguments += ["--check", "none", "--set", "check_geometry=false", "--rerun", "off"]
+    arguments += ["--check", "none", "--set", "check_geometry=false", "--rerun", "off", "--report", "off"]
     elsewhere = {"TMPDIR": str(temporary), "NUMBA_CACHE_DIR": str(tmp_path / "home" / "cache")}
     done = run(installed / "program_that_runs.py", arguments, tmp_path, **elsewhere)
     assert done.returncode == 0, done.stderr

@@ -74,7 +74,7 @@ def test_a_run_equals_the_study_without_sweeps_voxel_for_voxel(root, tmp_path) -
 
 def test_every_folder_has_tables_figures_and_a_report_unless_told_otherwise(root, tmp_path) -> None:
     data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--rerun", "off")
-    out = bench(*data, "--out", "run", cwd=tmp_path).stdout
+    out = bench(*data, "--out", "run", cwd=tmp_path, report=True).stdout
     run = tmp_path / "run"
     assert "report: run/report.html" in out
     assert {"scenes.csv", "persistence.md", "verdicts.tex"} <= {file.name for file in (run / "tables").iterdir()}

@@ -130,7 +130,8 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
 
 def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("semstab.engine.work.room.resident_bytes", lambda: 0)  # what is estimated counts alone
-    config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, memory_gb=0.00007)
+    small = {"memory_gb": 0.00003, "tile_size": "off"}
+    config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, **small)
     result = run_study(config, tmp_path / "out")
     assert {failure.variation.sweep for failure in result.failures} == {"base"}
     assert "would take" in result.failures[0].message

@@ -29,9 +29,9 @@ def file(root, tmp_path):
     return path
 
 
-def study(*arguments: str | Path, cwd: Path, code: int = 0) -> tuple[str, str]:
+def study(*arguments: str | Path, cwd: Path, code: int = 0, report: bool = False) -> tuple[str, str]:
     """What it prints to stdout and stderr."""
-    done = bench("study", *arguments, cwd=cwd, code=code, columns=80)
+    done = bench("study", *arguments, cwd=cwd, code=code, columns=80, report=report)
     return done.stdout, done.stderr
 
 
@@ -40,7 +40,7 @@ def units(out: Path) -> int:
 
 
 def wait_for_units(out: Path, count: int) -> None:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while units(out) < count:
         assert time.monotonic() < deadline
         time.sleep(0.005)
@@ -66,7 +66,7 @@ def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file,
 
 def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
     arguments = (file, "--set", "backends=[numpy, numba]", "--set", "backbones=[a]", "--only", "backends")
-    out, errors = study(*arguments, "--set", "statistics=true", cwd=tmp_path)
+    out, errors = study(*arguments, "--set", "statistics=true", cwd=tmp_path, report=True)
     files = ("report.html", "manifest.json", "config.yaml", "tables/scenes.csv", "figures/persistence.png")
     for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex", "figures/correctness.svg"):
         assert (tmp_path / "studies/tiny" / name).exists()
@@ -100,11 +100,10 @@ def test_failing_units_are_one_line_each_and_the_others_are_reported(root, file,
     arguments = (file, "--out", "out", "--set", "backbones=[a, b]", "--only", "frame_count", "--only", "voxel_size")
     out, errors = study(*arguments, cwd=tmp_path, code=2)
     wall = tmp_path / "wall"
-    of_b, of_a = errors.splitlines()
+    of_b, of_a = (line for line in errors.splitlines() if line.startswith("error: "))  # others tell of progress
     assert of_b.startswith(f"error: wall, b: voxel_size 0.25 and 1 more: {wall}/labels/b/0002.png: not a PNG image")
     assert of_a.startswith(f"error: wall, a: frame_count 10: {wall}/depth/0003.png: not a PNG image")
     assert "seen once" in out
-    assert (tmp_path / "out" / "report.html").exists()
     assert len(json.loads((tmp_path / "out" / "summary.json").read_text())["failures"]) == 4
 
 
