@@ -20,7 +20,7 @@ Float64 = npt.NDArray[np.float64]
 
 DAMAGE = (
     ValueError, TypeError, LookupError, AttributeError, OSError, EOFError, AssertionError, NotImplementedError,
-    struct.error, RuntimeError,
+    struct.error, RuntimeError, OverflowError, NameError,
 )  # fmt: skip
 """What reading a damaged file may raise in libraries."""
 

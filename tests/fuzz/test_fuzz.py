@@ -171,6 +171,12 @@ def test_a_mesh_of_two_coordinates_is_refused(tmp_path) -> None:
         Surface(tmp_path / "a.obj").triangles.bounds  # noqa: B018
 
 
+def test_a_mesh_with_a_number_beyond_all_is_refused(tmp_path) -> None:
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 {'9' * 25}\n")
+    with pytest.raises(DataError, match=r"a\.obj: "):
+        Surface(tmp_path / "a.obj").triangles.bounds  # noqa: B018
+
+
 def test_a_saved_frame_with_a_damaged_header_is_refused(tmp_path) -> None:
     frame = {"frame": np.array(3), "labels": np.zeros((2, 3)), "palette": np.zeros((1, 3))}
     path = tmp_path / "s__m.npz"
