@@ -47,9 +47,11 @@ def test_help_imports_nothing_heavy(tmp_path) -> None:
 
 
 def test_list_names_what_there_is(tmp_path) -> None:
-    result = bench("list", cwd=tmp_path)
+    result = bench("list", cwd=tmp_path, columns=200)
     for word in ("open3d", "numpy", "city", "posed_folder", "uavid7", "ready"):
         assert word in result.stdout
+    studies = [line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["study"]]
+    assert [row[2] for row in studies] == ["city", "remedies", "uavid3d"]
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:

@@ -168,7 +168,8 @@ def assert_same_run(whole, tiles) -> None:
     assert len(list((tiles / "voxels").glob("*/tile=*.parquet"))) > 4
     assert not (tiles / "parts").exists()
     found = differences(summary_of(whole), summary_of(tiles), tolerance=1e-12)
-    assert [line for line in found if "voxels_file" not in line] == []
+    untold = ("voxels_file", ".flipping")  # places that flip need the prior of the whole map
+    assert [line for line in found if not any(word in line.split(":")[0] for word in untold)] == []
     one, other = (semstab.load(folder).table() for folder in (tiles, whole))
     assert_same_bits(one, other)
     for row, expected in zip(series_of(tiles), series_of(whole), strict=True):

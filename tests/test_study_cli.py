@@ -142,9 +142,3 @@ def test_bad_input_is_one_line(file, tmp_path, arguments, message) -> None:
     assert len(errors.splitlines()) == 1
     assert errors.startswith("error: ")
     assert message in errors
-
-
-def test_list_names_the_studies_that_ship(tmp_path) -> None:
-    result = bench("list", cwd=tmp_path, columns=200)
-    rows = [line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["study"]]
-    assert [row[2] for row in rows] == ["city", "uavid3d"]

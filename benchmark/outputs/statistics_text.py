@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
@@ -25,6 +26,7 @@ from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 Row = tuple[str, Estimate | float, str]
 Cell = str | float
 WIDTH = 80
+BELOW: Any = {"initial_indent": " " * 6, "subsequent_indent": " " * 6}
 THIN = 0.1
 """Part of the weights in strata that hardly overlap, from which on it is said."""
 
@@ -36,13 +38,15 @@ def lines(found: MapStatistics) -> list[str]:
         *textwrap.wrap(found.verdict.line, WIDTH),
         "",
         f"{repeated.voxels} of {found.voxels} voxels seen twice or more, in {blocks.count} cubes of space",
-        f"intervals at 95 %, for this map; errors depend on each other within blocks of {blocks.size:.4g} m",
+        *textwrap.wrap(
+            f"intervals at 95 %, for this map; errors depend on each other within blocks of {blocks.size:.4g} m", WIDTH
+        ),
         "",
         f"{'':<34}{'value':>9}   {'interval':<20}",
     ]
     sections = (_agreement, _judged, _drift, _uncertainty, _geometry, _correctness)
     rows = [row for section in sections for row in section(found)]
-    return [*head, *(_line(*row) for row in rows), *_tables(found)]
+    return [*head, *(line for row in rows for line in _laid_out(*row)), *_tables(found)]
 
 
 def comparison_lines(found: BackboneComparison) -> list[str]:
@@ -58,7 +62,8 @@ def comparison_lines(found: BackboneComparison) -> list[str]:
         "",
         f"{'difference on common voxels':<34}{'value':>9}   {'interval':<20}{'p (Holm)':>10}",
     ]
-    out += [_line(f"{r.measure}: {r.a} - {r.b}", r.difference, _tested(r)) for r in paired.differences]
+    for r in paired.differences:
+        out += _laid_out(f"{r.measure}: {r.a} - {r.b}", r.difference, _tested(r))
     if found.looks is not None:
         out += ["", *_looks(found.looks), ""]
     if found.standardised.thin > THIN:
@@ -69,7 +74,7 @@ def comparison_lines(found: BackboneComparison) -> list[str]:
             out += [_line(f"{quantity.key}, standardised: {name}", value) for name, value in own.items()]
     for ranking in paired.rankings:
         order = (f"{r.rank}. {r.backbone} (first in {_share(r.best)})" for r in ranking.ranks)
-        out.append(f"by {ranking.measure}: {', '.join(order)}")
+        out += textwrap.wrap(f"by {ranking.measure}: {', '.join(order)}", WIDTH, subsequent_indent="  ")
     if (rules := found.fusion_rules) is not None:
         changed = [measure for measure, changes in rules.order_changes.items() if changes]
         out.append(f"another fusion rule changes the order by: {', '.join(changed) or 'no measure'}")
@@ -112,7 +117,7 @@ def _agreement(found: MapStatistics) -> list[Row]:
 
 
 def _between(flips: Flipping) -> str:
-    return f"{_share(flips.part)} of it {flips.a} - {flips.b}" if flips.a else ""
+    return f"{flips.part:.0%} of it between {flips.a} and {flips.b}" if flips.a else ""
 
 
 def _judged(found: MapStatistics) -> list[Row]:
@@ -154,7 +159,7 @@ def _drift(found: MapStatistics) -> list[Row]:
         trending = f"{tests.trending_voxels} of {tests.tested_voxels} voxels do"
         rows += [
             ("disagreement that goes one way", tests.trend, ""),
-            ("  beyond random order", tests.trend_excess, f"{_p('p', tests.trend_p)}; {trending}"),
+            ("  beyond random order", tests.trend_excess, "; ".join(filter(None, (_p("p", tests.trend_p), trending)))),
         ]
     if flips is not None:
         rows += [("flip rate", flips.rate, ""), ("  beyond random order", flips.excess, "")]
@@ -242,6 +247,12 @@ def _line(name: str, estimate: Estimate | float, note: str = "") -> str:
         return f"{name:<34}{_cell(estimate):>9}   {'':<20}{note}".rstrip()
     interval = f"{_cell(estimate.low)} to {_cell(estimate.high)}"
     return f"{name:<34}{_cell(estimate.value):>9}   {interval:<20}{note}".rstrip()
+
+
+def _laid_out(name: str, estimate: Estimate | float, note: str) -> list[str]:
+    """A row; what does not fit beside its numbers stands below them."""
+    line = _line(name, estimate, note)
+    return [line] if len(line) <= WIDTH else [_line(name, estimate), *textwrap.wrap(note, WIDTH, **BELOW)]
 
 
 def _order(tests: DriftTests) -> str:
