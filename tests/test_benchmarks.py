@@ -14,7 +14,8 @@ SMALL = {
     "bench_fusion.py": ["--sizes", "96x54", "--rounds", "1", "--conditions", "noise 0.3 %"],
     "bench_scaling.py": ["--size", "96x54", "--voxels", "1000", "5000"],
     "bench_casting.py": ["--size", "96x54", "--triangles", "200", "--rounds", "1"],
-    "bench_end_to_end.py": ["--size", "96x54", "--frames", "3", "--runs", "1", "--noise", "0", "--backend", "numpy"],
+    "bench_end_to_end.py": ["--size", "96x54", "--frames", "3", "--runs", "1", "--noise", "0", "--backend", "numpy",
+                            "--depth", "png"],
     "bench_gpu.py": ["--device", "CPU:0", "--sizes", "96x54", "--classes", "3", "--voxels", "9000", "--rounds", "2",
                      "--copied-megabytes", "1", "--cpu-backends", "numba"],
 }  # fmt: skip
