@@ -40,6 +40,9 @@ SLOW = 2.0
 DEAD = 90.0
 """Seconds after which a worker that does not even hear the alarm is killed."""
 
+FRESH = 20_000
+"""Inputs after which another worker takes over: what libraries leak adds up."""
+
 PEAK = 500
 """Megabytes that one input may take beyond what the process had."""
 
@@ -187,8 +190,15 @@ def fuzz(seconds: float, seed: int, wanted: str | None, failures: Path) -> int:
             except EOFError:
                 sys.exit("a true file is not read; see what the worker says without its output shut")
             end = end or time.monotonic() + seconds
-            while time.monotonic() < end:
-                name, file, content = ours.recv()
+            for _ in range(FRESH):
+                if time.monotonic() > end:
+                    break
+                try:
+                    name, file, content = ours.recv()
+                except EOFError:
+                    worker.join()
+                    faults[f"the worker died between two inputs ({worker.exitcode}), seed {start}"] += 1
+                    break
                 try:
                     outcome = ours.recv() if ours.poll(DEAD) else Outcome(False, f"hangs for {DEAD} s, deaf")
                 except (EOFError, ConnectionResetError):
