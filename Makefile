@@ -23,7 +23,7 @@ bench: setup
 
 test: setup-dev
 	$(MAKE) --no-print-directory -j2 --output-sync=target lint fuzz-short
-	$(BIN)/pytest -n auto --maxprocesses 4
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1
