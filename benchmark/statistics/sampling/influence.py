@@ -169,8 +169,8 @@ class InfluenceSums:
             columns = np.stack([column.to_numpy() for column in content.columns[len(KEYS) :]], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
-            if not np.abs(columns).max(initial=0.0) <= LARGEST_SUM:
-                raise DataError("a sum is no number, or larger than a map can have it")
+            if np.any(np.abs(columns) > LARGEST_SUM):
+                raise DataError("a sum is larger than a map can have it")
             found: list[InfluenceSums | None] = []
             for number in range(3):
                 own = part == number
