@@ -30,8 +30,9 @@ DAMAGED = (
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, packed: bool = True) -> None:
     """Write numbers and arrays of numbers by name, atomically, with a digest of all of them; packed: compressed."""
     made: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    made[DIGEST] = _digest(made)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        (np.savez_compressed if packed else np.savez)(file, **made, **{DIGEST: _digest(made)})
+        (np.savez_compressed if packed else np.savez)(file, **made)
 
 
 def read_arrays(path: Path) -> Arrays | None:

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -80,8 +81,8 @@ class Sights:
         values = read_arrays(path)
         if values is None or values.keys() != {field.name for field in dataclasses.fields(cls)}:
             return None
-        numbers = {name: int(values[name]) for name in ("size", "frames")}
-        return cls(**{**values, **numbers})
+        own: dict[str, Any] = {**values, **{name: int(values[name]) for name in ("size", "frames")}}
+        return cls(**own)
 
 
 def look_at(
