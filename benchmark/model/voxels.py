@@ -304,7 +304,17 @@ class Events:
             classes=self.classes,
         )
 
-    def save(self, path: str | Path) -> None:
+    def rows(self, voxels: Int64) -> Events:
+        """The log of these of its voxels (r,), ascending."""
+        chosen = np.zeros(len(self.ix), np.bool_)
+        chosen[voxels] = True
+        rows = np.flatnonzero(chosen[self.voxel])
+        own: dict[str, Any] = {name: getattr(self, name)[chosen] for name in _INDEX_TYPES}
+        own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
+        number = np.cumsum(chosen) - 1
+        return replace(self, **own, voxel=number[self.voxel[rows]], evidence=self.evidence.take(rows))
+
+    def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
 
         def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
@@ -312,11 +322,42 @@ class Events:
             return own | {name: getattr(self, name)[self.voxel[some]] for name in _INDEX_TYPES}
 
         parts = map(columns, self.evidence.chunks())
-        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Events]) -> Events:
+        """One log of the voxels of several that share none."""
+        if len(parts) == 1:
+            return parts[0]
+        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _INDEX_TYPES}
+        order = _sorted(index)
+        count = np.concatenate([np.diff(np.append(part.starts, len(part))) for part in parts])
+        first = np.cumsum(count) - count
+        number = np.repeat(np.arange(len(order)), count[order])
+        rows = np.arange(len(number)) + (first[order] - np.cumsum(count[order]) + count[order])[number]
+        return cls(
+            **{name: values[order] for name, values in index.items()},
+            voxel=number,
+            frame=np.concatenate([part.frame for part in parts])[rows],
+            evidence=Evidence.joined([part.evidence for part in parts]).take(rows),
+            pixels=np.concatenate([part.pixels for part in parts])[rows],
+            voxel_size=parts[0].voxel_size,
+            classes=parts[0].classes,
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
-        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        """Read what `save` wrote, a file or a folder of tiles, all of it.
+
+        Raises DataError where a file is missing, damaged or of another kind, or a log in tiles is larger than memory.
+        """
+        files = parquet.files_of(path)
+        if len(files) > 1:
+            _require_memory(Path(path), files)
+        return cls.joined([cls._read(file) for file in files])
+
+    @classmethod
+    def _read(cls, path: Path) -> Events:
         with parquet.reading(path):
             content = parquet.read(path, _EVENT_TYPES | _INDEX_TYPES)
             first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from semstab.metrics.summary import STRATA, TableSums
 from semstab.model.measures import sbd, vss
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
@@ -44,16 +44,27 @@ class MapSums:
     influence: InfluenceSums
 
     @classmethod
-    def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> MapSums:
-        """Those of a table."""
-        maps = maps_of(table, null=expected_sbd(table))
+    def of(
+        cls,
+        table: VoxelTable,
+        edges: Sequence[int] = STRATA,
+        *,
+        events: Events | None = None,
+        true_label: npt.NDArray[np.int64] | None = None,
+        null: Float64 | None = None,
+    ) -> MapSums:
+        """Those of a table; with its log, its true classes (n,) and its SBD in random order (n,) where they are known.
+
+        Of right and wrong they lack how likely places are stable, which only the whole map tells: `StableLooks`.
+        """
+        maps = maps_of(table, null=expected_sbd(table) if null is None else null)
         places = Places(table.index[table.op >= 2], table.voxel_size)
         return cls(
             TableSums.of(table, edges),
             place_sums(table, maps, places),
             stratum_sums(table, maps, edges),
-            class_sums(table),
-            influence_sums(table, sbd_excess=maps["sbd_excess"], edge=places.edge),
+            class_sums(table, events),
+            influence_sums(table, events, true_label, sbd_excess=maps["sbd_excess"], edge=places.edge, likely=None),
         )
 
     @classmethod
@@ -78,6 +89,7 @@ class MapSums:
             "strata": self.strata,
             "classes": self.classes,
             "about": np.array([self.places.edge, self.influence.edge, self.influence.step, self.influence.voxel_size]),
+            "truth": np.array(self.influence.truth),
         }
 
     @classmethod
@@ -92,7 +104,7 @@ class MapSums:
             PlaceSums(arrays["place cells"], edge, places),
             arrays["strata"],
             arrays["classes"],
-            InfluenceSums(cell, frame, columns, cube, int(step), voxel_size, K, classes),
+            InfluenceSums(cell, frame, columns, cube, int(step), voxel_size, K, classes, bool(arrays["truth"])),
         )
 
 

@@ -53,6 +53,11 @@ class Portion:
         """Of the file of what is left of it."""
         return "frames" if self.part is None else self.part.name
 
+    @property
+    def folder(self) -> str:
+        """Of what is left of the unit until it is whole, in that of the run."""
+        return f"{PORTIONS}/{self.key}"
+
 
 @dataclass(frozen=True)
 class About:
@@ -75,7 +80,7 @@ class Finished:
     """What is left of a portion.
 
     series   (F, C) a row a frame: REPORT, then ROW
-    sums     over the voxels, by name: those of `TableSums`, or of `MapSums` where its map is judged
+    sums     over the voxels, by name: those of `TableSums`, or of `FirstSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     poses    (F, 4, 4) of the frames, where it is of these
     """

@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,22 @@ import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import to_csv
-from semstab.engine.tiling.portion import Finished, joined_series
+from semstab.engine.tiling.portion import PORTIONS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
+from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduced_of, save_voxels, unit_summary
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.summary import TableSums
-from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
+from semstab.model.parquet import tile_of
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.results import Agreement, Deviation
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import write_text
-from semstab.statistics import Looks
-from semstab.statistics.description import analyse_sums
-from semstab.statistics.map_sums import MapSums
+from semstab.statistics import Looks, Truth, join_truth
+from semstab.statistics.description import concluded
 from semstab.statistics.sampling import InfluenceSums
+from semstab.statistics.sums import FirstSums, SecondSums, Whole, second_look
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
@@ -41,7 +43,8 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
     sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
     if not sums.total[2]:
         raise no_voxels(task, config)
-    found = _statistics(planned, parts, folder, frames.about.files) if planned.judged else None
+    files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
+    found = _statistics(planned, parts, folder, files) if planned.judged else None
     rows = joined_series(frames.series, [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
@@ -52,11 +55,12 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
         reduced_of(np.sum(reduced, axis=0)) if reduced else None,
         frames.about.sizes,
     )
-    files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
+    files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
     if planned.kept:
         savers: Savers = {f"{FRAMES}/{unit.slug}.csv": lambda path: write_text(path, to_csv(rows))}
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
+            files |= found[2]
         files |= {name: _saved(save, folder / name) for name, save in savers.items()}
     content = UnitContent(
         planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
@@ -76,20 +80,67 @@ def _saved(save: Callable[[Path], None], path: Path) -> str:
 
 
 def _statistics(
-    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Iterable[str]
-) -> tuple[MapStatistics, InfluenceSums]:
-    """What the statistics say of all parts together, with the looks that were sampled of the frames."""
+    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Collection[str]
+) -> tuple[MapStatistics, InfluenceSums, dict[str, str]]:
+    """What the statistics say of all parts together, with the looks that were sampled of the frames.
+
+    Then each tile is looked at again, and written once more where the whole map tells more of its voxels: the digests
+    of these files.
+    """
     classes, config = planned.task.mapping.target.classes, planned.config
-    looks = next(Looks.load(folder / name) for name in files if name.startswith(f"{LOOKS}/"))
-    return analyse_sums(
-        MapSums.merged([MapSums.read(part.sums, classes) for part in parts]),
+    whole = Whole(FirstSums.merged([FirstSums.read(part.sums, classes) for part in parts]))
+    looks = {Path(name).stem: Looks.load(folder / name) for name in files if _is_looks(name)}
+    true_looks = looks.pop("true-looks", None)
+    (sample,) = (own.sample() for own in looks.values())
+    second, written = _second_looks(planned, whole, folder, files)
+    summary, sums = concluded(
+        whole,
+        second,
         voxel_size=config.voxel_size,
         classes=classes,
-        sample=looks.sample(),
+        sample=sample if true_looks is None else sample.against(true_looks.sample()),
         name=planned.task.backbone,
         edges=config.strata,
         critical=config.critical_classes,
     )
+    return summary, sums, written
+
+
+def _is_looks(name: str) -> bool:
+    return name.startswith(f"{LOOKS}/") or name.endswith("looks.parquet")
+
+
+def _second_looks(
+    planned: PlannedUnit, whole: Whole, folder: Path, files: Iterable[str]
+) -> tuple[SecondSums, dict[str, str]]:
+    unit, written = planned.unit, dict[str, str]()
+    found: list[SecondSums] = []
+    for name in (name for name in files if Path(name).parent.name in ("voxels", unit.slug)):
+        if not name.startswith((f"{VOXELS}/", f"{PORTIONS}/")):
+            continue
+        file, table = folder / name, VoxelTable.load(folder / name)
+        true = file.parents[1] / "truth" / file.name
+        truth = VoxelTable.load(true) if name.startswith(f"{PORTIONS}/") and true.exists() else None
+        known = None if whole.first.truth is None else _known(table, truth)
+        second, more = second_look(table, whole, known, truth)
+        found.append(second)
+        if planned.kept and planned.config.statistics:
+            maps = VoxelTable.columns(file, further_columns(file))
+            columns, tile = {**maps, **more, **whole.maps(table, maps)}, tile_of(file)
+            savers: Savers = {
+                f"{VOXELS}/{unit.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
+            }
+            if truth is not None and planned.image_space:
+                savers[f"{TRUTH}/{unit.slug}/{file.name}"] = partial(truth.save, tile=tile)
+            written |= {path: _saved(save, folder / path) for path, save in savers.items()}
+    return SecondSums.merged(found), written
+
+
+def _known(table: VoxelTable, truth: VoxelTable | None) -> Truth:
+    """The true classes of a tile; none where the ground truth saw nothing of it."""
+    if truth is None:
+        return Truth(np.zeros(len(table), np.bool_), np.full(len(table), -1, np.int64))
+    return join_truth(table, truth)
 
 
 def _checked(found: Sequence[Agreement | None]) -> Agreement | None:

@@ -116,7 +116,8 @@ class InfluenceSums:
         edge, step = self.edge, self.step
         while len(np.unique(self.cell // round(edge / self.edge), axis=0)) > MOST_CELLS:
             edge *= 2
-        while step and len(np.unique(self.frame // (step // self.step))) > most_groups(self.K):
+        known = self.frame[self.frame >= 0]
+        while step and len(np.unique(known // (step // self.step))) > most_groups(self.K):
             step *= 2
         return self if (edge, step) == (self.edge, self.step) else self.coarsened(edge, step)
 
