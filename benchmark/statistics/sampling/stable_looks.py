@@ -81,7 +81,7 @@ class StableLooks:
         return cls(*_distinct(np.concatenate(keys), weight), edge, step)
 
     def added_to(self, sums: InfluenceSums, likely: Callable[[Int64, Int64], Float64]) -> InfluenceSums:
-        """The sums of the same map with what is stable, by the probability (k,) of places seen and voted for so often."""
+        """The sums of the same map with what is stable, by the probability (k,) of places with these votes."""
         own = layout(sums.K, truth=True)
         stable = self.weight * likely(self.key[:, SEEN].astype(np.int64), self.key[:, MOST].astype(np.int64))
         rows, of = np.unique(self.key[:, :4], axis=0, return_inverse=True)
