@@ -11,7 +11,8 @@ import pytest
 from semstab import backends
 from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
-from semstab.statistics import ceiling, losses, psa, rendered
+from semstab.statistics import losses, psa, rendered
+from semstab.statistics.judging import ceiling
 from semstab.testing import sight_line
 
 K, SIZE = 3, 0.25
