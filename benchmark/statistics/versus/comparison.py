@@ -115,7 +115,7 @@ def standardised(
     def weighted(sums: Float64) -> Float64:
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums[..., :S] / sums[..., S:]
-        used = (w > 0) & (sums[..., S:] > 0)
+        used = (w > 0) & (sums[..., S:].real > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             value: Float64 = np.where(used, w * means, 0.0).sum(axis=-1) / np.where(used, w, 0.0).sum(axis=-1)
         return value
