@@ -11,8 +11,7 @@ import pytest
 from semstab import backends
 from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
-from semstab.statistics import losses, psa, rendered
-from semstab.statistics.judging import ceiling
+from semstab.statistics import ceiling, losses, psa, rendered
 from semstab.testing import sight_line
 
 K, SIZE = 3, 0.25

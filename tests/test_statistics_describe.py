@@ -17,9 +17,8 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.terminal.statistics import comparison_lines, lines
 from semstab.runtime.files import read_json, write_json
 from semstab.runtime.json_form import from_json, to_json
-from semstab.statistics import analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha
+from semstab.statistics import analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
 from semstab.statistics.agreement import PSA
-from semstab.statistics.judging import verdict
 
 SIDE, F = 24, 8
 
