@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,14 +31,14 @@ from semstab.model.statistics import (
 )
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import alpha_of, between_of, class_agreement_of, kappa_of, ratio_of
-from semstab.statistics.ceiling import losses_of
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
-from semstab.statistics.drift import expected_sbd
+from semstab.statistics.judging.ceiling import losses_of
+from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import Sample, correlogram, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
+from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, PlaceSums, judged_of, with_sample
 from semstab.statistics.sums import SecondSums, Whole, first_look, second_look
-from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 Float64 = npt.NDArray[np.float64]
@@ -49,19 +49,17 @@ class Analysis:
     """What the statistics say of a map.
 
     sums  by frame and cube of space, from which intervals and differences follow without voxels
+    make  gives the maps, when they are asked for
     """
 
     summary: MapStatistics
-    _further: Maps
     sums: InfluenceSums
-    _table: VoxelTable
-    _null: Float64 | None
+    make: Callable[[], Maps]
 
-    @cached_property
+    @functools.cached_property
     def maps(self) -> Maps:
         """One value a voxel (n,) by name, NaN where undefined."""
-        null = expected_sbd(self._table) if self._null is None else self._null
-        return {**maps_of(self._table, null), **self._further}
+        return self.make()
 
 
 def describe(
@@ -124,7 +122,12 @@ def analyse(
         edges=edges,
         critical=critical,
     )
-    return Analysis(summary, further | more | whole.maps(table, further), sums, table, null)
+
+    def maps() -> Maps:
+        own = maps_of(table, expected_sbd(table) if null is None else null)
+        return {**own, **further, **more, **whole.maps(table, further)}
+
+    return Analysis(summary, sums, maps)
 
 
 def concluded(

@@ -22,11 +22,11 @@ from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduc
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.summary import TableSums
-from semstab.model.parquet import tile_of
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.results import Agreement, Deviation
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.parquet import tile_of
 from semstab.runtime.files import write_text
 from semstab.statistics import Looks, Truth, join_truth
 from semstab.statistics.description import concluded

@@ -30,7 +30,6 @@ from semstab.metrics import compare, macro_mean, summarise
 from semstab.metrics.matching import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.measures import dominant, measures, vss
-from semstab.model.parquet import Tile, names_in
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
     RECURRENT,
@@ -45,13 +44,14 @@ from semstab.model.results import (
 )
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.parquet import Tile, names_in
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.drift import expected_sbd
 from semstab.statistics.map_sums import maps_of
+from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sums import first_look
 from semstab.task import Task, read
 

@@ -13,8 +13,8 @@ from semstab.engine.tiling.partition import Tiling
 from semstab.engine.tiling.portion import Portion
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
-from semstab.model.extent import Extent
 from semstab.model.records import UnitContent
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.files import TEMPORARY
 
 

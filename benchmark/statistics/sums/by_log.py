@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
-from semstab.statistics.drift import TESTABLE, Flips, PValues, VoxelDrift, trend_columns, voxel_drift
 from semstab.statistics.map_sums import Maps, mean_columns
+from semstab.statistics.order import fusion_rules
+from semstab.statistics.order.drift import TESTABLE, Flips, PValues, VoxelDrift, trend_columns, voxel_drift
 from semstab.statistics.sampling import Places, PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
 

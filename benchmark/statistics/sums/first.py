@@ -14,10 +14,10 @@ from semstab.model.measures import dominant
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.array_form import from_arrays, to_arrays
 from semstab.statistics.blocks import Occupied
-from semstab.statistics.ceiling import repeated
 from semstab.statistics.correctness import Judged, Truth, judged_sums, stratum_sums
-from semstab.statistics.drift import flips, voxel_drift
+from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.map_sums import Maps, MapSums, mean_columns
+from semstab.statistics.order.drift import flips, voxel_drift
 from semstab.statistics.sampling import Places, PlaceSums
 from semstab.statistics.sampling.stable_looks import StableLooks
 from semstab.statistics.steady import Votes

@@ -12,11 +12,11 @@ from semstab.metrics.matching import shared_rows
 from semstab.model.statistics import DriftTests
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.ceiling import loss_sums
 from semstab.statistics.correctness import Truth, quadrant_sums, stable_wrong
-from semstab.statistics.drift import TESTABLE, benjamini_hochberg
-from semstab.statistics.flipping import FlippingSums
+from semstab.statistics.judging.ceiling import loss_sums
+from semstab.statistics.judging.flipping import FlippingSums
 from semstab.statistics.map_sums import Maps
+from semstab.statistics.order.drift import TESTABLE, benjamini_hochberg
 from semstab.statistics.sampling import InfluenceSums, PlaceSums
 from semstab.statistics.steady import Votes, steady
 from semstab.statistics.sums.by_log import FALSE_DISCOVERIES
