@@ -28,7 +28,7 @@ from semstab.outputs.plots.statistics import DriftByOP, draw_intervals, draw_rel
 from semstab.outputs.report import TOPICS, write_report
 from semstab.outputs.tables import tables
 from semstab.outputs.tables import to_json as table_content
-from semstab.outputs.terminal import print_summary
+from semstab.outputs.terminal.summary import print_summary
 from semstab.runtime.json_form import to_json
 from semstab.statistics import Estimate, Looks, Reliability, Sample, analyse, describe
 from semstab.statistics.correctness import ACCURACY

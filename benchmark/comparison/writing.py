@@ -60,7 +60,7 @@ def write(found: Found, out: str | Path) -> None:
     _write_columns(found, folder)
     write_text(folder / REPORT, page(found.result, made, drawn, folder))
     if found.changes:
-        from semstab.outputs.recording.changes import record_changes
+        from semstab.outputs.recording.maps.changes import record_changes
 
         record_changes(folder / RECORDING, dict(_recorded(found)), found.up, sentences(found.result))
 

@@ -50,8 +50,8 @@ from semstab.model.voxels import Events, VoxelTable
 from semstab.outputs.export import export
 from semstab.outputs.plots.maps import Overview
 from semstab.outputs.tables import tables
-from semstab.outputs.terminal import print_summary
-from semstab.predict.folder import PredictionFolder
+from semstab.outputs.terminal.summary import print_summary
+from semstab.predict.disk.folder import PredictionFolder
 from semstab.runtime.files import read_json
 from semstab.runtime.json_form import from_json
 from semstab.settings import load_config, load_study

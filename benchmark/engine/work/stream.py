@@ -38,7 +38,7 @@ class NoMap:
 
     def table(self) -> VoxelTable:
         """There is none."""
-        raise NotImplementedError
+        raise LookupError("nothing was fused")
 
     def events(self) -> Events | None:
         """There are none."""

@@ -6,13 +6,15 @@ from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
     difference,
     estimate,
+    identical,
     judged_of,
     mean_of,
+    none,
     question_of,
     standard_error,
     unpaired,
 )
-from semstab.statistics.sampling.paired import coverage, identical, mean_over_frames, same_flight
+from semstab.statistics.sampling.paired import coverage, difference_over_frames, mean_over_frames, same_flight
 from semstab.statistics.sampling.places import Places, PlaceSums
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "aligned",
     "coverage",
     "difference",
+    "difference_over_frames",
     "estimate",
     "identical",
     "influence_sums",
@@ -30,6 +33,7 @@ __all__ = [
     "mean_of",
     "mean_over_frames",
     "merged",
+    "none",
     "of_places_alone",
     "question_of",
     "same_flight",

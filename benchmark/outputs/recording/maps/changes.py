@@ -13,9 +13,9 @@ import rerun.blueprint as rrb
 
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording.entities import path
-from semstab.outputs.recording.layout import BACKGROUND, Scenery, eye
+from semstab.outputs.recording.eye import BACKGROUND, Scenery, eye
+from semstab.outputs.recording.maps.voxel_maps import packed, thinned
 from semstab.outputs.recording.target import Target
-from semstab.outputs.recording.voxel_maps import packed, thinned
 
 WORSE, SAME, BETTER, WHITE = (213, 94, 0), (150, 150, 150), (86, 180, 233), (255, 255, 255)
 LEAST = 0.05

@@ -17,7 +17,7 @@ from semstab.model.records import Record, Result
 from semstab.model.results import STAGES, Agreement, Means, UnitSummary
 from semstab.outputs.averages import Sweep, describe, levels, over_all, over_recurrent, pooled
 from semstab.outputs.remarks import HARDLY_ANY, remarks
-from semstab.outputs.statistics_text import comparison_lines, lines
+from semstab.outputs.terminal.statistics import comparison_lines, lines
 
 NOTHING = "-"
 

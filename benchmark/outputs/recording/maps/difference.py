@@ -12,11 +12,13 @@ import rerun as rr
 from semstab.metrics import vss
 from semstab.metrics.matching import shared_rows
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording.layout import DIFFERENCE
-from semstab.outputs.recording.voxel_maps import thinned
+from semstab.outputs.recording.maps.voxel_maps import thinned
 
 ONLY_FIRST, ONLY_SECOND = (230, 159, 0), (86, 180, 233)
 VSS_RANGE = (0.0, 0.5)
+
+DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
+"""The parts of a difference, and what they are called."""
 
 
 def log_difference(

@@ -15,8 +15,8 @@ from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import mean_drift
 from semstab.outputs.recording.entities import Clock, path
+from semstab.outputs.recording.maps.tracker import Tracker
 from semstab.outputs.recording.series import LINE_COLORS
-from semstab.outputs.recording.tracker import Tracker
 
 SHOWN = 10
 """Voxels that are shown of a backbone on a scene."""

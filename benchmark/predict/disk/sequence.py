@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from semstab.backbones import Backbone, Streamed, ask, streamed
-from semstab.predict.folder import Kind, PredictionFolder, ScoreType
+from semstab.predict.disk.folder import Kind, PredictionFolder, ScoreType
+from semstab.predict.disk.region_series import RegionSeries, region_series
+from semstab.predict.disk.score_maps import largest_only, resized
 from semstab.predict.images import ImageSequence, Picture, first_images, picture
-from semstab.predict.region_series import RegionSeries, region_series
-from semstab.predict.score_maps import largest_only, resized
 from semstab.runtime.files import content_key
 from semstab.runtime.prefetch import prefetch
 
