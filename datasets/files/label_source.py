@@ -34,7 +34,7 @@ SEPARATE = "{scene}/{backbone}/{name}"
 
 @dataclass(frozen=True)
 class LabelSource:
-    """One label source of a scene: where the file of a frame would be, and those that are there, by the frame's name."""
+    """One label source of a scene: where a frame's file would be, and those that are there, by the frame's name."""
 
     kind: Kind
     base: Path
