@@ -25,10 +25,10 @@ from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.parquet import Tile
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.extent import Extent
+from semstab.model.voxels.parquet import Tile
 from semstab.outputs.export import export
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from semstab.model.statistics import (
     DriftStatistics,
     DriftTests,
     EntropyParts,
+    Flipping,
     FlipRates,
     FrameAgreement,
     Interval,
@@ -31,7 +33,6 @@ from semstab.model.statistics import (
     StratumStatistics,
 )
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
     alpha_of,
     between_of,
@@ -40,7 +41,6 @@ from semstab.statistics.agreement import (
     kappa_of,
     ratio_of,
 )
-from semstab.statistics.ceiling import losses
 from semstab.statistics.correctness import (
     Truth,
     by_stratum,
@@ -50,16 +50,9 @@ from semstab.statistics.correctness import (
     rule_means,
     stable_wrong,
 )
-from semstab.statistics.drift import (
-    TESTABLE,
-    VoxelDrift,
-    benjamini_hochberg,
-    expected_sbd,
-    flips,
-    trend_columns,
-    voxel_drift,
-)
-from semstab.statistics.flipping import flipping
+from semstab.statistics.judging.ceiling import losses
+from semstab.statistics.judging.flipping import flipping
+from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import Sample, correlogram, reach_from
 from semstab.statistics.map_sums import (
     BY_STRATUM,
@@ -70,10 +63,19 @@ from semstab.statistics.map_sums import (
     place_sums,
     stratum_sums,
 )
+from semstab.statistics.order import fusion_rules
+from semstab.statistics.order.drift import (
+    TESTABLE,
+    VoxelDrift,
+    benjamini_hochberg,
+    expected_sbd,
+    flips,
+    trend_columns,
+    voxel_drift,
+)
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, judged_of, with_sample
 from semstab.statistics.scene_drift import scene_drift
 from semstab.statistics.steady import steady
-from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 FALSE_DISCOVERIES = 0.05
@@ -87,11 +89,17 @@ class Analysis:
     """What the statistics say of a map; `maps` have one value a voxel (n,), NaN where undefined.
 
     sums  by frame and cube of space, from which intervals and differences follow without voxels
+    make  gives the maps, when they are asked for
     """
 
     summary: MapStatistics
-    maps: Maps
     sums: InfluenceSums
+    make: Callable[[], Maps]
+
+    @functools.cached_property
+    def maps(self) -> Maps:
+        """One value a voxel (n,) by name."""
+        return self.make()
 
 
 def describe(
@@ -138,6 +146,8 @@ def analyse(
     that cannot be computed is None.
     Raises DataError where events, truth or limit do not belong to the table.
     """
+    if events is None and truth is None and limit is None:
+        return _of_table(table, sample=sample, name=name, seed=seed, edges=edges, critical=critical)
     if events is not None:
         require_same_map(table, events)
     again = table.op >= 2
@@ -172,7 +182,23 @@ def analyse(
         correctness=right,
         fusion_rules=None if events is None else _fusion_rules(table, events, known),
     )
-    return Analysis(summary, {**maps, "stable": stable}, sums)
+    maps["stable"] = stable
+    return Analysis(summary, sums, lambda: maps)
+
+
+def _of_table(table: VoxelTable, *, edges: Sequence[int], **settings: Any) -> Analysis:
+    """What `analyse` says of a map alone: no number of each voxel is kept."""
+    sums = MapSums.of(table, edges)
+    stable = steady(table)
+    unstable = flipping(table, stable, Places(table.index[table.op >= 2], table.voxel_size, sums.places.edge))
+    summary, influence = analyse_sums(
+        sums, voxel_size=table.voxel_size, classes=table.classes, edges=edges, flipping=unstable, **settings
+    )
+
+    def maps() -> Maps:
+        return {**maps_of(table, expected_sbd(table)), "stable": stable}
+
+    return Analysis(summary, influence, maps)
 
 
 def analyse_sums(
@@ -185,8 +211,12 @@ def analyse_sums(
     seed: int = 0,
     edges: Sequence[int] = STRATA,
     critical: Sequence[str] = (),
+    flipping: Flipping | None = None,
 ) -> tuple[MapStatistics, InfluenceSums]:
-    """What `analyse` says of a map without log and ground truth, from its sums, which may be those of its parts."""
+    """What `analyse` says of a map without log and ground truth, from its sums, which may be those of its parts.
+
+    flipping  of the map, where that is known
+    """
     about = _About(name, seed, critical, sums.table.summary(voxel_size, classes, edges))
     means = _Means(sums.places)
     influence = sums.influence if sample is None else with_sample(sums.influence, sample.shared())
@@ -196,6 +226,7 @@ def analyse_sums(
         influence,
         sample,
         agreement=_agreement(means, class_agreement_of(sums.classes, classes)),
+        flipping=flipping,
         drift=_drift(means),
         strata=_strata(about.table, sums.strata),
     )

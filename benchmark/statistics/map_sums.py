@@ -15,8 +15,8 @@ from semstab.metrics.summary import STRATA, TableSums
 from semstab.model.measures import sbd, vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
-from semstab.statistics.drift import expected_sbd
-from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
+from semstab.statistics.order.drift import expected_sbd
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged, stretches
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]
@@ -45,7 +45,12 @@ class MapSums:
 
     @classmethod
     def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> MapSums:
-        """Those of a table."""
+        """Those of a table, some voxels after the others."""
+        parts = (cls._of_few(table.rows(some), edges) for some in stretches(len(table)))
+        return functools.reduce(lambda one, other: cls.merged([one, other]), parts)
+
+    @classmethod
+    def _of_few(cls, table: VoxelTable, edges: Sequence[int]) -> MapSums:
         maps = maps_of(table, null=expected_sbd(table))
         places = Places(table.index[table.op >= 2], table.voxel_size)
         return cls(

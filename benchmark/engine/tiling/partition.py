@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.engine.tiling.sights import Sights
-from semstab.model.extent import Extent
+from semstab.model.voxels.extent import Extent
 
 ROOM = 4
 """A tile takes at most that part of what a task may take, where its size is not given."""

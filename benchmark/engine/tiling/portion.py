@@ -17,7 +17,8 @@ from semstab.engine.tiling.partition import Part
 from semstab.engine.tiling.stretches import Stretch
 from semstab.model.records import FrameQuality
 from semstab.model.results import Agreement, FrameReport, SizeAlpha
-from semstab.runtime.files import atomic_path, parse_json
+from semstab.runtime.array_files import read_arrays, write_arrays
+from semstab.runtime.files import parse_json
 from semstab.runtime.json_form import from_json, to_json
 
 PORTIONS = "parts"
@@ -111,16 +112,17 @@ class Finished:
         arrays["image"] = self.image
         arrays |= {f"sums {name}": value for name, value in self.sums.items()}
         text = json.dumps(to_json(self.about)).encode()
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, about=np.frombuffer(text, np.uint8), **arrays)
+        write_arrays(path, {"about": np.frombuffer(text, np.uint8), **arrays})
 
     @classmethod
-    def load(cls, path: Path) -> Finished:
-        """What `save` wrote. Raises DAMAGED_ARRAYS or DataError where it is not there or damaged."""
-        with path.open("rb") as file, np.load(file) as content:
-            about = from_json(About, parse_json(content["about"].tobytes()), path)
-            sums = {name[5:]: content[name] for name in content.files if name.startswith("sums ")}
-            return cls(about, content["series"], sums, content["reduced"], content["poses"], content["image"])
+    def load(cls, path: Path) -> Finished | None:
+        """What `save` wrote; None where it is not there, or damaged. Raises DataError for that of another version."""
+        arrays = read_arrays(path)
+        if arrays is None:
+            return None
+        about = from_json(About, parse_json(arrays["about"].tobytes()), path)
+        sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
+        return cls(about, arrays["series"], sums, arrays["reduced"], arrays["poses"], arrays["image"])
 
 
 def series_array(rows: Sequence[FrameRow]) -> Float64:

@@ -30,7 +30,6 @@ from semstab.metrics import compare, macro_mean, summarise
 from semstab.metrics.matching import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.measures import dominant, measures, vss
-from semstab.model.parquet import Tile
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
     RECURRENT,
@@ -45,6 +44,7 @@ from semstab.model.results import (
 )
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.parquet import Tile
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample

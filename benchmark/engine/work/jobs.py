@@ -17,8 +17,8 @@ from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.image_space import CLIPS
 from semstab.engine.work.sizes import FRAMES
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
-from semstab.model.extent import Extent
 from semstab.model.records import UnitContent
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.files import TEMPORARY
 
 

@@ -23,8 +23,8 @@ from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
 from semstab.errors import ConfigError, DataError
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.memory import available_bytes, resident_bytes
 from semstab.runtime.prefetch import Fetched, prefetch
 from semstab.runtime.stopwatch import Stopwatch
