@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,9 +16,10 @@ import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import to_csv
-from semstab.engine.tiling.portion import PORTIONS, Finished, joined_series
+from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduced_of, save_voxels, unit_summary
+from semstab.engine.work.image_space import image_space_of
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.summary import TableSums
@@ -28,8 +29,9 @@ from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.parquet import tile_of
 from semstab.runtime.files import write_text
-from semstab.statistics import Looks, Truth, join_truth
+from semstab.statistics import Looks, Sample, Truth, join_truth
 from semstab.statistics.description import concluded
+from semstab.statistics.looks.sampler import merged
 from semstab.statistics.sampling import InfluenceSums
 from semstab.statistics.sums import FirstSums, SecondSums, Whole, second_look
 
@@ -37,15 +39,24 @@ UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
 
 
-def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished], folder: Path) -> UnitContent:
-    """The unit's content; its series is written. Raises DataError where no pixel was valid."""
+def assembled(planned: PlannedUnit, finished: Mapping[str, Finished], folder: Path) -> UnitContent:
+    """The unit's content, from its portions by name, in order; its series is written.
+
+    Raises DataError where no pixel was valid.
+    """
     task, unit, config = planned.task, planned.unit, planned.config
+    stretches = [each for each in finished.values() if each.about.kind == STRETCH]
+    parts = [each for each in finished.values() if each.about.kind == PART]
     sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
     if not sums.total[2]:
         raise no_voxels(task, config)
-    files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
-    found = _statistics(planned, parts, folder, files) if planned.judged else None
-    rows = joined_series(frames.series, [part.series for part in parts])
+    files = {name: digest for each in finished.values() for name, digest in each.about.files.items()}
+    looks, true_looks = (_looks(stretches, folder, true=true) for true in (False, True))
+    sample = None if looks is None else looks.sample()
+    if sample is not None and true_looks is not None:
+        sample = sample.against(true_looks.sample())
+    found = _statistics(planned, parts, sample, folder, files) if planned.judged and sample is not None else None
+    rows = joined_series(np.concatenate([each.series for each in stretches]), [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
         task,
@@ -53,24 +64,28 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
         sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
         None if found is None else found[0],
         reduced_of(np.sum(reduced, axis=0)) if reduced else None,
-        frames.about.sizes,
+        next((each.about.sizes for each in finished.values() if each.about.sizes), ()),
     )
     files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
+    savers: Savers = {}
     if planned.kept:
-        savers: Savers = {f"{FRAMES}/{unit.slug}.csv": lambda path: write_text(path, to_csv(rows))}
+        savers[f"{FRAMES}/{unit.slug}.csv"] = lambda path: write_text(path, to_csv(rows))
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
             files |= found[2]
-        files |= {name: _saved(save, folder / name) for name, save in savers.items()}
+        if looks is not None:
+            savers[f"{LOOKS}/{unit.slug}.parquet"] = looks.save
+    files |= {name: _saved(save, folder / name) for name, save in savers.items()}
     content = UnitContent(
         planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
     )
-    if not planned.image_space or frames.about.image_space is None:
+    if not planned.image_space:
         return content
-    image_space = replace(frames.about.image_space, flicker_percent=summary.flicker_percent)
+    image_space = image_space_of(np.concatenate([each.image for each in stretches]), summary.flicker_percent)
     tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
-    content = replace(content, quality=frames.about.quality)
-    return replace(content, image_space=image_space, up=_up(planned, tiles, int(sums.total[2]), frames.poses))
+    poses = np.concatenate([each.poses for each in stretches])
+    up = _up(planned, tiles, int(sums.total[2]), poses)
+    return replace(content, image_space=image_space, quality=stretches[0].about.quality, up=up)
 
 
 def _saved(save: Callable[[Path], None], path: Path) -> str:
@@ -79,8 +94,15 @@ def _saved(save: Callable[[Path], None], path: Path) -> str:
     return file_digest(path).hex()
 
 
+def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> Looks | None:
+    """What was sampled of all frames, or of their ground truth; None where nothing was."""
+    names = [name for each in stretches for name in each.about.files if name.startswith(f"{PORTIONS}/")]
+    chosen = [name for name in names if name.endswith(TRUE_LOOKS) == true]
+    return merged([Looks.load(folder / name) for name in chosen]) if chosen else None
+
+
 def _statistics(
-    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Collection[str]
+    planned: PlannedUnit, parts: Sequence[Finished], sample: Sample, folder: Path, files: Iterable[str]
 ) -> tuple[MapStatistics, InfluenceSums, dict[str, str]]:
     """What the statistics say of all parts together, with the looks that were sampled of the frames.
 
@@ -89,25 +111,18 @@ def _statistics(
     """
     classes, config = planned.task.mapping.target.classes, planned.config
     whole = Whole(FirstSums.merged([FirstSums.read(part.sums, classes) for part in parts]))
-    looks = {Path(name).stem: Looks.load(folder / name) for name in files if _is_looks(name)}
-    true_looks = looks.pop("true-looks", None)
-    (sample,) = (own.sample() for own in looks.values())
     second, written = _second_looks(planned, whole, folder, files)
     summary, sums = concluded(
         whole,
         second,
         voxel_size=config.voxel_size,
         classes=classes,
-        sample=sample if true_looks is None else sample.against(true_looks.sample()),
+        sample=sample,
         name=planned.task.backbone,
         edges=config.strata,
         critical=config.critical_classes,
     )
     return summary, sums, written
-
-
-def _is_looks(name: str) -> bool:
-    return name.startswith(f"{LOOKS}/") or name.endswith("looks.parquet")
 
 
 def _second_looks(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -22,6 +21,7 @@ from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
 from semstab.engine.tiling.portion import About, Finished, Portion, series_array
+from semstab.engine.work.image_space import COLUMNS
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import NoMap, Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
@@ -209,13 +209,14 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
     with watch("write"):
         saved, returned = _written(job, _portion_savers(stream, one, portion, found))
-        image_space = None if stream.image_space is None else stream.image_space.result(math.nan)
+        rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
         finished = Finished(
-            About(saved, checked, image_space, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
+            About(portion.kind, saved, checked, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
             series_array(one.rows),
             {} if found is None else found.sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
             np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),
+            np.array(rows).reshape(-1, len(COLUMNS)),
         )
         _, left = _written(job, {f"{portion.folder}/{portion.name}.npz": finished.save})
     return Outcome(one.request.identity, portion=portion.name, files=returned | left)
@@ -252,13 +253,11 @@ def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part
     """Where the whole map has still to be waited for, voxels are written so that they are looked at again."""
     unit, config = one.task.units[0], one.request.config
     savers: Savers = {}
-    if one.request.image_space:
+    if stream.overview:
         savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
-    for sampler, name in ((one.sampler, "looks"), (one.truth_sampler, "true-looks")):
+    for sampler, file in ((one.sampler, portion.looks_file), (one.truth_sampler, portion.true_looks_file)):
         if sampler is not None:
-            kept = portion.kept and sampler is one.sampler
-            path = f"{LOOKS}/{unit.slug}.parquet" if kept else f"{portion.folder}/{name}.parquet"
-            savers[path] = sampler.looks(one.task.mapping.target.classes).save
+            savers[file] = sampler.looks(one.task.mapping.target.classes).save
     if found is None or portion.part is None:
         return savers
     again = portion.judged and (config.statistics or not portion.kept)

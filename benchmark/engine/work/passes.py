@@ -144,7 +144,7 @@ class Pass:
             made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
                 made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target), request.within)
-            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
+            if request.sized:
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []
@@ -172,6 +172,8 @@ class Pass:
         watched = [one for one in stream.maps if one.request.kept]
         with self._failing([one.request for one in stream.maps]):
             now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
+            if now.frame.index in stream.ahead:
+                return
             for one in stream.maps:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
@@ -283,7 +285,7 @@ def _new_map(config: Config, task: Task, within: Extent | None = None) -> Fusion
 
 def _truth_map(request: Request, task: Task) -> FusionBackend | NoMap | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
-    if truth_task(task) is None:
+    if truth_task(task) is None or not (request.fuses or request.judged):
         return None
     return _map_without_log(request.config, task, request.within) if request.fuses else NoMap()
 
@@ -293,7 +295,8 @@ def _map_without_log(config: Config, task: Task, within: Extent | None = None) -
 
 
 def _sampler(request: Request, task: Task) -> Sampler:
-    return Sampler(request.config.voxel_size, len(task.mapping.target))
+    origin = None if request.stretch is None else request.stretch.origin
+    return Sampler(request.config.voxel_size, len(task.mapping.target), origin=origin)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()
