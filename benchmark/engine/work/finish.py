@@ -23,7 +23,7 @@ from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
 from semstab.engine.tiling.portion import PORTIONS, About, Finished, Portion, series_array
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
-from semstab.engine.work.stream import Stream, UnitMap
+from semstab.engine.work.stream import NoMap, Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import compare, macro_mean, summarise
@@ -66,6 +66,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("measure"):
         table = _table(one.backend, task)
         _require_voxels(task, config, table)
+        if not (config.statistics or config.events):
+            one.backend = NoMap()  # what comes next has its memory
+    with watch("voxel sizes"):
+        sizes = () if one.sizes is None else one.sizes.alphas()
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_fused(unit, table))
@@ -74,7 +78,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         events = one.backend.events() if config.statistics else None
         found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
     with watch("measure"):
-        summary = _summary(one, table, found)
+        summary = _summary(one, table, found, sizes)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
     with watch("reference"):
@@ -134,14 +138,14 @@ def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
     return dataclasses.replace(compare(drawn, found, units, tolerance=one.request.config.tolerance), one_in=ONE_IN)
 
 
-def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
+def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None, sizes: tuple[SizeAlpha, ...]) -> UnitSummary:
     return unit_summary(
         one.task,
         one.rows,
         summarise(table, one.request.config.strata),
         None if found is None else found.summary,
         None if one.hard is None else reduced_of(reduced_sums(one.hard.table())),
-        () if one.sizes is None else one.sizes.alphas(),
+        sizes,
     )
 
 
@@ -200,6 +204,7 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     assert portion is not None
     with watch("measure"):
         table = _table(one.backend, one.task) if one.request.fuses else None
+        one.backend = NoMap()
         sums = {} if table is None else _sums_of(table, one.request.config.strata, judged=portion.judged)
     with watch("reference"):
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
