@@ -32,16 +32,16 @@ from semstab.backends.numba_parts.loops import (
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
 from semstab.backends.shared.hashing import PARTITIONS, mix
-from semstab.backends.shared.keys import columns_of_keys, index_of_keys
 from semstab.backends.shared.observed import Observed, ObservedScores
-from semstab.backends.shared.score_vectors import LANES
+from semstab.backends.shared.pixels.keys import columns_of_keys, index_of_keys
+from semstab.backends.shared.scores.vectors import LANES
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.compiled import is_kept, settings
 
 Int64 = npt.NDArray[np.int64]

@@ -24,10 +24,10 @@ from semstab.backends.shared.association import (
 from semstab.backends.shared.restricted import falling_into
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.model.evidence import Evidence
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable, index_columns
+from semstab.model.voxels.extent import Extent
 
 ONE_IN = 16
 """Of so many voxels the sample holds one."""

@@ -41,7 +41,6 @@ from semstab.model.records import (
 )
 from semstab.model.results import SCHEMA, Unit, slug
 from semstab.runtime.files import (
-    DAMAGED_ARRAYS,
     TEMPORARY,
     FolderLock,
     atomic_path,
@@ -135,9 +134,9 @@ class Folder:
         """What an earlier start left of a portion, if its files are there as they were."""
         try:
             found = Finished.load(self.path / PORTIONS / key / f"{name}.npz")
-        except (*DAMAGED_ARRAYS, DataError):
+        except DataError:
             return None
-        return found if self._are_whole(found.about.files) else None
+        return found if found is not None and self._are_whole(found.about.files) else None
 
     def clear(self, planned: PlannedUnit, keep: Collection[str]) -> None:
         """Remove what was left of a unit's voxels, a file or tiles, but for these files."""

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.errors import ConfigError
-from semstab.model import tabular
-from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
 from semstab.model.measures import measures
 from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
 from semstab.model.statistics import MapStatistics
-from semstab.model.voxels import VoxelTable
+from semstab.model.statistics.comparison import BackboneComparison
+from semstab.model.voxels import VoxelTable, tabular
 from semstab.runtime.json_form import INLINE
 
 if TYPE_CHECKING:

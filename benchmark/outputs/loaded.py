@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, one_line
-from semstab.model import tabular
 from semstab.model.records import Result
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import Events, VoxelTable, tabular
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,7 +18,7 @@ from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE, ratio_of
-from semstab.statistics.fusion_rules import Fused
+from semstab.statistics.order.fusion_rules import Fused
 from semstab.statistics.sampling.places import Places
 from semstab.statistics.steady import LIKELY, steady
 

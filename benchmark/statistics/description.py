@@ -33,7 +33,6 @@ from semstab.model.statistics import (
     StratumStatistics,
 )
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import fusion_rules
 from semstab.statistics.agreement import (
     alpha_of,
     between_of,
@@ -42,7 +41,6 @@ from semstab.statistics.agreement import (
     kappa_of,
     ratio_of,
 )
-from semstab.statistics.ceiling import losses
 from semstab.statistics.correctness import (
     Truth,
     by_stratum,
@@ -52,16 +50,9 @@ from semstab.statistics.correctness import (
     rule_means,
     stable_wrong,
 )
-from semstab.statistics.drift import (
-    TESTABLE,
-    VoxelDrift,
-    benjamini_hochberg,
-    expected_sbd,
-    flips,
-    trend_columns,
-    voxel_drift,
-)
-from semstab.statistics.flipping import flipping
+from semstab.statistics.judging.ceiling import losses
+from semstab.statistics.judging.flipping import flipping
+from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import Sample, correlogram, reach_from
 from semstab.statistics.map_sums import (
     BY_STRATUM,
@@ -72,10 +63,19 @@ from semstab.statistics.map_sums import (
     place_sums,
     stratum_sums,
 )
+from semstab.statistics.order import fusion_rules
+from semstab.statistics.order.drift import (
+    TESTABLE,
+    VoxelDrift,
+    benjamini_hochberg,
+    expected_sbd,
+    flips,
+    trend_columns,
+    voxel_drift,
+)
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, judged_of, with_sample
 from semstab.statistics.scene_drift import scene_drift
 from semstab.statistics.steady import steady
-from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 FALSE_DISCOVERIES = 0.05

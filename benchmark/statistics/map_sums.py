@@ -15,7 +15,7 @@ from semstab.metrics.summary import STRATA, TableSums
 from semstab.model.measures import sbd, vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
-from semstab.statistics.drift import expected_sbd
+from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged, stretches
 from semstab.statistics.uncertainty import decompose
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.drift import VoxelDrift, drift_tables, streams, trend_columns, variation, varying
+from semstab.statistics.order.drift import VoxelDrift, drift_tables, streams, trend_columns, variation, varying
 from semstab.statistics.sampling.reach import arrangement
 
 Float64 = npt.NDArray[np.float64]
@@ -97,7 +97,7 @@ class _Sampled:
 
     def orders(self, events: Events, K: int, seed: int, count: int) -> tuple[Int64, Float64, Float64]:
         """Voxels that many stretches see, and the sums over them of SBD and of trends (R,), in random orders."""
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         at = np.concatenate([[0], np.cumsum(self.T)])
         changes = np.diff(self.stretch, prepend=-1) != 0

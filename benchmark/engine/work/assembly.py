@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,10 @@ import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import to_csv
-from semstab.engine.tiling.portion import Finished, joined_series
+from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, Finished, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
+from semstab.engine.work.image_space import image_space_of
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.summary import TableSums
@@ -28,6 +29,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import write_text
 from semstab.statistics import Looks
 from semstab.statistics.description import analyse_sums
+from semstab.statistics.looks.sampler import merged
 from semstab.statistics.map_sums import MapSums
 from semstab.statistics.sampling import InfluenceSums
 
@@ -35,14 +37,20 @@ UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
 
 
-def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished], folder: Path) -> UnitContent:
-    """The unit's content; its series is written. Raises DataError where no pixel was valid."""
+def assembled(planned: PlannedUnit, finished: Mapping[str, Finished], folder: Path) -> UnitContent:
+    """The unit's content, from its portions by name, in order; its series is written.
+
+    Raises DataError where no pixel was valid.
+    """
     task, unit, config = planned.task, planned.unit, planned.config
+    stretches = [each for each in finished.values() if each.about.kind == STRETCH]
+    parts = [each for each in finished.values() if each.about.kind == PART]
     sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
     if not sums.total[2]:
         raise no_voxels(task, config)
-    found = _statistics(planned, parts, folder, frames.about.files) if planned.judged else None
-    rows = joined_series(frames.series, [part.series for part in parts])
+    looks = _looks(stretches, folder)
+    found = _statistics(planned, parts, looks) if planned.judged and looks is not None else None
+    rows = joined_series(np.concatenate([each.series for each in stretches]), [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
         task,
@@ -50,23 +58,26 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
         sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
         None if found is None else found[0],
         reduced_of(np.sum(reduced, axis=0)) if reduced else None,
-        frames.about.sizes,
+        next((each.about.sizes for each in finished.values() if each.about.sizes), ()),
     )
-    files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
+    files = {name: digest for each in finished.values() for name, digest in each.about.files.items()}
+    files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
+    savers: Savers = {} if looks is None else {f"{LOOKS}/{unit.slug}.parquet": looks.save}
     if planned.kept:
-        savers: Savers = {f"{FRAMES}/{unit.slug}.csv": lambda path: write_text(path, to_csv(rows))}
+        savers[f"{FRAMES}/{unit.slug}.csv"] = lambda path: write_text(path, to_csv(rows))
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
-        files |= {name: _saved(save, folder / name) for name, save in savers.items()}
+    files |= {name: _saved(save, folder / name) for name, save in savers.items()}
     content = UnitContent(
         planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
     )
-    if not planned.image_space or frames.about.image_space is None:
+    if not planned.image_space:
         return content
-    image_space = replace(frames.about.image_space, flicker_percent=summary.flicker_percent)
+    image_space = image_space_of(np.concatenate([each.image for each in stretches]), summary.flicker_percent)
     tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
-    content = replace(content, quality=frames.about.quality)
-    return replace(content, image_space=image_space, up=_up(planned, tiles, int(sums.total[2]), frames.poses))
+    poses = np.concatenate([each.poses for each in stretches])
+    up = _up(planned, tiles, int(sums.total[2]), poses)
+    return replace(content, image_space=image_space, quality=stretches[0].about.quality, up=up)
 
 
 def _saved(save: Callable[[Path], None], path: Path) -> str:
@@ -75,12 +86,15 @@ def _saved(save: Callable[[Path], None], path: Path) -> str:
     return file_digest(path).hex()
 
 
-def _statistics(
-    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Iterable[str]
-) -> tuple[MapStatistics, InfluenceSums]:
+def _looks(stretches: Sequence[Finished], folder: Path) -> Looks | None:
+    """What was sampled of all frames; None where nothing was."""
+    names = [name for each in stretches for name in each.about.files if name.startswith(f"{PORTIONS}/")]
+    return merged([Looks.load(folder / name) for name in names]) if names else None
+
+
+def _statistics(planned: PlannedUnit, parts: Sequence[Finished], looks: Looks) -> tuple[MapStatistics, InfluenceSums]:
     """What the statistics say of all parts together, with the looks that were sampled of the frames."""
     classes, config = planned.task.mapping.target.classes, planned.config
-    looks = next(Looks.load(folder / name) for name in files if name.startswith(f"{LOOKS}/"))
     return analyse_sums(
         MapSums.merged([MapSums.read(part.sums, classes) for part in parts]),
         voxel_size=config.voxel_size,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -22,6 +21,7 @@ from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
 from semstab.engine.tiling.portion import PORTIONS, About, Finished, Portion, series_array
+from semstab.engine.work.image_space import COLUMNS
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import NoMap, Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
@@ -30,7 +30,6 @@ from semstab.metrics import compare, macro_mean, summarise
 from semstab.metrics.matching import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.measures import dominant, measures, vss
-from semstab.model.parquet import Tile
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
     RECURRENT,
@@ -45,6 +44,7 @@ from semstab.model.results import (
 )
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.parquet import Tile
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
@@ -210,13 +210,14 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
     with watch("write"):
         saved, returned = _written(job, _portion_savers(stream, one, portion, table))
-        image_space = None if stream.image_space is None else stream.image_space.result(math.nan)
+        rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
         finished = Finished(
-            About(saved, checked, image_space, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
+            About(portion.kind, saved, checked, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
             series_array(one.rows),
             sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
             np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),
+            np.array(rows).reshape(-1, len(COLUMNS)),
         )
         _, left = _written(job, {f"{PORTIONS}/{portion.key}/{portion.name}.npz": finished.save})
     return Outcome(one.request.identity, portion=portion.name, files=returned | left)
@@ -231,10 +232,10 @@ def _sums_of(table: VoxelTable, edges: Sequence[int], *, judged: bool) -> dict[s
 def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, table: VoxelTable | None) -> Savers:
     unit = one.task.units[0]
     savers: Savers = {}
-    if one.request.image_space:
+    if stream.overview:
         savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
     if one.sampler is not None:
-        savers[f"{LOOKS}/{unit.slug}.parquet"] = one.sampler.looks(one.task.mapping.target.classes).save
+        savers[portion.looks_file] = one.sampler.looks(one.task.mapping.target.classes).save
     if table is not None and portion.part is not None and portion.kept:
         for tile, rows in tiles_of(table, portion.part.size, portion.key):
             savers[f"{VOXELS}/{unit.slug}/{tile.name}"] = partial(save_voxels, rows, tile=tile)

@@ -23,8 +23,8 @@ from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
 from semstab.errors import ConfigError, DataError
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.memory import available_bytes, resident_bytes
 from semstab.runtime.prefetch import Fetched, prefetch
 from semstab.runtime.stopwatch import Stopwatch
@@ -143,7 +143,7 @@ class Pass:
             made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
                 made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target), request.within)
-            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
+            if request.sized:
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []
@@ -171,6 +171,8 @@ class Pass:
         watched = [one for one in stream.maps if one.request.kept]
         with self._failing([one.request for one in stream.maps]):
             now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
+            if now.frame.index in stream.ahead:
+                return
             for one in stream.maps:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
@@ -290,7 +292,8 @@ def _map_without_log(config: Config, task: Task, within: Extent | None = None) -
 
 
 def _sampler(request: Request, task: Task) -> Sampler:
-    return Sampler(request.config.voxel_size, len(task.mapping.target))
+    origin = None if request.stretch is None else request.stretch.origin
+    return Sampler(request.config.voxel_size, len(task.mapping.target), origin=origin)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model import parquet
 from semstab.model.records import Record, Tables
 from semstab.model.results import Unit
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import VoxelTable, parquet
 from semstab.outputs.plots.histograms import Histograms, histograms, together
 from semstab.outputs.plots.statistics import DriftByOP
 from semstab.outputs.plots.topdown import MOST, FromAbove, topmost

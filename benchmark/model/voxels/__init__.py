@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.model import parquet, tabular
 from semstab.model.evidence import Evidence
 from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.model.measures import MeasureMeans, dominant, measures
+from semstab.model.voxels import parquet, tabular
 from semstab.runtime.memory import available_bytes
 
 if TYPE_CHECKING:

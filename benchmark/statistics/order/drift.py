@@ -81,7 +81,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
     NaN where OP < 2, where a frame's pixels in the voxel disagree, or where OP exceeds 256.
     """
-    from semstab.statistics import kernels
+    from semstab.statistics.loops import kernels
 
     T = table.op.astype(np.int64)
     known = (T >= 2) & (T <= kernels.LONGEST_TABLE) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
@@ -165,7 +165,7 @@ class _Orders:
 
     @classmethod
     def of(cls, table: VoxelTable, events: Events, where: npt.NDArray[np.bool_], seed: int) -> _Orders:
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         first, T = events.starts[where], table.op[where].astype(np.int64)
         seeds = streams(table.rows(where).index, seed)
@@ -173,7 +173,7 @@ class _Orders:
 
     def measure(self, draws: int) -> tuple[Float64, Float64, Float64]:
         """Fill `seen`; the null of the drifts (n,), p-values (n, 3) of few observations, the trend's variance."""
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         null, p, variance = np.zeros(len(self.T)), np.zeros((len(self.T), 3)), np.zeros(len(self.T))
         kernels.in_chunks(kernels.measure_voxels, *self._shared(), draws, self.seen, null, p, variance)
@@ -181,7 +181,7 @@ class _Orders:
 
     def test(self, which: Int64, *, by_drift: bool, most: int, enough: int) -> Float64:
         """P-values (r,) of the voxels of these numbers."""
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         p = np.zeros(len(which))
         kernels.in_chunks(kernels.permute_voxels, which, *self._shared(), by_drift, most, enough, self.seen, p)
@@ -212,7 +212,7 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
 
 def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
-    from semstab.statistics import kernels, log_kernels
+    from semstab.statistics.loops import kernels, log_kernels
 
     n, bounds = len(events.ix), np.append(events.starts, len(events))
     changes, differing, since = np.zeros(n), np.zeros(n), np.full(n, np.nan)
@@ -263,7 +263,7 @@ def varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], I
 
 def drift_tables(T: Int64) -> tuple[Float64, Float64]:
     """What the kernels look up for voxels of up to that OP."""
-    from semstab.statistics import kernels
+    from semstab.statistics.loops import kernels
 
     longest = int(T.max(initial=2))
     return kernels.one_hot_drifts(min(longest, kernels.LONGEST_TABLE)), kernels.step_terms(longest)
@@ -271,7 +271,7 @@ def drift_tables(T: Int64) -> tuple[Float64, Float64]:
 
 def streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
     """A random number (n,) of each voxel that depends on its index (n, 3) and the seed only."""
-    from semstab.statistics import kernels
+    from semstab.statistics.loops import kernels
 
     drawn = np.empty(len(index), np.uint64)
     kernels.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
