@@ -69,6 +69,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("measure"):
         table = _table(one.backend, task)
         _require_voxels(task, config, table)
+        if not (config.statistics or config.events):
+            one.backend = NoMap()  # what comes next has its memory
+    with watch("voxel sizes"):
+        sizes = () if one.sizes is None else one.sizes.alphas()
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_fused(unit, table))
@@ -77,7 +81,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         events = one.backend.events() if config.statistics else None
         found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
     with watch("measure"):
-        summary = _summary(one, table, found)
+        summary = _summary(one, table, found, sizes)
     with watch("write"):
         saved, returned = _written(job, _savers(stream, one, table, truth, found))
     with watch("reference"):
@@ -137,14 +141,14 @@ def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
     return dataclasses.replace(compare(drawn, found, units, tolerance=one.request.config.tolerance), one_in=ONE_IN)
 
 
-def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
+def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None, sizes: tuple[SizeAlpha, ...]) -> UnitSummary:
     return unit_summary(
         one.task,
         one.rows,
         summarise(table, one.request.config.strata),
         None if found is None else found.summary,
         None if one.hard is None else reduced_of(reduced_sums(one.hard.table())),
-        () if one.sizes is None else one.sizes.alphas(),
+        sizes,
     )
 
 
@@ -237,6 +241,7 @@ def _looked_at(one: UnitMap, table: VoxelTable, *, judged: bool) -> _Part:
     config = one.request.config
     log = one.backend.events() if config.statistics or config.events else None
     events = None if log is None else dataclasses.replace(log, classes=table.classes)
+    one.backend = NoMap()  # what comes next has its memory
     if not judged:
         return _Part(table, TableSums.of(table, config.strata).arrays(), events=events)
     if not config.statistics:

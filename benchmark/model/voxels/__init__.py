@@ -245,23 +245,35 @@ class Events:
 
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
+        parts = [log._columns() for log in self._few_at_a_time()]
+        columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in _SUMS}
+        evidence = Evidence.joined([part["evidence"] for part in parts])
+        index = {name: getattr(self, name) for name in _INDEX_TYPES}
+        return VoxelTable(**index, **columns, evidence=evidence, voxel_size=self.voxel_size, classes=self.classes)
+
+    def _columns(self) -> dict[str, Any]:
         starts, s_bar = self.starts, self.evidence[:]
-        op = np.diff(np.append(starts, len(self)))
-        return VoxelTable(
-            self.ix,
-            self.iy,
-            self.iz,
-            op=op.astype(np.int32),
-            evidence=Evidence.of(_sum_by_voxel(s_bar, starts)),
-            drift_sum=_sum_by_voxel(self.drift(), starts),
-            pixels=_sum_by_voxel(self.pixels, starts),
-            first_frame=np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
-            last_frame=np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
-            self_sum=_sum_by_voxel((s_bar**2).sum(axis=1), starts),
-            frame_entropy_sum=_sum_by_voxel(entropy_bits(s_bar), starts),
-            voxel_size=self.voxel_size,
-            classes=self.classes,
-        )
+        return {
+            "op": np.diff(np.append(starts, len(self))).astype(np.int32),
+            "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
+            "drift_sum": _sum_by_voxel(self.drift(), starts),
+            "pixels": _sum_by_voxel(self.pixels, starts),
+            "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
+            "last_frame": np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
+            "self_sum": _sum_by_voxel((s_bar**2).sum(axis=1), starts),
+            "frame_entropy_sum": _sum_by_voxel(entropy_bits(s_bar), starts),
+        }
+
+    def _few_at_a_time(self) -> Iterator[Events]:
+        """The logs of voxels one after the other, of as many as have little evidence when it is dense."""
+        edges = np.array([some.start for some in self.evidence.chunks()])
+        cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
+        bounds = np.append(self.starts, len(self)).tolist()
+        for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
+            own, of = slice(bounds[first], bounds[last]), slice(first, last)
+            columns: dict[str, Any] = {name: getattr(self, name)[of] for name in _INDEX_TYPES}
+            columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
+            yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
 
     def beliefs(self) -> Float64:
         """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
@@ -369,6 +381,7 @@ _VOXEL_TYPES: Types = _INDEX_TYPES | {
     "op": np.int32, "evidence": np.float64, "drift_sum": np.float64, "pixels": np.int64, "first_frame": np.int32,
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
+_SUMS = [name for name in _VOXEL_TYPES if name not in (*_INDEX_TYPES, "evidence")]
 _EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
 
 
