@@ -52,7 +52,7 @@ from semstab.predict.disk.folder import PredictionFolder
 from semstab.runtime.files import read_json
 from semstab.runtime.json_form import from_json
 from semstab.settings import load_config, load_study
-from semstab.statistics.commit import Commit
+from semstab.statistics.judging.commit import Commit
 from semstab.statistics.looks import Looks
 from semstab.statistics.sampling.influence import InfluenceSums
 

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from semstab.engine.series import FrameRow
 from semstab.engine.tiling.partition import Part
-from semstab.model.records import FrameQuality, ImageSpace
+from semstab.engine.tiling.stretches import Stretch
+from semstab.model.records import FrameQuality
 from semstab.model.results import Agreement, FrameReport, SizeAlpha
 from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.runtime.files import parse_json
@@ -22,6 +23,12 @@ from semstab.runtime.json_form import from_json, to_json
 
 PORTIONS = "parts"
 """Folder of what is finished of units in tiles, unit by unit, until they are whole."""
+
+TRUE_LOOKS = ".truth.parquet"
+"""What the file of looks at the ground truth ends in."""
+
+PART, STRETCH, SIZES = "part", "stretch", "sizes"
+"""Kinds of portions; the last one tells how the map hangs on the voxel size."""
 
 REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
           "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
@@ -34,10 +41,11 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Portion:
-    """What of a unit in tiles is computed in one go: the voxels of a part, or else what its frames tell without a map.
+    """What of a unit in tiles is computed in one go: the voxels of a part, or else what frames tell without its map.
 
     key      of the unit
-    part     None for the frames
+    part     whose voxels are fused
+    stretch  else the frames that are looked at; None where some of them are fused at several voxel sizes
     kept     whether the voxels are kept
     judged   whether the statistics say something of the map
     reduces  whether soft scores are also fused as labels
@@ -45,6 +53,7 @@ class Portion:
 
     key: str
     part: Part | None = None
+    stretch: Stretch | None = None
     kept: bool = False
     judged: bool = False
     reduces: bool = False
@@ -52,21 +61,42 @@ class Portion:
     @property
     def name(self) -> str:
         """Of the file of what is left of it."""
-        return "frames" if self.part is None else self.part.name
+        return next((each.name for each in (self.part, self.stretch) if each is not None), SIZES)
+
+    @property
+    def kind(self) -> str:
+        """PART, STRETCH or SIZES."""
+        return PART if self.part is not None else STRETCH if self.stretch is not None else SIZES
+
+    @property
+    def looks_file(self) -> str:
+        """Of what was sampled of a stretch, in the folder, until the unit is whole."""
+        return f"{PORTIONS}/{self.key}/{self.name}.parquet"
+
+    @property
+    def true_looks_file(self) -> str:
+        """The same of its ground truth."""
+        return f"{PORTIONS}/{self.key}/{self.name}{TRUE_LOOKS}"
+
+    @property
+    def folder(self) -> str:
+        """Of what is left of the unit until it is whole, in that of the run."""
+        return f"{PORTIONS}/{self.key}"
 
 
 @dataclass(frozen=True)
 class About:
     """What is no array of a finished portion.
 
+    kind     see `Portion.kind`
     files    digests of its files, by their path in the folder
     checked  how far it agrees with the reference on a sample of its voxels
-    image_space, sizes, quality  of the frames
+    sizes, quality  of the frames
     """
 
+    kind: str
     files: Mapping[str, str] = field(default_factory=dict)
     checked: Agreement | None = None
-    image_space: ImageSpace | None = None
     sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None
 
@@ -76,9 +106,10 @@ class Finished:
     """What is left of a portion.
 
     series   (F, C) a row a frame: REPORT, then ROW
-    sums     over the voxels, by name: those of `TableSums`, or of `MapSums` where its map is judged
+    sums     over the voxels, by name: those of `TableSums`, or of `FirstSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     poses    (F, 4, 4) of the frames, where it is of these
+    image    (F, C) what each of them tells in image coordinates, see `ImageSpaceMeter`
     """
 
     about: About
@@ -86,10 +117,12 @@ class Finished:
     sums: Mapping[str, Any] = field(default_factory=dict)
     reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     poses: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    image: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
         arrays: dict[str, Any] = {"series": self.series, "reduced": self.reduced, "poses": self.poses}
+        arrays["image"] = self.image
         arrays |= {f"sums {name}": value for name, value in self.sums.items()}
         text = json.dumps(to_json(self.about)).encode()
         write_arrays(path, {"about": np.frombuffer(text, np.uint8), **arrays})
@@ -102,7 +135,7 @@ class Finished:
             return None
         about = from_json(About, parse_json(arrays["about"].tobytes()), path)
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
-        return cls(about, arrays["series"], sums, arrays["reduced"], arrays["poses"])
+        return cls(about, arrays["series"], sums, arrays["reduced"], arrays["poses"], arrays["image"])
 
 
 def series_array(rows: Sequence[FrameRow]) -> Float64:

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.shared.association import check_depth
-from semstab.backends.shared.keys import index_of_keys, out_of_reach
-from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.pixels.keys import index_of_keys, out_of_reach
+from semstab.backends.shared.pixels.pixel_keys import frame_terms
 from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,7 @@ def influence_sums(
     sample: tuple[Events, Events] | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
+    likely: Literal["known"] | None = "known",
 ) -> InfluenceSums:
     """The sums of a map.
 
@@ -46,11 +47,12 @@ def influence_sums(
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
+    likely      None leaves open how likely places are stable: of a part of a map, see `StableLooks`
     """
     index = table.index[table.op >= 2]
     edge = cell_edge(index, table.voxel_size) if edge is None else edge
-    likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
-    whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
+    stable = np.nan_to_num(steady(table)) if true_label is not None and likely else np.zeros(len(table))
+    whole = _of_table(table, true_label, edge, stable) if events is None else _of_log(events, true_label, edge, stable)
     whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)
     return whole if sample is None else with_sample(whole, sample, logged=events is not None)
 
@@ -211,7 +213,7 @@ def _sums_of_log(
     likely: Float64,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
-    from semstab.statistics.kernels import in_chunks
+    from semstab.statistics.loops.kernels import in_chunks
     from semstab.statistics.sampling import loops
 
     K = int(events.evidence.shape[1])
