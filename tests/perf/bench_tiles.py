@@ -5,8 +5,8 @@
 A flight goes to and fro over a field, in legs 40 m apart, with a frame every 30 m: a frame adds about 30,000 voxels of
 0.2 m. It is written as a posed folder and run on one thread, without report, and without recording unless `--record`
 asks for it. Peak is resident memory of the command, with `--jobs` of its largest process; CPU time is user and system,
-of all processes, and that of the stages of a map microseconds a voxel. All columns of both maps are compared bit by bit,
-their summaries to 1e-12.
+of all processes, and that of the stages of a map in microseconds a voxel. All columns of both maps are compared bit by
+bit, their summaries to 1e-12.
 """
 
 from __future__ import annotations
@@ -54,10 +54,9 @@ def write_flight(root: Path, count: int) -> Path:
 def run(scene: Path, out: Path, *options: str) -> dict[str, Any]:
     """Run the command; its peak memory in GB, CPU time in seconds, and that of the stages."""
     watched = out.with_suffix(".json")
-    command = [sys.executable, str(HERE / "staged.py"), str(watched), "run", "--data", str(scene), "--voxel-size", "0.2",
-               "--out", str(out), "--trust-geometry", "--report", "off", "--set", "threads=1", "--quiet",
-               *options]  # fmt: skip
-    process = subprocess.Popen(command)
+    command = [sys.executable, str(HERE / "staged.py"), str(watched), "run", "--data", str(scene), "--out", str(out),
+               "--voxel-size", "0.2", "--trust-geometry", "--report", "off", "--quiet", *options]  # fmt: skip
+    process = subprocess.Popen(command, env={**os.environ, "NUMBA_NUM_THREADS": "1"})
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)}: ended with {os.waitstatus_to_exitcode(status)}")
@@ -117,7 +116,7 @@ def main() -> None:
                 rows.append({"run": name, "frames": count, "voxels": voxels, "tiles": tiles, **found})
                 peak, cpu = found["peak_gb"], found["cpu_s"]
                 print(f"{voxels:12,} {name:>7} {tiles:6} {peak:8.2f} {cpu:7.1f} {1e6 * cpu / voxels:11.2f}", end="")
-                print(*(f"{1e6 * found[stage] / voxels:11.3f}" for stage in STAGES), flush=True)
+                print(*(f"{1e6 * found.get(stage, 0.0) / voxels:11.3f}" for stage in STAGES), flush=True)
             print("the same" if same(Path(folder) / "whole", Path(folder) / "tiles") else "NOT THE SAME", flush=True)
     if arguments.json:
         write_json(arguments.json, {"memory_gb": arguments.memory_gb, "rows": rows})

@@ -1,7 +1,7 @@
-"""The command in a process that also says what each stage took: `python tests/perf/staged.py FILE.json run --data ...`.
+"""The command, which also says what each stage took: `python tests/perf/staged.py FILE.json run --data ...`.
 
-CPU seconds (of the main thread, and of all threads) and peak resident memory by stage of the stopwatch, as JSON. With one
-thread, what the main thread takes in the stages of a frame is theirs; images are decoded in others.
+CPU seconds (of the main thread, and of all threads) and peak resident memory by stage of the stopwatch, as JSON. Where
+numba has one thread, what the main thread takes in the stages of a frame is theirs; images are decoded in others.
 """
 
 from __future__ import annotations
