@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import re
 import shutil
 import zipfile
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import tiny_scene
 from posed_config import configure
@@ -138,3 +141,56 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
         archive.writestr("summary.json", b" " * (LARGEST + 1))
     assert file.stat().st_size < 200_000
     fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_contender, file)
+
+
+@pytest.mark.parametrize(
+    ("field", "number", "line"),
+    [
+        ("edge", 0.3, "sums of wall are damaged"),
+        ("edge", 2.0**63, "sums of wall are damaged"),
+        ("step", 2**31, "sums of wall are damaged"),
+        ("step", 3, "sums of wall are damaged"),
+        ("evidence_0", 1e300, "sums of wall are damaged"),
+        ("evidence_0", float("inf"), "sums of wall are damaged"),
+        ("ix", 2**40, "sums of wall are damaged"),
+        ("flicker", 1e308, "percentages of flicker, or the frames"),
+        ("frames", 2**31, "percentages of flicker, or the frames"),
+    ],
+)
+def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path, field, number, line):
+    file = tmp_path / "kept.semstab"
+    save_summary(open_contender(f"{run}:a"), file)
+    with zipfile.ZipFile(file) as archive:
+        content, sums = json.loads(archive.read("summary.json")), pq.read_table(io.BytesIO(archive.read("0.parquet")))
+    about = json.loads(sums.schema.metadata[b"semstab"])
+    if field in about:
+        sums = sums.replace_schema_metadata({"semstab": json.dumps(about | {field: number})})
+    elif field in sums.column_names:
+        values = pa.array([number] * len(sums))
+        sums = sums.set_column(sums.column_names.index(field), field, values)
+    else:
+        content["scenes"][0][field][0] = number
+    pq.write_table(sums, tmp_path / "sums.parquet")
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("summary.json", json.dumps(content))
+        archive.write(tmp_path / "sums.parquet", "0.parquet")
+    fails(DataError, line, open_contender, file)
+
+
+def test_flicker_out_of_range_in_a_runs_series_is_refused(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    series = next((tmp_path / "run/frames").glob("wall__a*.csv"))
+    rows = series.read_text().splitlines()
+    at = rows[0].split(",").index("flicker_percent")
+    values = rows[2].split(",")
+    values[at] = "1e308"
+    series.write_text("\n".join([*rows[:2], ",".join(values), *rows[3:]]))
+    fails(DataError, "out of range", lambda: open_contender(f"{tmp_path}/run:a").scenes["wall"].flicker)
+
+
+def test_cubes_and_groups_as_large_as_they_may_be(run):
+    sums = open_contender(f"{run}:a").scenes["wall"].sums
+    assert sums.cells > 8
+    wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
+    assert wide.cells <= 8
+    assert value(wide, "alpha") == pytest.approx(value(sums, "alpha"))

@@ -16,10 +16,10 @@ from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
+from semstab.predict.disk.sequence import SequenceOptions, predict_sequence
 from semstab.predict.filters import REGISTRY, parse
 from semstab.predict.kept import Kept
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, stored_labels
-from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import filtered_config, predicted_config, resolve
 
 MODEL = """
@@ -165,6 +165,10 @@ def test_what_is_kept_on_disk_is_asked_once(tmp_path):
         assert (b.scores == 0.5).all()
     Kept(model, tmp_path).fit(images[:1]).predict(images[:1])  # fitted to something else it is another model
     assert model.asked == 4
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:500])
+    Kept(model, tmp_path).predict(images)  # what is damaged is asked for again
+    assert model.asked == 7
 
 
 # --- The command line -------------------------------------------------------------------------------------------------

@@ -28,9 +28,9 @@ from semstab.outputs.plots.sweeps import draw_sweep
 from semstab.outputs.plots.topdown import FromAbove
 from semstab.outputs.plots.views import Views
 from semstab.outputs.recording import Recording, looks
-from semstab.outputs.recording.voxel_maps import defaults
+from semstab.outputs.recording.maps.voxel_maps import defaults
 from semstab.outputs.tables import tables, to_csv
-from semstab.outputs.terminal import print_summary
+from semstab.outputs.terminal.summary import print_summary
 
 
 def second_largest(table):

@@ -30,9 +30,9 @@ from semstab.metrics import matched_region_flicker
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import ENTROPY
 from semstab.pixels.warp import warp
-from semstab.predict.jobs import file_job, scene_jobs
+from semstab.predict.disk.jobs import file_job, scene_jobs
+from semstab.predict.disk.sequence import PredictionObserver, SequenceOptions, predict_sequence
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
-from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
 from semstab.predict.sources import ImageFiles
 from semstab.runtime.files import FolderLock
 from semstab.settings import predicted_config
@@ -162,7 +162,7 @@ def test_scores_that_are_many_go_to_disk_class_by_class(tmp_path, monkeypatch, d
     space = LabelSpace("two", ("ab", "c"), members=(("a", "b"), ()))
     stored = []
     for size in (1 << 28, 0):
-        monkeypatch.setattr("semstab.predict.sequence.SCORE_BYTES", size)
+        monkeypatch.setattr("semstab.predict.disk.sequence.SCORE_BYTES", size)
         inner = Streaming()
         model = InTaxonomy(Checked(inner, "mine"), space, "strict") if inside else Checked(inner, "mine")
         predict(folder, model, indices=[0], scores=True, name=f"x{size}", score_type="float32")
@@ -259,7 +259,7 @@ def test_predictions_killed_at_their_birth_go_on(scene, monkeypatch):
         raise KilledError
 
     with monkeypatch.context() as patch:
-        patch.setattr("semstab.predict.folder.write_json", killed)
+        patch.setattr("semstab.predict.disk.folder.write_json", killed)
         with pytest.raises(KilledError):
             predict(scene, Shifting())
     (scene / "labels/clusters/.semstab-ab12cd34.png").write_bytes(b"half")
@@ -772,7 +772,7 @@ def test_bad_input_is_one_line_and_exit_2(scene, tmp_path, arguments, message):
 def test_a_report_is_said_in_numbers():
     from rich.console import Console
 
-    from semstab.predict.sequence import SequenceReport
+    from semstab.predict.disk.sequence import SequenceReport
     from semstab.predict.terminal import print_report
 
     report = SequenceReport("flight", (Path("labels/x"),), predicted=10, kept=2, model_seconds=2.0, seconds=4.0)

@@ -19,8 +19,8 @@ from semstab.datasets.formats.images import read_labels
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
+from semstab.predict.disk.sequence import SequenceOptions, predict_sequence
 from semstab.predict.predictor import PredictorConfig
-from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.predict.sources import ImageFiles
 from semstab.settings import predicted_config, resolve
 

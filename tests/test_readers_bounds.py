@@ -19,7 +19,7 @@ from semstab.config import read_yaml
 from semstab.datasets.formats.images import read_color, read_depth, read_labels
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import LabelSpace
-from semstab.predict.folder import PredictionFolder
+from semstab.predict.disk.folder import PredictionFolder
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:

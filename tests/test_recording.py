@@ -31,10 +31,11 @@ from semstab.model.measures import SBD_MAX, measures
 from semstab.model.records import Record, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import SERIES, Recording, background, looks, observer, tracker, voxel_maps
+from semstab.outputs.recording import SERIES, Recording, background, looks, observer
 from semstab.outputs.recording.entities import Clock
-from semstab.outputs.recording.layout import Scenery, direction, fit
-from semstab.outputs.recording.legend import LINE, Legend
+from semstab.outputs.recording.eye import Scenery, direction, fit
+from semstab.outputs.recording.maps import tracker, voxel_maps
+from semstab.outputs.recording.maps.legend import LINE, Legend
 from semstab.outputs.recording.series import OF_THE_BACKBONE
 from semstab.task import Task
 

@@ -28,11 +28,12 @@ from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import SBD_MAX
 from semstab.model.palette import GLOW
-from semstab.outputs.recording import Recording, camera, drift_colors, flips, voxel_maps
+from semstab.outputs.recording import Recording, camera
 from semstab.outputs.recording.entities import Clock
-from semstab.outputs.recording.flips import FlipLog
-from semstab.outputs.recording.tracker import Tracker
-from semstab.outputs.recording.voxel_maps import looks
+from semstab.outputs.recording.maps import drift_colors, flips, voxel_maps
+from semstab.outputs.recording.maps.flips import FlipLog
+from semstab.outputs.recording.maps.tracker import Tracker
+from semstab.outputs.recording.maps.voxel_maps import looks
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 

@@ -9,7 +9,7 @@ import pytest
 from simulated_events import grid, log_of
 
 from semstab.outputs.plots.looks import draw_correlogram
-from semstab.outputs.recording.agreement import looks_report
+from semstab.outputs.recording.maps.agreement import looks_report
 from semstab.statistics import Sample, View, correlogram, describe, krippendorff_alpha
 from semstab.statistics.looks.correlogram import band
 

@@ -11,8 +11,15 @@ from semstab.metrics.matching import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
 from semstab.statistics.correctness import correctness
-from semstab.statistics.drift import expected_sbd
-from semstab.statistics.sampling import coverage, identical, mean_over_frames, same_flight
+from semstab.statistics.order.drift import expected_sbd
+from semstab.statistics.sampling import (
+    coverage,
+    difference,
+    difference_over_frames,
+    identical,
+    mean_over_frames,
+    same_flight,
+)
 from semstab.statistics.sampling.collect import influence_sums
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
 from semstab.statistics.steady import steady
@@ -105,13 +112,18 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     kept = table.index[:, 0] < 12
     whole = influence_sums(table, log, truth)
     part = influence_sums(rows_of(table, np.flatnonzero(kept)))
-    assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean())
-    assert (coverage(whole, whole).low, coverage(whole, whole).high) == (1.0, 1.0)
+    assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean() - 1)
+    assert (coverage(whole, whole).low, coverage(whole, whole).high) == (0.0, 0.0)
     assert same_flight(whole, whole)
     assert not same_flight(whole, part)
     other = influence_sums(table, log, 1 - truth)
     assert identical(whole, other, "alpha")
     assert not identical(whole, other, "accuracy")
+    nothing = difference(whole, other, "alpha")
+    assert (nothing.value, nothing.low, nothing.high, nothing.decided) == (0.0, 0.0, 0.0, True)
+    series = dict(enumerate(values))
+    assert difference_over_frames(series, series | {99: 0.0}).high == 0.0
+    assert difference_over_frames({f: v + 1 for f, v in series.items()}, series).value == pytest.approx(1)
 
 
 def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers():

@@ -24,7 +24,7 @@ from semstab.model.frames import Frame, Intrinsics
 from semstab.model.voxels import Events
 from semstab.outputs.report.reading import reading
 from semstab.outputs.tables import tables
-from semstab.outputs.terminal import print_summary
+from semstab.outputs.terminal.summary import print_summary
 from semstab.settings import load_config, resolve
 from semstab.testing.builders import assert_same_map, random_frames
 

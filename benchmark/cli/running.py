@@ -204,10 +204,10 @@ def execute(config: Config, out: Path, executor: Executor, rerun: str | None, re
     from rich.console import Console
 
     from semstab.api import run_study
-    from semstab.outputs.progress import ProgressBar, failure_lines
     from semstab.outputs.remedies import remedies
-    from semstab.outputs.remedies_text import print_remedies
-    from semstab.outputs.terminal import print_summary
+    from semstab.outputs.terminal.progress import ProgressBar, failure_lines
+    from semstab.outputs.terminal.remedies import print_remedies
+    from semstab.outputs.terminal.summary import print_summary
 
     if report not in ("on", "off"):
         raise ConfigError(f"--report {report}: write on or off")

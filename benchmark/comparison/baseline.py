@@ -7,7 +7,7 @@ import json
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,6 +28,11 @@ LARGEST = 100_000_000
 
 MANY_GROUPS = 32
 """Groups of frames down to which these are joined, before cubes are."""
+
+
+def valid_flicker(frames: Iterable[int], percents: Iterable[float]) -> bool:
+    """Whether these are percentages, of frames that have an index."""
+    return all(0 <= frame < 2**31 for frame in frames) and all(0 <= percent <= 100 for percent in percents)
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,10 @@ class _Scene:
     seed: int | None
     frames: tuple[int, ...]
     flicker: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.frames) != len(self.flicker) or not valid_flicker(self.frames, self.flicker):
+            raise DataError("percentages of flicker, or the frames they are of, are out of range")
 
 
 @dataclass(frozen=True)
@@ -133,7 +142,7 @@ def load_baseline(path: str | Path) -> Baseline:
             own.georeference,
             own.up,
             own.seed,
-            dict(zip(own.frames, own.flicker, strict=False)),
+            dict(zip(own.frames, own.flicker, strict=True)),
         )
         for own in content.scenes
     }

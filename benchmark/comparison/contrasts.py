@@ -25,30 +25,31 @@ from semstab.comparison.quantities import (
     quantities,
 )
 from semstab.metrics import macro_mean
-from semstab.model.contrast import Contrast
 from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
+from semstab.model.statistics.contrast import Contrast
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
-from semstab.statistics.comparison import LEAST_VOXELS
 from semstab.statistics.correctness import ACCURACY, MIOU
-from semstab.statistics.differences import holm
 from semstab.statistics.sampling import (
     InfluenceSums,
     Places,
-    aligned,
     coverage,
     difference,
+    difference_over_frames,
     estimate,
     mean_of,
     mean_over_frames,
+    none,
     of_places_alone,
     question_of,
     standard_error,
     unpaired,
     value,
 )
-from semstab.statistics.sampling.influence import columns_of, functional
+from semstab.statistics.sampling.influence import functional
+from semstab.statistics.versus.comparison import LEAST_VOXELS
+from semstab.statistics.versus.differences import holm
 
 FORGIVING, DECIDED = (REACHED, ALPHA_BETWEEN), (ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that forgive what a score leaves open, and those of the fused labels alone."""
@@ -153,8 +154,6 @@ def _difference(base: InfluenceSums, other: InfluenceSums, key: str, k: int | No
     question, number = _question(key, k, base, other), functional(key, k)
     if common.basis == "flights":
         return unpaired(estimate(other, key, k, question), estimate(base, key, k, question))
-    if _same(base, other, key, k):
-        return _none(estimate(base, key, k, question))
     found = difference(other, base, key, k, question, same_frames=common.same_frames)
     most = number.high - number.low
     return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
@@ -165,17 +164,6 @@ def _question(key: str, k: int | None, *sums: InfluenceSums) -> Question:
     return NEXT_FLIGHT if all_tell else THIS_MAP
 
 
-def _same(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None) -> bool:
-    """Whether all that a number is of is the same in both, place by place and frame by frame."""
-    one, two = (columns_of(own, key, k) for own in aligned(base, other))
-    return one.shape == two.shape and bool(np.array_equal(one, two, equal_nan=True))
-
-
-def _none(found: Interval) -> Interval:
-    """A difference that there is nowhere."""
-    return dataclasses.replace(found, value=0.0, low=0.0, high=0.0, p_value=math.nan)
-
-
 def _same_ceiling(base: Entry, other: Entry) -> bool:
     """Whether both judge against the same labels: those of the truth, or their own in finer cells."""
     found = [entry.summary.statistics for entry in (base, other)]
@@ -183,29 +171,20 @@ def _same_ceiling(base: Entry, other: Entry) -> bool:
 
 
 def _coverage(base: InfluenceSums, other: InfluenceSums) -> Contrast:
-    ratio = coverage(other, base)
-    change = dataclasses.replace(ratio, value=ratio.value - 1, low=ratio.low - 1, high=ratio.high - 1)
-    change = _none(change) if _same(base, other, "psa", None) or _as_many(base, other) else _with_p_value(change)
-    return Contrast(COVERAGE.key, "", 1.0, ratio.value, change, math.nan, "")
-
-
-def _as_many(base: InfluenceSums, other: InfluenceSums) -> bool:
-    """Whether both have as many voxels in every cube."""
-    one, two = (own.coarsened(max(base.edge, other.edge), 0) for own in (base, other))
-    return bool(np.array_equal(one.cell, two.cell) and np.allclose(one["voxels"], two["voxels"]))
+    change = _with_p_value(coverage(other, base))
+    return Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
 
 
 def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
     frames = sorted(base.keys() & other.keys()) if paired else []
     if len(frames) > 1:
-        before, after = (np.array([own[frame] for frame in frames]) for own in (base, other))
-        change = mean_over_frames(np.array(frames), after - before)
-        found = _none(change) if np.array_equal(before, after) else _with_p_value(change)
+        before, after = ([own[frame] for frame in frames] for own in (base, other))
+        found = _with_p_value(difference_over_frames(other, base))
     else:
-        before, after = (np.array([*own.values()]) for own in (base, other))
+        before, after = ([*own.values()] for own in (base, other))
         each = [mean_over_frames(np.array([*own]), np.array([*own.values()])) for own in (base, other)]
         found = unpaired(each[1], each[0])
-    return Contrast(FLICKER.key, "", mean(before), mean(after), found, math.nan, "")
+    return Contrast(FLICKER.key, "", mean(np.array(before)), mean(np.array(after)), found, math.nan, "")
 
 
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
@@ -218,7 +197,7 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     places = Places(base.index[known], base.voxel_size, edge)
     columns = np.stack([after - before, np.ones(len(before))], axis=1)
     change = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
-    found = _none(change) if np.array_equal(before, after) else _with_p_value(change)
+    found = none(change) if np.array_equal(before, after) else _with_p_value(change)
     return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from semstab.comparison.baseline import Baseline, Kept, load_baseline, save_baseline
+from semstab.comparison.baseline import Baseline, Kept, load_baseline, save_baseline, valid_flicker
 from semstab.config import nearest
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
@@ -195,9 +195,12 @@ def _flicker(file: Path | None) -> Flicker:
         with file.open(encoding="utf-8", newline="") as lines:
             rows = [(row["frame"], row["flicker_percent"]) for row in csv.DictReader(lines)]
         found = {int(frame): float(percent) for frame, percent in rows if percent}
+        found = {frame: percent for frame, percent in found.items() if math.isfinite(percent)}
+        if not valid_flicker(found, found.values()):
+            raise ValueError("a percentage of flicker, or a frame's index, is out of range")
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise DataError(f"{file}: cannot be read ({one_line(error)}); run it again") from error
-    return {frame: percent for frame, percent in found.items() if math.isfinite(percent)}
+    return found
 
 
 def _of_baseline(path: Path, found: Baseline, backbone: str | None) -> Contender:

@@ -18,8 +18,8 @@ from semstab.gating.config import GateConfig, gate_config
 from semstab.gating.measures import OF_EVIDENCE
 from semstab.gating.results import GateResult, Judgement
 from semstab.gating.rules import Rule, parse
-from semstab.model.statistics import NEXT_FLIGHT, Interval
-from semstab.statistics.sampling import mean_of, mean_over_frames, value
+from semstab.model.statistics import Interval
+from semstab.statistics.sampling import difference_over_frames, mean_of, mean_over_frames, value
 from semstab.statistics.sampling.influence import columns_of
 
 __all__ = ["GateConfig", "GateResult", "gate", "gate_config"]
@@ -169,7 +169,5 @@ def _flicker(new: Entry, base: Entry, level: float) -> Interval:
         raise DataError(
             f"{new.where} and {base.where}: no frames in common to compare flicker on; run both on the same"
         )
-    differences = np.array([new.flicker[frame] - base.flicker[frame] for frame in shared])
-    if not differences.any():
-        return judging.of_frames(Interval(0.0, 0.0, 0.0, NEXT_FLIGHT), len(shared))
-    return judging.of_frames(mean_over_frames(np.array(shared), differences, 1 - 2 * level), len(shared))
+    found = difference_over_frames(new.flicker, base.flicker, 1 - 2 * level)
+    return judging.of_frames(found, len(shared))

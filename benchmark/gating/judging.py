@@ -15,7 +15,6 @@ from semstab.statistics.sampling import (
     coverage,
     difference,
     estimate,
-    identical,
     of_places_alone,
     same_flight,
 )
@@ -65,10 +64,6 @@ def change(
     new, base = comparable(new, base)
     if key == "coverage":
         found = coverage(new, base, both)
-        found = dataclasses.replace(found, value=found.value - 1, low=found.low - 1, high=found.high - 1)
-    elif identical(new, base, key, k):
-        same = estimate(new, key, k, _question(key, k, frames))
-        found = dataclasses.replace(same, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="")
     else:
         paired = frames == "fixed" or same_flight(new, base)
         found = difference(new, base, key, k, _question(key, k, frames), same_frames=paired, level=both)

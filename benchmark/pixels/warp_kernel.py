@@ -9,6 +9,21 @@ from semstab.runtime.compiled import serial
 
 
 @serial
+def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> tuple[float, float, float]:
+    """Column, row and depth in the other camera of the point at depth d along a ray; depth 0 where it is not seen."""
+    fx, fy, cx, cy = camera
+    if not 0.0 < d < math.inf:
+        return 0.0, 0.0, 0.0
+    x, y = ray_x * d, ray_y * d
+    z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * d + motion[2, 3]
+    if not z > 0.0:
+        return 0.0, 0.0, 0.0
+    to_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * d + motion[0, 3]
+    to_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * d + motion[1, 3]
+    return fx * (to_x / z) + cx, fy * (to_y / z) + cy, z
+
+
+@serial
 def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, tolerance: float, out: Any) -> None:
     """For each pixel of a view the flat index of the other view's pixel that sees the same surface, or -1.
 
@@ -20,25 +35,16 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
     out          (H, W) int32, is filled
     """
     ray_x, ray_y = rays
-    fx, fy, cx, cy = camera
     H, W = other_depth.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             out[v, u] = -1
-            d = float(depth[v, u])
-            if not 0.0 < d < math.inf:
-                continue
-            x, y = ray_x[u] * d, ray_y[v] * d
-            z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * d + motion[2, 3]
+            column, row, z = _seen_at(float(depth[v, u]), ray_x[u], ray_y[v], motion, camera)
             if not z > 0.0:
                 continue
-            to_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * d + motion[0, 3]
-            to_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * d + motion[1, 3]
-            column = math.floor(fx * (to_x / z) + cx + 0.5)  # integers are pixel centres
-            row = math.floor(fy * (to_y / z) + cy + 0.5)
-            if not (0.0 <= column < W and 0.0 <= row < H):
+            at_u, at_v = math.floor(column + 0.5), math.floor(row + 0.5)  # integers are pixel centres
+            if not (0 <= at_u < W and 0 <= at_v < H):
                 continue
-            at_u, at_v = int(column), int(row)
             if abs(float(other_depth[at_v, at_u]) - z) <= tolerance * z:
                 out[v, u] = at_v * W + at_u
 
@@ -54,21 +60,11 @@ def blend(
     out     (H, W, K) zeros, is filled; 0 where there is nothing
     """
     ray_x, ray_y = rays
-    fx, fy, cx, cy = camera
     H, W, K = values.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
-            d = float(depth[v, u])
-            if not 0.0 < d < math.inf:
-                continue
-            x, y = ray_x[u] * d, ray_y[v] * d
-            z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * d + motion[2, 3]
-            if not z > 0.0:
-                continue
-            to_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * d + motion[0, 3]
-            to_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * d + motion[1, 3]
-            column, row = fx * (to_x / z) + cx, fy * (to_y / z) + cy
-            if not (-0.5 <= column < W - 0.5 and -0.5 <= row < H - 0.5):
+            column, row, z = _seen_at(float(depth[v, u]), ray_x[u], ray_y[v], motion, camera)
+            if not (z > 0.0 and -0.5 <= column < W - 0.5 and -0.5 <= row < H - 0.5):
                 continue
             left, top = math.floor(column), math.floor(row)
             total = 0.0

@@ -16,10 +16,10 @@ from semstab.backbones import Backbone
 from semstab.config import DatasetConfig, FrameSelection, validated
 from semstab.datasets import Scene, options_model
 from semstab.errors import ConfigError
+from semstab.predict.disk.jobs import Job, file_job, scene_jobs
+from semstab.predict.disk.sequence import SequenceOptions, SequenceReport, predict_sequence
 from semstab.predict.images import ImageSequence
-from semstab.predict.jobs import Job, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels
-from semstab.predict.sequence import SequenceOptions, SequenceReport, predict_sequence
 from semstab.predict.stored import NAME as STORED
 from semstab.predict.terminal import PredictionBar, print_report
 

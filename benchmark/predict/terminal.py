@@ -7,7 +7,7 @@ import time
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from semstab.predict.sequence import PredictionObserver, SequenceReport
+from semstab.predict.disk.sequence import PredictionObserver, SequenceReport
 
 
 class PredictionBar(PredictionObserver):

@@ -21,8 +21,8 @@ from semstab.engine import load_result
 from semstab.errors import LONGEST_LINE, SemstabError
 from semstab.model.records import UnitContent
 from semstab.outputs.tables import tables
-from semstab.outputs.terminal import print_summary
-from semstab.predict.folder import PredictionFolder
+from semstab.outputs.terminal.summary import print_summary
+from semstab.predict.disk.folder import PredictionFolder
 from semstab.runtime.files import read_json
 from semstab.runtime.json_form import from_json
 

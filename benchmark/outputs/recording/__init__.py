@@ -24,9 +24,9 @@ change/RUN/agreement, .../truth         VoxelGridMap: what each voxel that chang
 change/RUN/.../same, .../places         Points3D: the other voxels; the places that got worse, with their numbers
 """
 
+from semstab.outputs.recording.maps.voxel_maps import looks
 from semstab.outputs.recording.observer import Recording
 from semstab.outputs.recording.series import SERIES
 from semstab.outputs.recording.target import Target
-from semstab.outputs.recording.voxel_maps import looks
 
 __all__ = ["SERIES", "Recording", "Target", "looks"]

@@ -15,19 +15,20 @@ from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame
 from semstab.model.results import Unit
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import drift_colors, series
+from semstab.outputs.recording import series
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
     IMAGE_SIDE,
     Overlay,
     stride_of,
 )
-from semstab.outputs.recording.difference import log_difference
 from semstab.outputs.recording.entities import Clock, path
-from semstab.outputs.recording.flips import FlipLog
 from semstab.outputs.recording.layout import drawn, is_pointwise
-from semstab.outputs.recording.tracker import FrameDrift, Tracker
-from semstab.outputs.recording.voxel_maps import MapLog
+from semstab.outputs.recording.maps import drift_colors
+from semstab.outputs.recording.maps.difference import log_difference
+from semstab.outputs.recording.maps.flips import FlipLog
+from semstab.outputs.recording.maps.tracker import FrameDrift, Tracker
+from semstab.outputs.recording.maps.voxel_maps import MapLog
 from semstab.task import Task
 
 SAMPLING = 2

@@ -28,20 +28,22 @@ from semstab.model.measures import measures
 from semstab.model.records import RECORDING_PARTS, Result, Variation, voxels_of
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import drift_colors, series
-from semstab.outputs.recording.agreement import looks_report
+from semstab.outputs.recording import series
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
     CameraLog,
     label_context,
 )
 from semstab.outputs.recording.entities import Clock, path
+from semstab.outputs.recording.eye import Scenery
 from semstab.outputs.recording.group import GroupLog
-from semstab.outputs.recording.layout import Known, Scenery, blueprint
-from semstab.outputs.recording.legend import Legend
+from semstab.outputs.recording.layout import Known, blueprint
+from semstab.outputs.recording.maps import drift_colors
+from semstab.outputs.recording.maps.agreement import looks_report
+from semstab.outputs.recording.maps.legend import Legend
+from semstab.outputs.recording.maps.voxel_maps import CHUNKS, chunks_of, thinned_map
 from semstab.outputs.recording.parts import Parts
 from semstab.outputs.recording.target import DEFAULT_URL, Target, is_whole
-from semstab.outputs.recording.voxel_maps import CHUNKS, chunks_of, thinned_map
 from semstab.task import Task
 
 FIRST_CHUNKS = 8

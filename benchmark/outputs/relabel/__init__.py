@@ -19,7 +19,7 @@ from semstab.model.frames import Frame
 from semstab.model.records import Record
 from semstab.outputs.relabel.fused_labels import Belief, FusedLabels, labels_of
 from semstab.outputs.relabel.report import Relabelled, Tally
-from semstab.predict.folder import PredictionFolder
+from semstab.predict.disk.folder import PredictionFolder
 from semstab.runtime.files import write_json
 from semstab.runtime.prefetch import prefetch
 from semstab.settings import load_config

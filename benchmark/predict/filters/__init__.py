@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -81,7 +82,7 @@ class Shown:
         return self.frame
 
 
-class Filter:
+class Filter(ABC):
     """Beliefs in, beliefs out, image by image; one is made for each sequence. `REGISTRY` names its subclasses.
 
     parameter       what stands behind the colon
@@ -100,9 +101,9 @@ class Filter:
     def __init__(self, value: float) -> None:
         self.value = value
 
+    @abstractmethod
     def __call__(self, belief: Belief, shown: Shown) -> Belief:
         """The belief after what it does; the array that it is given stays as it is."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,20 @@
 """What a map's numbers would be elsewhere, or in the next flight: sums by frame and cube of space, and intervals."""
 
-from semstab.statistics.sampling.collect import influence_sums, with_sample
+from semstab.statistics.sampling.collect import influence_sums, stretches, with_sample
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
 from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
     difference,
     estimate,
+    identical,
     judged_of,
     mean_of,
+    none,
     question_of,
     standard_error,
     unpaired,
 )
-from semstab.statistics.sampling.paired import coverage, identical, mean_over_frames, same_flight
+from semstab.statistics.sampling.paired import coverage, difference_over_frames, mean_over_frames, same_flight
 from semstab.statistics.sampling.places import Places, PlaceSums
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "aligned",
     "coverage",
     "difference",
+    "difference_over_frames",
     "estimate",
     "identical",
     "influence_sums",
@@ -30,10 +33,12 @@ __all__ = [
     "mean_of",
     "mean_over_frames",
     "merged",
+    "none",
     "of_places_alone",
     "question_of",
     "same_flight",
     "standard_error",
+    "stretches",
     "unpaired",
     "value",
     "with_sample",

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,13 @@ MOST_CELLS, MOST_GROUPS = 256, 64
 
 MOST_SUMS = 2**24
 """Numbers in the sums, at most: of thousands of classes fewer groups of frames are kept apart."""
+
+
+EDGES, MOST_STEP = (2.0**-30, 2.0**62), 2**30
+"""Metres that the edge of a cube may have, and how many frames may be in a group."""
+
+LARGEST_SUM = 1e18
+"""No map has so many observations."""
 
 
 def most_groups(K: int) -> int:
@@ -88,9 +95,9 @@ class InfluenceSums:
 
     def coarsened(self, edge: float, step: int) -> InfluenceSums:
         """With larger cubes, or groups of frames; step 0 forgets the frames."""
-        cell = np.floor_divide(self.cell, round(edge / self.edge)).astype(np.int32)
+        cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
-        frame = np.where(self.frame >= 0, self.frame // (step // self.step), -1) if known else np.full(len(cell), -1)
+        frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
         key = np.concatenate([cell, frame[:, None]], axis=1)
         rows, of = np.unique(key, axis=0, return_inverse=True)
         columns = np.zeros((len(rows), self.columns.shape[1]))
@@ -114,9 +121,10 @@ class InfluenceSums:
     def bounded(self) -> InfluenceSums:
         """With at most MOST_CELLS cubes and `most_groups`."""
         edge, step = self.edge, self.step
-        while len(np.unique(self.cell // round(edge / self.edge), axis=0)) > MOST_CELLS:
+        while len(np.unique(_joined(self.cell, edge / self.edge), axis=0)) > MOST_CELLS:
             edge *= 2
-        while step and len(np.unique(self.frame // (step // self.step))) > most_groups(self.K):
+        known = self.frame[self.frame >= 0]
+        while step and len(np.unique(_joined(known, step // self.step))) > most_groups(self.K):
             step *= 2
         return self if (edge, step) == (self.edge, self.step) else self.coarsened(edge, step)
 
@@ -157,10 +165,12 @@ class InfluenceSums:
             if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
                 raise DataError("of another kind or version")
             about = dataclasses.asdict(from_json(About, about, path))
-            part, *keys = (content.column(name).to_numpy() for name in KEYS)
+            part, *keys = (_key(content.column(name).to_numpy(), name) for name in KEYS)
             columns = np.stack([column.to_numpy() for column in content.columns[len(KEYS) :]], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
+            if np.any(np.abs(columns) > LARGEST_SUM):
+                raise DataError("a sum is larger than a map can have it")
             found: list[InfluenceSums | None] = []
             for number in range(3):
                 own = part == number
@@ -194,8 +204,25 @@ class About:
     truth: bool
 
     def __post_init__(self) -> None:
-        if not (self.edge > 0 and self.voxel_size > 0 and self.step >= 0 and len(self.classes) in (0, self.K)):
+        if not (0 < self.voxel_size < math.inf and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size:g} m")
+        if not (EDGES[0] <= self.edge <= EDGES[1] and math.frexp(self.edge)[0] == 0.5):
+            raise DataError(f"cubes of {self.edge:g} m, which is no power of 2 from {EDGES[0]:g} to {EDGES[1]:g}")
+        if not (0 <= self.step <= MOST_STEP and self.step & (self.step - 1) == 0):
+            raise DataError(f"groups of {self.step} frames, which is no power of 2 up to {MOST_STEP}")
+
+
+def _joined(index: Int32, times: float) -> npt.NDArray[np.int64]:
+    """Which cubes, or groups of frames, these are where so many are one; -1 of frames stays."""
+    wide: npt.NDArray[np.int64] = index.astype(np.int64) // round(min(times, 2.0**40))
+    return wide
+
+
+def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+    """A column of whole numbers that fit; raises DataError where it is not."""
+    if values.dtype.kind not in "iu" or not np.array_equal(values, values.astype(np.int32)):
+        raise DataError(f"a number of column '{name}' is out of range")
+    return values
 
 
 def _same_rows(one: InfluenceSums, other: InfluenceSums) -> bool:
@@ -213,7 +240,18 @@ def merged(*parts: InfluenceSums) -> InfluenceSums:
         seen=_merged([part.seen for part in parts]),
         limit=_merged([part.limit for part in parts]),
     )
-    return together.coarsened(together.edge, together.step).bounded()
+    return _known(together.coarsened(together.edge, together.step).bounded())
+
+
+def _known(sums: InfluenceSums) -> InfluenceSums:
+    """Where one part does not tell what frames have to do with a class, all of them do not."""
+    by_class = [own for name, own in layout(sums.K, truth=sums.truth).items() if name in ("class_own", "class_apart")]
+    if not any(np.isnan(sums.columns[:, own]).any() for own in by_class):
+        return sums
+    columns = sums.columns.copy()
+    for own in by_class:
+        columns[sums["voxels"][:, 0] != 0, own] = np.nan
+    return dataclasses.replace(sums, columns=columns)
 
 
 def _merged(parts: Sequence[InfluenceSums | None]) -> InfluenceSums | None:
@@ -264,7 +302,7 @@ def class_alpha_of(sums: Float64) -> Float64:
     apart, n, total, squares = np.moveaxis(sums, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
-        value: Float64 = 1 - (apart / n) / np.where(expected > ONE_HOT, expected, np.nan)
+        value: Float64 = 1 - (apart / n) / np.where(expected.real > ONE_HOT, expected, np.nan)
     return value
 
 
@@ -280,7 +318,7 @@ def reached_of(of: Statistic) -> Statistic:
     def ratio(sums: Float64) -> Float64:
         seen, limit = np.split(sums, 2, axis=-1)
         ceiling = of(limit)
-        share: Float64 = of(seen) / np.where(ceiling > 0, ceiling, np.nan)
+        share: Float64 = of(seen) / np.where(ceiling.real > 0, ceiling, np.nan)
         return share
 
     return ratio

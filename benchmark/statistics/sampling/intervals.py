@@ -69,11 +69,13 @@ def difference(
 
     same_frames  False for another flight, whose frames have nothing to do with these; where it is not given, frames are
                  paired if both maps have the same
-    Each map counts with all its voxels: those of the cubes that only one holds add to the variance.
+    Each map counts with all its voxels: those of the cubes that only one holds add to the variance. Of the very same
+    sums there is no difference anywhere: exactly 0, without a p-value.
     """
-
     a, b = aligned(a, b)
     found = value(a, key, k) - value(b, key, k)
+    if identical(a, b, key, k) and not math.isnan(found):
+        return none(estimate(a, key, k, question, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
         return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
@@ -88,6 +90,22 @@ def difference(
     return dataclasses.replace(
         _interval(found, low, high, one.minus(other), spread, question), p_value=_p_value(found, spread)
     )
+
+
+def identical(a: InfluenceSums, b: InfluenceSums, key: str, k: int | None = None) -> bool:
+    """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
+    found = []
+    for part in aligned(a, b):
+        columns = columns_of(part, key, k)
+        rows = parts_of(part, functional(key, k))[:1]
+        where = columns.any(axis=1) & bool(rows)
+        found.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
+    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*found, strict=True))
+
+
+def none(found: Interval) -> Interval:
+    """A difference that there is nowhere, of places and frames as found."""
+    return dataclasses.replace(found, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
 
 
 def of_places(

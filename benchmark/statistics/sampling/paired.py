@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +12,8 @@ import numpy.typing as npt
 from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.blocks import LEVEL
-from semstab.statistics.sampling.influence import MOST_GROUPS, InfluenceSums, aligned, columns_of, functional, parts_of
-from semstab.statistics.sampling.intervals import LEAST_FRAMES, TOO_FEW, of_places
+from semstab.statistics.sampling.influence import MOST_GROUPS, InfluenceSums
+from semstab.statistics.sampling.intervals import LEAST_FRAMES, TOO_FEW, none, of_places
 
 Float64 = npt.NDArray[np.float64]
 
@@ -42,19 +43,27 @@ def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: flo
     )
 
 
+def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level: float = LEVEL) -> Interval:
+    """The mean of a series by frame less that of another one, paired on the frames of both, for the next flight."""
+    frames = sorted(a.keys() & b.keys())
+    differences = np.array([a[frame] - b[frame] for frame in frames])
+    if not differences.any():
+        return none(Interval(0.0, 0.0, 0.0, NEXT_FLIGHT, frames=len(frames)))
+    return mean_over_frames(np.array(frames), differences, level)
+
+
 def coverage(new: InfluenceSums, base: InfluenceSums, level: float = LEVEL) -> Interval:
-    """How many voxels with OP >= 2 a map has for each one of another, paired on cubes, for this map."""
+    """How many voxels with OP >= 2 a map has for each one of another, less 1, paired on cubes, for this map."""
     edge = max(new.edge, base.edge)
     parts = [sums.coarsened(edge, 0) for sums in (new, base)]
     cell, row = np.unique(np.concatenate([part.cell for part in parts]), axis=0, return_inverse=True)
     of = np.split(row.ravel(), [len(parts[0].cell)])
-    each = [
+    after, before = (
         np.bincount(at, weights=part["voxels"][:, 0], minlength=len(cell)) for at, part in zip(of, parts, strict=True)
-    ]
-    columns = np.stack([each[0], each[0] + each[1], each[1]], axis=1)
+    )
+    columns = np.stack([after - before, after + before, before], axis=1)
     found = of_places(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
-    same = np.allclose(each[0], each[1], rtol=1e-9)
-    return dataclasses.replace(found, low=1.0, high=1.0, undecided="") if same else found
+    return none(found) if np.allclose(after, before, rtol=1e-9) else found
 
 
 def same_flight(a: InfluenceSums, b: InfluenceSums) -> bool:
@@ -64,14 +73,3 @@ def same_flight(a: InfluenceSums, b: InfluenceSums) -> bool:
         return False
     one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step)) for part in (a, b))
     return len(one) > 0 and np.array_equal(one, other)
-
-
-def identical(a: InfluenceSums, b: InfluenceSums, key: str, k: int | None = None) -> bool:
-    """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
-    found = []
-    for part in aligned(a, b):
-        columns = columns_of(part, key, k)
-        rows = parts_of(part, functional(key, k))[:1]
-        where = columns.any(axis=1) & bool(rows)
-        found.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
-    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*found, strict=True))

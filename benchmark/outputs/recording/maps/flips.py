@@ -1,0 +1,193 @@
+"""Flip forensics: which frames moved the voxels that drifted most, and which of them changed the dominant class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace
+from semstab.model.measures import mean_drift
+from semstab.outputs.recording.entities import Clock, path
+from semstab.outputs.recording.maps.tracker import Tracker
+from semstab.outputs.recording.series import LINE_COLORS
+
+SHOWN = 10
+"""Voxels that are shown of a backbone on a scene."""
+
+MAX_MOVES = 2_000_000
+"""Moves that are kept of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
+
+MOVED_BITS = 0.05
+"""Drift from which on a frame is to blame, also where the dominant class stays: that of a drifting voxel."""
+
+NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
+"""Of an image's longer side, what a number takes up left of its point and above, and right of it and below."""
+
+MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
+
+COLORS = (*LINE_COLORS, (255, 255, 255), (170, 255, 195), (220, 190, 255))
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A voxel that drifted much.
+
+    number  from 1, the one that drifted most first
+    center  (3,) metres, world
+    bits    its drift, summed over all frames
+    moves   records of `MOVE`, in the order of the frames
+    """
+
+    number: int
+    center: npt.NDArray[np.float64]
+    first_frame: int
+    first_class: int
+    op: int
+    sbd: float
+    bits: float
+    moves: npt.NDArray[np.void]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """What projects a point of the world into a frame: K (3, 3), T_wc (4, 4), and the image's height and width."""
+
+    K: npt.NDArray[np.float64]
+    T_wc: npt.NDArray[np.float64]
+    shape: tuple[int, int]
+
+    def project(self, points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """Of points (n, 3) where they are in the viewer's image (n, 2), and which of them with their number inside."""
+        R, t = self.T_wc[:3, :3], self.T_wc[:3, 3]
+        x, y, z = self.K @ ((points - t) @ R).T
+        before = z > 0
+        pixels = np.stack([x, y], axis=1) / np.where(before, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
+        size = np.array(self.shape[::-1], dtype=np.float64)
+        first, last = NUMBER * size.max()
+        return pixels, before & np.all((pixels >= first) & (pixels <= size - last), axis=1)
+
+
+class FlipLog:
+    """Keeps what moved a voxel's belief, above all its dominant class, and from which file the frame's labels came."""
+
+    def __init__(self) -> None:
+        self.moves: list[npt.NDArray[np.void]] = []
+        """Records of `MOVE`, in the order of the frames."""
+        self._count = 0
+        self._frames: dict[int, tuple[float | None, str]] = {}  # timestamp, label file
+        self._cameras: dict[int, Camera] = {}
+
+    def update(self, tracker: Tracker, frame: Frame) -> None:
+        """Keep what the frame that the tracker followed last has moved."""
+        changes = tracker.map.changes
+        at = np.flatnonzero((changes.before != changes.after) | (changes.drift >= MOVED_BITS))
+        moves = np.zeros(len(at), dtype=MOVE)
+        moves["row"], moves["frame"], moves["bits"] = changes.row[at], frame.index, changes.drift[at]
+        moves["before"], moves["after"] = changes.before[at], changes.after[at]
+        self.moves.append(moves)
+        self._count += len(at)
+        name = frame.files.get("labels") or frame.files.get("scores") or ""
+        file = PurePath(name)
+        self._frames[frame.index] = frame.timestamp, file.name if file.suffix else ""
+        self._cameras[frame.index] = Camera(frame.intrinsics.matrix, frame.T_wc, frame.shape)
+        if self._count > MAX_MOVES:
+            self._drop(tracker.map.column("drift_sum"))
+
+    def suspects(self, tracker: Tracker) -> Iterator[Suspect]:
+        """The voxels that drifted most, and what moved them."""
+        total = tracker.map.column("drift_sum")
+        most = np.partition(total, -SHOWN)[-SHOWN] if len(total) > SHOWN else 0.0
+        rows = np.flatnonzero((total >= most) & (total > 0))
+        rows = rows[np.argsort(-total[rows], kind="stable")][:SHOWN]
+        fused = tracker.map
+        first_frame, op = (fused.column(name, rows) for name in ("first_frame", "op"))
+        centers = (fused.index_of(rows) + 0.5) * fused.voxel_size
+        dominant, sbd = fused.evidence_of(rows).argmax(axis=1), mean_drift(total[rows], op)
+        moves = np.concatenate([np.zeros(0, dtype=MOVE), *self.moves])
+        for i, row in enumerate(rows):
+            own = moves[moves["row"] == row]
+            first = int(own["before"][0]) if len(own) else int(dominant[i])
+            yield Suspect(
+                i + 1, centers[i], int(first_frame[i]), first, int(op[i]), float(sbd[i]), float(total[row]), own
+            )
+
+    def log(
+        self,
+        stream: rr.RecordingStream,
+        scene: str,
+        backbone: str,
+        suspects: list[Suspect],
+        classes: LabelSpace,
+        translation: npt.NDArray[np.floating[Any]],
+        clock: Clock,
+    ) -> None:
+        """A lane with each suspect's dominant class, a line of text for each flip, and where the suspects are."""
+        for suspect in suspects:
+            lane = path(scene, "flips", backbone, f"voxel_{suspect.number}")
+            names = list(classes.classes)
+            colors = [(*color, 255) for color in classes.colors]
+            stream.log(lane, rr.StateConfiguration(values=names, labels=names, colors=colors), static=True)
+            self._log_state(stream, lane, suspect.first_frame, classes.classes[suspect.first_class], clock)
+            for flip in suspect.moves[suspect.moves["before"] != suspect.moves["after"]]:
+                self._log_state(stream, lane, int(flip["frame"]), classes.classes[flip["after"]], clock)
+        report = rr.TextDocument(self._report(backbone, suspects, classes), media_type=rr.MediaType.MARKDOWN)
+        stream.log(path(scene, "flips_report", backbone), report, static=True)
+        if suspects:
+            at = np.array([suspect.center - translation for suspect in suspects])
+            labels = [f"{suspect.number}" for suspect in suspects]
+            marks = [COLORS[k % len(COLORS)] for k in range(len(suspects))]
+            radii = rr.Radius.ui_points([5.0] * len(suspects))
+            points = rr.Points3D(at, labels=labels, colors=marks, radii=radii, show_labels=True)
+            stream.log(path(scene, "flips_at", backbone), points, static=True)
+            self._log_numbers(stream, path(scene, "camera", backbone, "flips"), suspects, clock)
+
+    def _log_numbers(self, stream: rr.RecordingStream, entity: str, suspects: list[Suspect], clock: Clock) -> None:
+        """Where the suspects are in each frame; in the view of an image 3D points would stand beside it as well."""
+        for frame, camera in self._cameras.items():
+            pixels, inside = camera.project(np.array([suspect.center for suspect in suspects]))
+            seen = np.flatnonzero(inside)
+            clock.set(stream, frame, self._frames[frame][0])
+            numbers = rr.Points2D(
+                pixels[seen],
+                labels=[f"{suspects[k].number}" for k in seen],
+                colors=[COLORS[k % len(COLORS)] for k in seen],
+                radii=rr.Radius.ui_points([4.0] * len(seen)),
+                show_labels=True,
+            )
+            stream.log(entity, numbers)
+
+    def _log_state(self, stream: rr.RecordingStream, lane: str, frame: int, name: str, clock: Clock) -> None:
+        clock.set(stream, frame, self._frames.get(frame, (None, ""))[0])
+        stream.log(lane, rr.StateChange(state=name))
+
+    def _report(self, backbone: str, suspects: list[Suspect], classes: LabelSpace) -> str:
+        """Markdown: for each suspect the frames that are to blame."""
+        lines = [f"**{backbone}**: the voxels with the largest drift, and the frames that moved them"]
+        lines += [""] if suspects else ["", "No voxel drifted."]
+        for s in suspects:
+            x, y, z = s.center
+            lines.append(
+                f"- **voxel {s.number}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {s.op}, drift {s.bits:.3f} bits in all,"
+                f" SBD {s.sbd:.4f} bits; {classes.classes[s.first_class]} in frame {s.first_frame}"
+            )
+            for move in s.moves:
+                file = self._frames.get(int(move["frame"]), (None, ""))[1]
+                where = f"frame {move['frame']}{f' ({file})' if file else ''}"
+                before, after = (classes.classes[move[when]] for when in ("before", "after"))
+                what = f"**{before} → {after}**" if before != after else f"stays {before}"
+                lines.append(f"    - {where}: {what}, {move['bits']:.4f} bits")
+        return "\n".join(lines) + "\n"
+
+    def _drop(self, total_drift: npt.NDArray[np.float64]) -> None:
+        """Keep half as many: the moves of the voxels that drifted most."""
+        moves = np.concatenate(self.moves)
+        order = np.argsort(-total_drift[moves["row"]], kind="stable")[: MAX_MOVES // 2]
+        self.moves = [moves[np.sort(order)]]
+        self._count = len(order)
