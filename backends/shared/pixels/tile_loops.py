@@ -9,6 +9,7 @@ order in which they are made does not show.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -53,9 +54,9 @@ def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb,
         d = np.float64(depth[u])
         ok = (d > 0.0) & (d < np.inf) & (labels[u] != ignore)
         d = d if ok else 0.0
-        a = bits_of(d * (ray_a[u] + a0) + ta)
-        b = bits_of(d * (ray_b[u] + b0) + tb)
-        c = bits_of(d * (ray_c[u] + c0) + tc)
+        a: Any = bits_of(d * (ray_a[u] + a0) + ta)
+        b: Any = bits_of(d * (ray_b[u] + b0) + tb)
+        c: Any = bits_of(d * (ray_c[u] + c0) + tc)
         doubt |= ok & (((a & face) == 0) | ((b & face) == 0) | ((c & face) == 0))
         outside |= (a ^ FROM) | (b ^ FROM) | (c ^ FROM)
         i, j, k = (a << 12) & (-1 << 48), (b >> 4) & (0xFFFF << 32), (c >> 20) & (0xFFFF << 16)
