@@ -14,12 +14,12 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from semstab.backends.shared.bits import bits_of
 from semstab.backends.shared.hashing import PARTITIONS, partition_of
 from semstab.backends.shared.pixels.keys import HALF
 from semstab.backends.shared.pixels.pixel_keys import exact_keys_of_row
 from semstab.backends.shared.pixels.run_vectors import LANES, runs_of_eight
 from semstab.backends.shared.prefetch import touch
-from semstab.backends.shared.scores.logarithm import bits_of
 from semstab.runtime.compiled import compiled, parallel, serial
 
 NEAR = 1 << 15
