@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.registry import Entry, Registry
 
 OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
@@ -109,7 +109,7 @@ class Changes:
 class GrowingMap(FusionBackend, Protocol):
     """A backend whose map can be followed voxel by voxel while it grows: what the recording asks for.
 
-    A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.keys`.
+    A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.pixels.keys`.
     """
 
     @property

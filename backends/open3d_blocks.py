@@ -24,10 +24,10 @@ from semstab.backends.shared.observed import Observed, ObservedScores
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
+from semstab.model.voxels.extent import Extent
 
 INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""

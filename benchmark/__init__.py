@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from semstab.outputs.loaded import load
     from semstab.outputs.relabel import Belief, relabel
     from semstab.settings import load_config, load_study
-    from semstab.statistics.commit import Commit
+    from semstab.statistics.judging.commit import Commit
 
 __version__ = "0.3.0"
 

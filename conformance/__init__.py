@@ -48,10 +48,13 @@ def case_folder(name: str) -> Path:
 def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE) -> Iterator[Verdict]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
-    Raises ConfigError for a case that there is not, or a command that cannot be started.
+    Raises ConfigError for a case that there is not, or a command that cannot be read or started.
     """
     folders = [case_folder(name) for name in only or case_names()]
-    words = shlex.split(command)
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise ConfigError(f"{command}: {one_line(error)}") from error
     if not words:
         raise ConfigError("name the program that fuses a case: semstab-bench conform 'PROGRAM OPTIONS'")
     for folder in folders:

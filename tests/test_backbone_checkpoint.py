@@ -70,6 +70,10 @@ def test_a_damaged_configuration(folder):
 
 def test_damaged_preprocessing(folder):
     (folder / "preprocessor_config.json").write_text("{")
+    fails(DataError, r"preprocessor_config\.json: ", model=str(folder))
+    (folder / "preprocessor_config.json").write_text("[1]")
+    fails(DataError, "is no JSON object", model=str(folder))
+    (folder / "preprocessor_config.json").write_text('{"image_processor_type": 1}')
     fails(DataError, "AutoImageProcessor cannot load it", model=str(folder))
 
 

@@ -15,7 +15,7 @@ import tiny_scene
 import semstab
 
 IMPORT = """
-import semstab.outputs.recording, semstab.statistics.kernels  # whatever is compiled is imported without an error
+import semstab.outputs.recording, semstab.statistics.loops.kernels  # whatever is compiled is imported without an error
 from semstab.backends.numba_hash import NumbaHash
 from semstab.runtime.compiled import serial
 

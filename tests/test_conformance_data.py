@@ -73,7 +73,7 @@ def test_a_wrong_table_is_said_with_its_voxel(tmp_path, program, said) -> None:
 
 
 def test_what_cannot_be_run_is_one_line() -> None:
-    for words in (["nowhere/program"], [""], [f"{FUSE} numpy", "--only", "drfit"]):
+    for words in (["nowhere/program"], [""], ["'half a quotation"], [f"{FUSE} numpy", "--only", "drfit"]):
         done = CliRunner().invoke(app, ["conform", *words])
         assert done.exit_code == 2
         assert done.stderr.startswith("error: ")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from semstab.errors import DataError
+from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.runtime.files import atomic_path, keep_only, read_json, write_json, write_text
 
 
@@ -82,3 +83,32 @@ def test_results_of_an_earlier_start_are_removed_and_nothing_else(tmp_path) -> N
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "now.csv", "sub"]
     assert (tmp_path / "sub/before.csv").exists()
     keep_only([], tmp_path / "nowhere")
+
+
+def test_arrays_are_read_as_they_were_written_or_not_at_all(tmp_path):
+    path, arrays = tmp_path / "a.npz", {"x": np.arange(6.0).reshape(2, 3), "n": 3}
+    for packed in (True, False):
+        write_arrays(path, arrays, packed=packed)
+        again = read_arrays(path)
+        assert again.keys() == arrays.keys()
+        np.testing.assert_array_equal(again["x"], arrays["x"])
+        assert int(again["n"]) == 3
+    with np.load(path) as content:
+        whole = dict(content)
+    for change in (
+        {"x": whole["x"] + 1},
+        {"x": whole["x"].reshape(3, 2)},
+        {"more": np.zeros(1)},
+        {"digest": np.zeros(1)},
+    ):
+        np.savez(path, **whole | change)  # with checksums that are right
+        assert read_arrays(path) is None
+    path.write_bytes(b"PK")
+    assert read_arrays(path) is None
+    assert read_arrays(tmp_path / "nowhere.npz") is None
+
+
+def test_json_is_read_from_no_pipe(tmp_path):
+    os.mkfifo(tmp_path / "a.json")
+    with pytest.raises(DataError, match=r"a\.json: cannot be read"):
+        read_json(tmp_path / "a.json")

@@ -165,6 +165,10 @@ def test_what_is_kept_on_disk_is_asked_once(tmp_path):
         assert (b.scores == 0.5).all()
     Kept(model, tmp_path).fit(images[:1]).predict(images[:1])  # fitted to something else it is another model
     assert model.asked == 4
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:500])
+    Kept(model, tmp_path).predict(images)  # what is damaged is asked for again
+    assert model.asked == 7
 
 
 # --- The command line -------------------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semstab.backends.shared import pixel_keys
-from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.pixels import pixel_keys
+from semstab.backends.shared.pixels.keys import HALF
 from semstab.model.labels import IGNORE_8BIT
 
 W = 300

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import shutil
 from collections.abc import Generator
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -19,15 +20,17 @@ from pyarrow import dataset, parquet
 import semstab
 from semstab import backends
 from semstab.engine import InProcess
+from semstab.engine.tiling import stretches
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.parquet import Tile
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.extent import Extent
+from semstab.model.voxels.parquet import Tile
 from semstab.outputs.export import export
+from semstab.statistics.sampling import InfluenceSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
 
@@ -157,9 +160,11 @@ def both(wall, tmp_path_factory):
 def run_both(root, folder, **settings):
     executor = Several()
     semstab.engine.run(configure(root, **settings), out=folder / "whole")
-    semstab.engine.run(configure(root, **settings, tile_size=8), out=folder / "tiles", executor=executor)
+    with mock.patch.object(stretches, "LEAST", 8):
+        semstab.engine.run(configure(root, **settings, tile_size=8), out=folder / "tiles", executor=executor)
     assert len(executor.done) > 4
-    assert "frames" in executor.done
+    frames = [name for name in executor.done if name.startswith("frames_")]
+    assert len(frames) > 1
     return folder / "whole", folder / "tiles"
 
 
@@ -168,8 +173,7 @@ def assert_same_run(whole, tiles) -> None:
     assert len(list((tiles / "voxels").glob("*/tile=*.parquet"))) > 4
     assert not (tiles / "parts").exists()
     found = differences(summary_of(whole), summary_of(tiles), tolerance=1e-12)
-    untold = ("voxels_file", ".flipping")  # places that flip need the prior of the whole map
-    assert [line for line in found if not any(word in line.split(":")[0] for word in untold)] == []
+    assert [line for line in found if "_file" not in line.split(":")[0]] == []
     one, other = (semstab.load(folder).table() for folder in (tiles, whole))
     assert_same_bits(one, other)
     for row, expected in zip(series_of(tiles), series_of(whole), strict=True):
@@ -185,6 +189,37 @@ def test_a_run_in_tiles_says_what_a_whole_one_says(both) -> None:
 @pytest.mark.parametrize(("scene", "backend"), [("soft_wall", "numba"), ("wall", "numpy")])
 def test_so_it_does_with_soft_scores_and_other_backends(scene, backend, tmp_path, request) -> None:
     assert_same_run(*run_both(request.getfixturevalue(scene), tmp_path, **SETTINGS | {"backends": [backend]}))
+
+
+@pytest.fixture(scope="module")
+def judged(wall, tmp_path_factory):
+    """The same of a run with all statistics and its log."""
+    settings = SETTINGS | {"statistics": True, "events": True, "backbones": ["a"]}
+    return run_both(wall, tmp_path_factory.mktemp("judged"), **settings)
+
+
+def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
+    """With log and ground truth: tests of drift, flips, fusion rules, quadrants; each column of each voxel."""
+    assert_same_run(*judged)
+    whole, tiles = judged
+    (statistics,) = (run["statistics"] for run in summary_of(tiles)["runs"])
+    assert all(statistics[name] is not None for name in ("geometry", "correctness", "fusion_rules", "flipping"))
+    assert statistics["drift"]["tests"]["tested_voxels"] > 0
+    one, other = (semstab.load(folder) for folder in (tiles, whole))
+    names = parquet.read_schema(other.result.records[0].voxels_file).names
+    names = [name for name in names if name != "evidence"]
+    columns, expected = (VoxelTable.columns(run.result.records[0].voxels_file, names) for run in (one, other))
+    for name in names:
+        np.testing.assert_allclose(columns[name], expected[name], rtol=1e-12, err_msg=name)
+    assert_same_bits(*(VoxelTable.load(run.result.records[0].truth_file) for run in (one, other)))
+    logs = one.events(), other.events()
+    for name in ("ix", "iy", "iz", "voxel", "frame", "pixels", "evidence"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(log, name)) for log in logs))
+    sums = [InfluenceSums.load(run.result.records[0].influence_file) for run in (one, other)]
+    ordered = [
+        own.columns[np.lexsort((own.frame, *own.cell.T))] for own in (own.coarsened(own.edge, own.step) for own in sums)
+    ]
+    np.testing.assert_allclose(*ordered, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".ply", ".laz"])
@@ -280,7 +315,6 @@ def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
     ("settings", "message"),
     [
         ({"tile_size": 12}, r"tile_size: use a power of 2 from 8, or off"),
-        ({"tile_size": 8, "statistics": True}, r"tile_size = 8: statistics and events keep every observation"),
         ({"tile_size": 8, "backends": ["open3d-projective"]}, r"tile_size = 8: backend 'open3d-projective' cannot"),
     ],
 )

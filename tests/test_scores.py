@@ -11,7 +11,7 @@ import pytest
 
 import semstab
 from semstab import backends
-from semstab.backends.shared.logarithm import plogp_fast
+from semstab.backends.shared.scores.logarithm import plogp_fast
 from semstab.errors import DataError
 from semstab.runtime.compiled import serial
 from semstab.testing import EXACT, SUMS, assert_same_map

@@ -17,8 +17,8 @@ from semstab.model.measures import VSS
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
 from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
-from semstab.statistics.comparison import EDGES, standard_weights
-from semstab.statistics.differences import holm
+from semstab.statistics.versus.comparison import EDGES, standard_weights
+from semstab.statistics.versus.differences import holm
 
 SIDE = 24
 

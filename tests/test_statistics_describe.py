@@ -11,8 +11,8 @@ from simulated_events import grid, log_of
 
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
-from semstab.model.comparison import BackboneComparison
 from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, ClassReach, Interval, Judged, MapStatistics, Reach
+from semstab.model.statistics.comparison import BackboneComparison
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.terminal.statistics import comparison_lines, lines
 from semstab.runtime.files import read_json, write_json

@@ -12,11 +12,11 @@ from striped_floor import K, flight, sampler_of
 
 from semstab import backends
 from semstab.errors import DataError
-from semstab.model.comparison import CommonLooks
+from semstab.model.statistics.comparison import CommonLooks
 from semstab.outputs.terminal.statistics import comparison_lines
 from semstab.statistics import Looks, compare_backbones, psa
-from semstab.statistics.comparison import thin
 from semstab.statistics.looks.common import common, psa_bounds
+from semstab.statistics.versus.comparison import thin
 
 SIZE = 0.2
 

@@ -11,7 +11,7 @@ from semstab.metrics.matching import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
 from semstab.statistics.correctness import correctness
-from semstab.statistics.drift import expected_sbd
+from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import (
     coverage,
     difference,

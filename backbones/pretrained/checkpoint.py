@@ -18,6 +18,7 @@ from pydantic import Field
 
 from semstab.config import Settings
 from semstab.errors import ConfigError, DataError, one_line
+from semstab.runtime.files import read_json
 
 if not transformers.is_torch_available():  # else its classes are stand-ins that fail when they are used
     raise ImportError(f"transformers {transformers.__version__} does not work with torch {torch.__version__}")
@@ -80,6 +81,16 @@ class Checkpoint:
             raise DataError(f"{folder}: there is no such folder; name one that save_pretrained wrote, or a hub id")
         fetched = _cached(options) or _download(options)
         return cls(options.model, fetched, fetched.name)
+
+    def preprocessing(self) -> dict[str, Any]:
+        """What preprocessor_config.json says; nothing where it is not there. Raises DataError where it is damaged."""
+        file = self.folder / "preprocessor_config.json"
+        if not file.is_file():
+            return {}
+        content = read_json(file)
+        if not isinstance(content, dict):
+            raise DataError(f"{file}: is no JSON object; {AGAIN}")
+        return content
 
     def load(self, loader: Any, **options: Any) -> Any:
         """What `loader.from_pretrained` makes of the folder, without network.

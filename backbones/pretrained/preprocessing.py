@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
 from typing import Any, Literal
 
 import transformers
@@ -12,7 +11,6 @@ from transformers import AutoImageProcessor, SegformerImageProcessorPil
 
 from semstab.backbones.pretrained.checkpoint import Checkpoint, ModelOptions
 from semstab.errors import ConfigError, DataError
-from semstab.runtime.files import parse_json
 
 Processing = Literal["pil", "torchvision"]
 
@@ -33,8 +31,9 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
     """
     if processing == "torchvision" and importlib.util.find_spec("torchvision") is None:
         raise ConfigError("processor: torchvision is not installed; leave it out, or pip install torchvision")
-    file = checkpoint.folder / "preprocessor_config.json"
-    if processing == "pil" and file.is_file() and _kind(file) == "SegformerFeatureExtractor":
+    said = checkpoint.preprocessing()
+    kind = said.get("image_processor_type") or said.get("feature_extractor_type")
+    if processing == "pil" and kind == "SegformerFeatureExtractor":
         processor = checkpoint.load(SegformerImageProcessorPil, **settings)
     else:
         processor = checkpoint.load(AutoImageProcessor, backend=processing, **settings)
@@ -52,12 +51,3 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
 def model_type(checkpoint: Checkpoint) -> str:
     """What transformers calls the checkpoint's kind: 'segformer', 'mask2former', ..."""
     return str(checkpoint.load(transformers.AutoConfig).model_type)
-
-
-def _kind(file: Path) -> str | None:
-    try:
-        content = parse_json(file.read_text(encoding="utf-8"))
-    except ValueError:
-        return None  # the loader says it better
-    kind = content.get("image_processor_type") or content.get("feature_extractor_type")
-    return str(kind)

@@ -13,7 +13,6 @@ from semstab.backbones import Image
 from semstab.backbones.pretrained.checkpoint import Checkpoint, bilinear
 from semstab.backbones.pretrained.preprocessing import ImageModelOptions, load_processor
 from semstab.errors import DataError
-from semstab.runtime.files import parse_json
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -66,13 +65,15 @@ class Sam2:
     def __init__(self, model: Any, checkpoint: Checkpoint, options: ImageModelOptions) -> None:
         self._model = model
         side = int(model.config.prompt_encoder_config.image_size)
-        file = checkpoint.folder / "preprocessor_config.json"
-        said = parse_json(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        said = checkpoint.preprocessing()
         self._size = (side, side)
-        self._mean, self._std = (
-            torch.tensor(said.get(key) or usual)[:, None, None]
-            for key, usual in (("image_mean", IMAGENET_MEAN), ("image_std", IMAGENET_STD))
-        )
+        try:
+            self._mean, self._std = (
+                torch.tensor(said.get(key) or usual).reshape(3, 1, 1)
+                for key, usual in (("image_mean", IMAGENET_MEAN), ("image_std", IMAGENET_STD))
+            )
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise DataError(f"{checkpoint.folder}: image_mean and image_std are three numbers each") from error
 
     def see(self, image: Image) -> Seen:
         """Encode an image."""

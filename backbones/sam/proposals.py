@@ -20,7 +20,8 @@ from semstab.backbones import UNASSIGNED, Image, image_digest
 from semstab.backbones.pretrained.checkpoint import Checkpoint
 from semstab.backbones.pretrained.preprocessing import ImageModelOptions
 from semstab.backbones.sam.models import Seen, load_model
-from semstab.runtime.files import atomic_path, content_key
+from semstab.runtime.array_files import read_arrays, write_arrays
+from semstab.runtime.files import content_key
 
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
@@ -100,13 +101,10 @@ class SamProposer:
         if self.options.cache is None:
             return self._propose(image)
         file = self.options.cache / self._key() / f"{image_digest(image)}.npz"
-        if file.is_file():
-            with np.load(file) as kept:
-                return Proposals((int(kept["shape"][0]), int(kept["shape"][1])), *(kept[name] for name in KEPT))
+        if (kept := read_arrays(file)) is not None:
+            return Proposals((int(kept["shape"][0]), int(kept["shape"][1])), *(kept[name] for name in KEPT))
         proposals = self._propose(image)
-        with atomic_path(file) as temporary:
-            arrays = {name: getattr(proposals, name) for name in KEPT}
-            np.savez_compressed(temporary, shape=np.array(proposals.shape), **arrays)
+        write_arrays(file, {"shape": proposals.shape, **{name: getattr(proposals, name) for name in KEPT}})
         return proposals
 
     def _key(self) -> str:

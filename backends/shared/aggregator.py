@@ -12,15 +12,15 @@ import numpy.typing as npt
 from semstab.backends.shared.association import INDEX_LIMIT, check_frame, voxel_index
 from semstab.backends.shared.entries import find_entries
 from semstab.backends.shared.hashing import PARTITIONS
-from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
-from semstab.backends.shared.merging import compact, group, scatter, sort_labels
 from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import columns_of, frame_terms
-from semstab.backends.shared.scores import Scores
-from semstab.backends.shared.tiles import Tiles
-from semstab.model.extent import Extent
+from semstab.backends.shared.pixels.keys import HALF, index_of_keys, out_of_reach
+from semstab.backends.shared.pixels.merging import compact, group, scatter, sort_labels
+from semstab.backends.shared.pixels.pixel_keys import columns_of, frame_terms
+from semstab.backends.shared.pixels.tiles import Tiles
+from semstab.backends.shared.scores.observed_scores import Scores
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
+from semstab.model.voxels.extent import Extent
 
 BANDS = 64
 MIN_BAND_ROWS = 8

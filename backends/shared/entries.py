@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import mix, partition_of
-from semstab.backends.shared.pixel_keys import keep_columns, keys_of_row
+from semstab.backends.shared.pixels.pixel_keys import keep_columns, keys_of_row
 from semstab.runtime.compiled import parallel, serial
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semstab.backends.shared.association import Mask, back_project, voxel_index
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.extent import Extent
 
 if TYPE_CHECKING:
     from semstab.backends import FusionBackend

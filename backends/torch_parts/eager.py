@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.pixels.keys import HALF
 from semstab.backends.shared.total import Change
 from semstab.backends.torch_parts.storage import EMPTY, Columns, MapGrid, VoxelHash
 from semstab.backends.torch_parts.views import DepthView, Labels, Scores

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 
 from semstab.backends.shared.association import INDEX_LIMIT, check_settings
-from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
+from semstab.backends.shared.pixels.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.total import Change, MapTotal
 from semstab.backends.torch_parts import eager
 from semstab.backends.torch_parts.devices import device_of, kernels_for

@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from semstab.backends.shared import keys
+from semstab.backends.shared.pixels import keys
 from semstab.backends.torch_parts import eager, storage
 from semstab.model.results import RECURRENT
 

@@ -87,7 +87,7 @@ def relabel(
     from semstab.convert.display import frame_bar
     from semstab.outputs.relabel import Belief
     from semstab.outputs.relabel import relabel as write
-    from semstab.statistics.commit import Commit
+    from semstab.statistics.judging.commit import Commit
 
     thresholds = None if commit is None else Commit.load(commit)
     belief = Belief(min_op, min_psa, tuple(category or ()), leave_own_out, thresholds)

@@ -25,14 +25,12 @@ from semstab.comparison.quantities import (
     quantities,
 )
 from semstab.metrics import macro_mean
-from semstab.model.contrast import Contrast
 from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
+from semstab.model.statistics.contrast import Contrast
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
-from semstab.statistics.comparison import LEAST_VOXELS
 from semstab.statistics.correctness import ACCURACY, MIOU
-from semstab.statistics.differences import holm
 from semstab.statistics.sampling import (
     InfluenceSums,
     Places,
@@ -50,6 +48,8 @@ from semstab.statistics.sampling import (
     value,
 )
 from semstab.statistics.sampling.influence import functional
+from semstab.statistics.versus.comparison import LEAST_VOXELS
+from semstab.statistics.versus.differences import holm
 
 FORGIVING, DECIDED = (REACHED, ALPHA_BETWEEN), (ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that forgive what a score leaves open, and those of the fused labels alone."""

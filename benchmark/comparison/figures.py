@@ -10,9 +10,9 @@ from semstab.comparison.comparing import Found
 from semstab.comparison.places import Changes
 from semstab.comparison.quantities import HEADLINES, IOU, by_key
 from semstab.comparison.tables import ALL_SCENES, IN_CLASSES, scopes
-from semstab.model.contrast import Against, RunComparison
 from semstab.model.results import slug
 from semstab.model.statistics import Estimate
+from semstab.model.statistics.contrast import Against, RunComparison
 from semstab.outputs.plots.changes import Panel, draw_changes
 from semstab.outputs.plots.statistics import draw_intervals
 from semstab.outputs.plots.style import Figure

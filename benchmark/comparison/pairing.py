@@ -10,17 +10,17 @@ import numpy.typing as npt
 
 from semstab.comparison.opening import Entry
 from semstab.metrics.matching import observations, rows_of
-from semstab.model.comparison import CommonLooks, MapCoverage
-from semstab.model.contrast import Basis
 from semstab.model.measures import sbd
 from semstab.model.records import Record
+from semstab.model.statistics.comparison import CommonLooks, MapCoverage
+from semstab.model.statistics.contrast import Basis
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.comparison import coverage, repeated_rows
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.drift import expected_sbd
 from semstab.statistics.looks import Looks
 from semstab.statistics.looks.ignored import common_looks
+from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, influence_sums
+from semstab.statistics.versus.comparison import coverage, repeated_rows
 
 Int64 = npt.NDArray[np.int64]
 

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from semstab.comparison.contrasts import joint_class
 from semstab.comparison.pairing import Common
 from semstab.metrics.matching import shared_rows, voxel_keys
-from semstab.model.contrast import Blame, Place
 from semstab.model.measures import dominant
+from semstab.model.statistics.contrast import Blame, Place
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from semstab.comparison.places import MOST
 from semstab.comparison.quantities import BY_CLASS, HEADLINES, VERDICT, by_key
 from semstab.comparison.tables import blamed
-from semstab.model.contrast import Against, Basis, Contrast, Place, RunComparison, SceneComparison
 from semstab.model.measures import Quantity
 from semstab.model.statistics import NEXT_FLIGHT
+from semstab.model.statistics.contrast import Against, Basis, Contrast, Place, RunComparison, SceneComparison
 
 MOST_CLASSES = 4
 """Classes that are told of in a sentence."""

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 
 from semstab.comparison.quantities import BY_CLASS, HEADLINES, IOU, RECALL, VERDICT, by_key
-from semstab.model.contrast import Against, Blame, Contrast, Place, RunComparison
 from semstab.model.measures import Quantity
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Estimate, Interval
+from semstab.model.statistics.contrast import Against, Blame, Contrast, Place, RunComparison
 from semstab.outputs.tables.comparison import coverage_table, ignored_table
 from semstab.outputs.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA_BETWEEN, PSA

@@ -12,8 +12,8 @@ from rich.table import Table
 from semstab.comparison.quantities import HEADLINES, by_key
 from semstab.comparison.reading import sentences
 from semstab.comparison.tables import ALL_SCENES, IN_CLASSES, heading, scopes
-from semstab.model.contrast import Against, Contrast, Place, RunComparison
 from semstab.model.measures import Quantity
+from semstab.model.statistics.contrast import Against, Contrast, Place, RunComparison
 from semstab.outputs.terminal.summary import narrow_table
 
 MOST_SCENES = 4

@@ -11,8 +11,8 @@ from semstab.comparison.figures import figures
 from semstab.comparison.reading import sentences
 from semstab.comparison.tables import heading, tables
 from semstab.errors import ConfigError
-from semstab.model import parquet
-from semstab.model.contrast import RunComparison
+from semstab.model.statistics.contrast import RunComparison
+from semstab.model.voxels import parquet
 from semstab.outputs.plots.style import Figure
 from semstab.outputs.report.page import blocks, filled
 from semstab.outputs.tables import Table, save_tables, to_markdown

@@ -188,7 +188,7 @@ def _work_off(
     units = {each.identity: each for each in missing}
     whole = [each for each in missing if each.identity not in tilings]
     in_tiles = {
-        each.identity: TiledUnit(each, tilings[each.identity], folder)
+        each.identity: TiledUnit(each, tilings[each.identity], folder, executor.width)
         for each in missing
         if isinstance(each, PlannedUnit) and each.identity in tilings
     }

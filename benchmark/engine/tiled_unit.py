@@ -16,12 +16,12 @@ from semstab.errors import SemstabError
 class TiledUnit:
     """What an earlier start finished of it is kept, if the unit is still cut in the same way."""
 
-    def __init__(self, planned: PlannedUnit, tiling: Tiling, folder: Folder) -> None:
+    def __init__(self, planned: PlannedUnit, tiling: Tiling, folder: Folder, width: int = 1) -> None:
         self.planned, self._folder = planned, folder
         self._key = unit_key(planned.identity, planned.digest)
         self._requests = {
             request.portion.name: request
-            for request in Request.portions(planned, self._key, tiling)
+            for request in Request.portions(planned, self._key, tiling, width)
             if request.portion is not None
         }
         self._there: dict[str, Finished] = {}
@@ -65,9 +65,8 @@ class TiledUnit:
 
     def _assembled(self) -> Outcome:
         identity = self.planned.identity
-        frames = self._there["frames"]
-        parts = [self._there[name] for name in self._requests if name != "frames"]  # sums do not hang on who was first
+        finished = {name: self._there[name] for name in self._requests}  # sums do not hang on who was first
         try:
-            return Outcome(identity, assembled(self.planned, frames, parts, self._folder.path))
+            return Outcome(identity, assembled(self.planned, finished, self._folder.path))
         except SemstabError as error:
-            return failed([self._requests["frames"]], error)[0]
+            return failed([*self._requests.values()][:1], error)[0]

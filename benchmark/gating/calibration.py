@@ -8,8 +8,8 @@ from pathlib import Path
 from semstab.comparison.opening import open_contender
 from semstab.errors import ConfigError, DataError
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.commit import Commit, calibrate
 from semstab.statistics.correctness import join_truth
+from semstab.statistics.judging.commit import Commit, calibrate
 
 
 def calibrated(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> Commit:

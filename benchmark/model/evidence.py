@@ -100,8 +100,13 @@ class Evidence(NDArrayOperatorsMixin):
 
     def take(self, rows: Any) -> Evidence:
         """The rows (r,) of these numbers, or for which a mask (n,) holds."""
-        chosen = np.arange(len(self))[rows]
-        first, count = self.starts[chosen], np.diff(self.starts)[chosen]
+        if isinstance(rows, slice) and rows.step in (None, 1):
+            first, last, _ = rows.indices(len(self))
+            starts = self.starts[first : max(first, last) + 1]
+            entries = slice(starts[0], starts[-1])
+            return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K)
+        first, end = self.starts[:-1][rows], self.starts[1:][rows]
+        count = end - first
         starts = np.concatenate([[0], np.cumsum(count)])
         entry = np.arange(starts[-1]) + np.repeat(first - starts[:-1], count)
         return Evidence(starts, self.label[entry], self.weight[entry], self.K)

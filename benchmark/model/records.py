@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.errors import ConfigError
-from semstab.model import tabular
-from semstab.model.comparison import BackboneComparison
 from semstab.model.georeference import Georeference
 from semstab.model.measures import measures
 from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
 from semstab.model.statistics import MapStatistics
-from semstab.model.voxels import VoxelTable
+from semstab.model.statistics.comparison import BackboneComparison
+from semstab.model.voxels import VoxelTable, tabular
 from semstab.runtime.json_form import INLINE
 
 if TYPE_CHECKING:
@@ -166,8 +165,8 @@ class Record:
 
     @property
     def events_file(self) -> Path | None:
-        """File of its log of observations, which is there where it was asked for and its backend keeps one."""
-        return self._beside(EVENTS)
+        """File, or folder of tiles, of its log, which is there where it was asked for and its backend keeps one."""
+        return self._beside(EVENTS, "" if self.in_tiles else ".parquet")
 
     @property
     def influence_file(self) -> Path | None:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from semstab.backbones import Backbone, Image, Prediction, image_digest
 from semstab.backbones.wrapped import Wrapped
 from semstab.model.frames import Frame
 from semstab.predict.images import shown_digest
-from semstab.runtime.files import atomic_path, content_key
+from semstab.runtime.array_files import read_arrays, write_arrays
+from semstab.runtime.files import content_key
 
 
 class Kept(Wrapped):
@@ -42,15 +41,14 @@ class Kept(Wrapped):
     def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
         """Scores are kept wherever there are some: whoever asks later may want them."""
         file = self._folder / f"{self._key(image, frame)}.npz"
-        if not file.is_file():
+        there = read_arrays(file)
+        if there is None:
             (prediction,) = self.ask([image], self.gives_scores, frame)
             held: dict[str, Any] = {"labels": prediction.labels}
             held |= {"scores": prediction.scores} if self.gives_scores else {}
-            with atomic_path(file) as temporary:
-                np.savez(temporary, **held)
+            write_arrays(file, held, packed=False)
             return prediction if scores else Prediction(prediction.labels)
-        with np.load(file) as there:
-            return Prediction(there["labels"], there["scores"] if scores else None)
+        return Prediction(there["labels"], there["scores"] if scores else None)
 
     def _key(self, image: Image, frame: Sequence[Frame]) -> str:
         seen = {"fitted": self._fitted_to, "shown": shown_digest(image, frame)}

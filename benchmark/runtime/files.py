@@ -9,11 +9,8 @@ import json
 import math
 import os
 import stat
-import struct
 import tempfile
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
@@ -29,12 +26,6 @@ from semstab.runtime.json_form import to_json
 
 TEMPORARY = ".semstab-"
 """How names of files begin that are not whole yet."""
-
-DAMAGED_ARRAYS = (
-    OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
-    struct.error, tokenize.TokenError, SyntaxError,
-)  # fmt: skip
-"""What numpy raises on a damaged .npz file of our own."""
 
 MAX_YAML_BYTES = 2**24
 MAX_ALIASED = 10**5
@@ -167,7 +158,8 @@ def parse_json(text: str | bytes) -> Any:
 def read_json(path: str | Path) -> Any:
     """Read a JSON file; raise DataError with the file's name where it cannot be read."""
     try:
-        return parse_json(Path(path).read_text(encoding="utf-8"))
+        with open_file(path) as file:
+            return parse_json(file.read().decode("utf-8"))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:

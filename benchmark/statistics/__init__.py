@@ -4,7 +4,6 @@ Pure functions of a VoxelTable and its Events. `describe` says everything about 
 several; docs/metrics.md derives each measure.
 """
 
-from semstab.model.comparison import BackboneComparison
 from semstab.model.statistics import (
     ClassAgreement,
     Correctness,
@@ -15,6 +14,7 @@ from semstab.model.statistics import (
     Reliability,
     StabilityVerdict,
 )
+from semstab.model.statistics.comparison import BackboneComparison
 from semstab.statistics.agreement import (
     alpha_between,
     class_agreement,
@@ -23,10 +23,7 @@ from semstab.statistics.agreement import (
     krippendorff_alpha,
     psa,
 )
-from semstab.statistics.backbones import compare_backbones
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
-from semstab.statistics.ceiling import ceiling, losses, rendered
-from semstab.statistics.comparison import coverage, paired, standardised
 from semstab.statistics.correctness import (
     Truth,
     correctness,
@@ -36,8 +33,10 @@ from semstab.statistics.correctness import (
     stable_wrong,
 )
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.differences import claimed_together
-from semstab.statistics.drift import (
+from semstab.statistics.judging.ceiling import ceiling, losses, rendered
+from semstab.statistics.judging.verdict import verdict
+from semstab.statistics.looks import Looks, Sample, Sampler, View, correlogram, reach_of
+from semstab.statistics.order.drift import (
     Flips,
     VoxelDrift,
     benjamini_hochberg,
@@ -45,11 +44,12 @@ from semstab.statistics.drift import (
     flips,
     voxel_drift,
 )
-from semstab.statistics.fusion_rules import RULES, Fused, fuse
-from semstab.statistics.looks import Looks, Sample, Sampler, View, correlogram, reach_of
+from semstab.statistics.order.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.scene_drift import SceneDrift, scene_drift
 from semstab.statistics.uncertainty import Uncertainty, decompose
-from semstab.statistics.verdict import verdict
+from semstab.statistics.versus.backbones import compare_backbones
+from semstab.statistics.versus.comparison import coverage, paired, standardised
+from semstab.statistics.versus.differences import claimed_together
 
 __all__ = [
     "RULES",

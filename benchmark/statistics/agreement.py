@@ -145,7 +145,7 @@ def between_of(sums: Float64) -> Float64:
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = own / n - ((sums[..., 3:] ** 2).sum(axis=-1) - own) / (n * (n - 1))
         ratio = (own - sums[..., 0]) / n / expected
-    beyond: Float64 = np.where(expected > ONE_HOT, 1 - ratio, np.nan)
+    beyond: Float64 = np.where(expected.real > ONE_HOT, 1 - ratio, np.nan)
     return beyond
 
 
@@ -167,7 +167,7 @@ def class_of(sums: Float64) -> Float64:
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = 2 * (n * squares - total**2) / (n * (n - 1))
         ratio = apart / n / expected
-    beyond: Float64 = np.where(expected > ONE_HOT, 1 - ratio, np.nan)
+    beyond: Float64 = np.where(expected.real > ONE_HOT, 1 - ratio, np.nan)
     return beyond
 
 
@@ -208,7 +208,7 @@ def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[Clas
 def _squares(table: VoxelTable, events: Events | None) -> Float64:
     """The sum over frames of s_tk^2 for each entry (m,) of the table's evidence."""
     if events is not None:
-        from semstab.statistics import kernels, log_kernels
+        from semstab.statistics.loops import kernels, log_kernels
 
         squares, bounds = np.zeros(len(table.evidence.weight)), np.append(events.starts, len(events))
         voxels = table.evidence.entries
@@ -223,5 +223,5 @@ def _beyond_chance(observed: Float64, expected: Float64) -> Float64:
     """1 - (1 - observed) / (1 - expected); NaN where chance alone would always agree."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = (1 - observed) / (1 - expected)
-    beyond: Float64 = np.where(1 - expected > ONE_HOT, 1 - ratio, np.nan)
+    beyond: Float64 = np.where(1 - expected.real > ONE_HOT, 1 - ratio, np.nan)
     return beyond

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +18,19 @@ from semstab.model.voxels import VoxelTable
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Statistic = Callable[[Float64], Float64]
-"""From sums over voxels (..., C) to a value (...,); smooth, and the same when all sums are doubled."""
+"""From sums over voxels (..., C) to a value (...,); the same when all sums are doubled, and a formula of which complex
+sums make sense: its slopes are found with them (`slope`), so that it compares `.real` only."""
 
 LEAST_BLOCKS = 32
 LEVEL = 0.95
 REPLICATES = 2000
 ROUNDING = 1e-9
 TINY = 1e-12
+MOST_CELLS = LEAST_BLOCKS * 16**3
+"""Cells that tell which edge leaves so many blocks: finer ones than an eighth of it do not matter."""
+STEP = 1e-20
+"""Of a sum, into the complex plane: its square is nothing beside 1."""
+
 AT_ONCE = 2**20
 """Numbers in the sums of which a statistic is taken together: all of 20,000 classes would take 3 GB."""
 
@@ -73,9 +79,35 @@ def spatial_blocks(
     return Blocks(of.astype(np.int64), len(blocks), edge * voxel_size)
 
 
-def _largest_edge(index: npt.NDArray[np.integer], least: int) -> int:
+@dataclass(frozen=True, eq=False)
+class Occupied:
+    """Where voxels are, as finely as the edge of blocks asks for: cells (c, 3) of `unit` voxels, a power of 2."""
+
+    cells: npt.NDArray[np.integer]
+    unit: int
+
+    @classmethod
+    def of(cls, index: npt.NDArray[np.integer]) -> Occupied:
+        """Those of voxels (n, 3)."""
+        return cls.merged([cls(index, 1)])
+
+    @classmethod
+    def merged(cls, parts: Sequence[Occupied]) -> Occupied:
+        """Those of a map from its parts."""
+        unit = max(part.unit for part in parts)
+        cells = np.concatenate([part.cells // (unit // part.unit) for part in parts])
+        while len(cells := _distinct(cells)) > MOST_CELLS:
+            cells, unit = cells // 2, 2 * unit
+        return cls(cells, unit)
+
+    def edge(self, least: int = LEAST_BLOCKS) -> int:
+        """That of `spatial_blocks`, in voxels."""
+        return _largest_edge(self.cells, least, self.unit)
+
+
+def _largest_edge(index: npt.NDArray[np.integer], least: int, unit: int = 1) -> int:
     """The edge, in voxels: first the power of 2, then what can be added to it."""
-    cells, unit, steps = _distinct(index), 1, 1  # blocks of `steps` cells, cells of `unit` voxels
+    cells, steps = _distinct(index), 1  # blocks of `steps` cells, cells of `unit` voxels
     while len(_distinct(cells // (2 * steps))) >= max(least, 2):
         if steps < 8:
             steps *= 2
@@ -172,30 +204,35 @@ def _standard_errors(sums: Float64, statistic: Statistic, weights: Float64) -> F
 def _slopes(statistic: Statistic, totals: Float64, sums: Float64) -> Callable[[Int64], Float64]:
     """The statistic's linear part in each block's sums (B, C) at some of the totals (R, C): (r, B)."""
     if len(sums) < totals.shape[1]:  # fewer blocks than columns, as with many classes
-        along = np.stack([_derivative(statistic, totals, 1e-3 * own) for own in sums], axis=1) * 1e3
+        along = np.stack([slope(statistic, totals, own) for own in sums], axis=1)
         return lambda rows: along[rows]
     scale = np.abs(totals).max(axis=0)
     gradient = np.zeros_like(totals)
     for column in np.flatnonzero(scale):
         step = np.zeros(totals.shape[1])
-        step[column] = 1e-5 * scale[column]
-        gradient[:, column] = _derivative(statistic, totals, step) / step[column]
+        step[column] = scale[column]
+        gradient[:, column] = slope(statistic, totals, step) / scale[column]
     return lambda rows: gradient[rows] @ sums.T
 
 
-def _derivative(statistic: Statistic, totals: Float64, step: Float64) -> Float64:
-    """Half the difference (R,) of the statistic one step ahead of the totals and one behind."""
-    half: Float64 = (statistic(totals + step) - statistic(totals - step)) / 2
-    return half
+def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
+    """The derivative (...,) of a statistic at totals (..., C) along a direction (..., C); NaN where it is undefined.
+
+    By a step into the complex plane, which takes no difference and so loses no digit (Squire and Trapp 1998, SIAM
+    Review 40).
+    """
+    value = statistic(totals + STEP * 1j * direction)
+    derivative: Float64 = np.where(np.isnan(value.real), np.nan, value.imag / STEP)
+    return derivative
 
 
 def gradient_of(statistic: Statistic, total: Float64) -> Float64:
-    """Central differences (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
+    """The gradient (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
     gradient = np.zeros_like(total)
     some = np.flatnonzero(total)
     for at in np.array_split(some, len(some) * len(total) // AT_ONCE + 1):
-        step = 1e-5 * np.maximum(np.abs(total[at]), TINY)
-        steps = np.zeros((len(at), len(total)))
-        steps[np.arange(len(at)), at] = step
-        gradient[at] = (statistic(total + steps) - statistic(total - steps)) / (2 * step)
+        scale = np.maximum(np.abs(total[at]), TINY)
+        along = np.zeros((len(at), len(total)))
+        along[np.arange(len(at)), at] = scale
+        gradient[at] = slope(statistic, total, along) / scale
     return gradient

@@ -76,7 +76,7 @@ class LabelMaps:
             raise DataError(
                 f"{self._folder}: {listed(lost, str(self._folder))}; choose frames that have them, or add them"
             )
-        return source.files[name]
+        return Path(source.files[name])
 
     def space(self, backbone: str) -> LabelSpace | None:
         """The classes of a label source, None where nothing says them; what says them is read once."""
@@ -92,7 +92,7 @@ class LabelMaps:
             raise ConfigError(f"{self._folder}: '{backbone}' holds regions without classes, which cannot be fused")
         space = self.space(backbone)
         if space is None:
-            beside = next(iter(source.files.values())).parent
+            beside = Path(next(iter(source.files.values()))).parent
             raise DataError(
                 f"{where}: the classes of '{backbone}' are not known; set classes: [name, ...] in id order, taxonomy:"
                 f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {beside}"
@@ -117,7 +117,7 @@ class LabelMaps:
 
     def mask_file(self, name: str) -> Path | None:
         """The mask of a frame, where it has one."""
-        return self._masks.get(name)
+        return Path(self._masks[name]) if name in self._masks else None
 
     def mask(self, path: Path) -> npt.NDArray[np.uint8]:
         """(H, W): 1 where a mask leaves out. Raises DataError that names it."""

@@ -10,7 +10,7 @@ from typing import Literal
 
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.templates import Folders, Template, inside, matching_folders
+from semstab.datasets.files.templates import Folders, Template, inside_text, matching_folders
 from semstab.datasets.formats.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
@@ -34,17 +34,18 @@ SEPARATE = "{scene}/{backbone}/{name}"
 
 @dataclass(frozen=True)
 class LabelSource:
-    """One label source of a scene: the path of each frame, and the file that is there."""
+    """One label source of a scene: where a frame's file would be, and those that are there, by the frame's name."""
 
     kind: Kind
-    expected: Mapping[str, Path]
-    files: Mapping[str, Path]
+    base: Path
+    template: str
+    files: Mapping[str, str]
 
     def missing(self, name: str) -> list[str]:
         """Nothing, or the path that the file of that frame would have."""
         if name in self.files:
             return []
-        path = self.expected[name]
+        path = self.base / self.template.replace("{name}", name)
         return [str(path if path.suffix.lower() in SUFFIXES[self.kind] else f"{path}{SUFFIXES[self.kind][0]}")]
 
 
@@ -124,7 +125,7 @@ def find_regions(
     return {backbone: source for backbone, source in found.items() if source.files}
 
 
-def find_masks(options: FileOptions, place: ScenePlace, names: FileNames) -> Mapping[str, Path]:
+def find_masks(options: FileOptions, place: ScenePlace, names: FileNames) -> Mapping[str, str]:
     """The mask of each frame that has one, by the frame's name; none without the option."""
     if options.masks is None:
         return {}
@@ -155,17 +156,14 @@ def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) 
 
 
 def _source(kind: Kind, base: Path, template: str, names: FileNames, folders: Folders) -> LabelSource:
-    """The files of one source, by the frames' names."""
-    paths = {
-        name: [inside(base, base, template.replace("{name}", each), str(base)) for each in known]
-        for name, known in names.items()
-    }
-    found = {
-        name: next((path for each in known if (path := folders.one_of(each, SUFFIXES[kind])) is not None), None)
-        for name, known in paths.items()
-    }
-    expected = {name: known[0] for name, known in paths.items()}
-    return LabelSource(kind, expected, {name: path for name, path in found.items() if path is not None})
+    """The files of one source, by the frames' names; as text, for a path takes longer to make than to look up."""
+    where, found = str(base), {}
+    for name, known in names.items():
+        paths = (inside_text(base, template.replace("{name}", each), where) for each in known)
+        file = next((file for path in paths if (file := folders.file(path, SUFFIXES[kind])) is not None), None)
+        if file is not None:
+            found[name] = file
+    return LabelSource(kind, base, template, found)
 
 
 def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:
@@ -176,7 +174,7 @@ def label_space(options: FileOptions, folder: Path, name: str, source: LabelSour
     if name in options.taxonomies:
         return LabelSpace.load(options.taxonomies[name])
     frame, file = next(iter(source.files.items()))
-    for parent in file.parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
+    for parent in Path(file).parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
         if (beside := parent / LABEL_SPACE_FILE).is_file():
             return LabelSpace.load(beside)
     try:

@@ -35,12 +35,16 @@ from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
+from semstab.runtime.prefetch import prefetch
 
 PLACES = {
     "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",
     "casts", "images",
 }  # fmt: skip
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
+
+AT_ONCE = 64
+"""Files that a thread reads one after the other for their digests."""
 
 
 class FileScene(Scene):
@@ -77,7 +81,7 @@ class FileScene(Scene):
         self.regions = self._maps.regions
         self.label_paths = tuple(label_paths(options, place, names))
         self._folders = Folders()
-        self._digests: dict[Path, bytes] = {}
+        self._digests: dict[str, bytes] = {}
         self._depth: DepthSource = (
             StoredDepth(options, self._read) if surface is None else CastDepth(surface, options, self._views)
         )
@@ -232,15 +236,21 @@ class FileScene(Scene):
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
         digest.update(self._maps.table_bytes(backbone))
-        for index in indices:
+        files = [self._images(self._frame(index), backbone) for index in indices]
+        read = _digests_of([file for each in files for file in each if file not in self._digests])
+        for index, images in zip(indices, files, strict=True):
             source = self._frame(index)
             digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
-            mask, depth = self._maps.mask_file(source.name), self._depth.digest(source)
-            digest.update(depth or b"")
-            for path in (source.depth if depth is None else None, self._maps.file(source.name, backbone), mask):
-                if path is not None:
-                    digest.update(self._digests.get(path) or disk.file_digest(path))
+            digest.update(self._depth.digest(source) or b"")
+            for file in images:
+                digest.update(read.get(file) or self._digests[file])
         return digest.hexdigest()
+
+    def _images(self, source: FrameSource, backbone: str) -> list[str]:
+        """The files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
+        depth = source.depth if self._depth.digest(source) is None else None
+        paths = (depth, self._maps.file(source.name, backbone), self._maps.mask_file(source.name))
+        return [str(path) for path in paths if path is not None]
 
     def _views(self) -> Iterator[View]:
         """Those of the frames that have a pose."""
@@ -311,7 +321,7 @@ class FileScene(Scene):
     def _read(self, path: Path) -> bytes:
         """The content of an image file; its digest is kept, so that `digest` need not read the file again."""
         data = disk.read_bytes(path)
-        self._digests[path] = disk.digest(data)
+        self._digests[str(path)] = disk.digest(data)
         return data
 
     def _stored_pose(self, source: FrameSource) -> Poses:
@@ -325,3 +335,14 @@ class FileScene(Scene):
         if not 0 <= index < len(self):
             raise ConfigError(f"{self.folder}: there is no frame {index}; it has {len(self)}, counted from 0")
         return self._frames[index]
+
+
+def _digests_of(files: Sequence[str]) -> dict[str, bytes]:
+    """Those of files that have to be read for it, some in each of several threads."""
+    some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
+    digests = prefetch(lambda k: [disk.file_digest(Path(file)) for file in some[k]], range(len(some)))
+    return {
+        file: digest
+        for names, fetched in zip(some, digests, strict=True)
+        for file, digest in zip(names, fetched.item, strict=True)
+    }

@@ -81,8 +81,7 @@ def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
 
     Raises DataError with `where` (the file that names the path) where it does not, or no path can be called so.
     """
-    if UNSAFE.search(relative) or len(relative) > LONGEST:
-        raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
+    _require_path(relative, where)
     path = folder / relative
     if ".." not in relative and not relative.startswith("/"):
         return path
@@ -91,6 +90,19 @@ def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
             f"{where}: the path {relative[:200]!r} leaves {root}; set root to the folder that holds all files"
         )
     return path if ".." not in path.parts else Path(os.path.normpath(path))
+
+
+def inside_text(root: Path, relative: str, where: str) -> str:
+    """The same of a path relative to the root, as text, which may have more dots and slashes than it needs."""
+    if ".." in relative or relative.startswith("/"):
+        return str(inside(root, root, relative, where))
+    _require_path(relative, where)
+    return f"{root}/{relative}"
+
+
+def _require_path(relative: str, where: str) -> None:
+    if UNSAFE.search(relative) or len(relative) > LONGEST:
+        raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
 
 
 class Folders:
@@ -106,12 +118,17 @@ class Folders:
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
         """The path where it has one of the suffixes, else that with the first suffix there is a file of."""
+        file = self.file(str(path), suffixes)
+        return None if file is None else Path(file)
+
+    def file(self, path: str, suffixes: Collection[str]) -> str | None:
+        """The same as text."""
         parent, name = os.path.split(path)
         there = self._listed(parent)
         if os.path.splitext(name)[1].lower() in suffixes:  # noqa: PTH122  of ten thousand names
             return path if name in there else None
         suffix = next((suffix for suffix in suffixes if name + suffix in there), None)
-        return None if suffix is None else Path(parent, name + suffix)
+        return None if suffix is None else path + suffix
 
     def _listed(self, folder: str) -> frozenset[str]:
         if folder not in self._names:

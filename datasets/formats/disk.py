@@ -62,12 +62,13 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, Path]:
     """The files with one of these suffixes. Raises DataError for two of one stem, or a folder that cannot be listed."""
     files: dict[str, Path] = {}
     for entry in _entries(folder):
-        path = folder / entry.name
-        if path.suffix.lower() not in suffixes or not entry.is_file():
+        stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122  of a hundred thousand names
+        if suffix.lower() not in suffixes or not entry.is_file():
             continue
-        if path.stem in files:
-            raise DataError(f"{path}: {files[path.stem].name} is the same frame; keep one of the two")
-        files[path.stem] = path
+        path = folder / entry.name
+        if stem in files:
+            raise DataError(f"{path}: {files[stem].name} is the same frame; keep one of the two")
+        files[stem] = path
     return files
 
 

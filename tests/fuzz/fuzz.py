@@ -1,6 +1,6 @@
 """Damage tiny true files of every kind that is read, and see that each is read, or refused in one line.
 
-    python tests/fuzz/fuzz.py [--seconds 60] [--seed 1] [--kind NAME] [--failures DIR]       make fuzz: an hour
+    python tests/fuzz/fuzz.py [--seconds 60] [--inputs N] [--seed 1] [--kind NAME] [--failures DIR]   make fuzz: an hour
 
 A worker reads; a worker that dies or hangs is replaced. Prints a table by kind, and leaves inputs that fail in DIR,
 each with what happened beside it. Exit code 1 where there are any.
@@ -13,6 +13,7 @@ import collections
 import contextlib
 import hashlib
 import logging
+import math
 import multiprocessing as mp
 import os
 import random
@@ -173,12 +174,12 @@ def report_of(counts: dict[str, collections.Counter[str]]) -> str:
     return "\n".join(lines)
 
 
-def fuzz(seconds: float, seed: int, wanted: str | None, failures: Path) -> int:
-    """Run workers for so long; how many inputs failed."""
+def fuzz(seconds: float, most: float, seed: int, wanted: str | None, failures: Path) -> int:
+    """Run workers for so long, or until so many inputs were read; how many of them failed."""
     counts: dict[str, collections.Counter[str]] = {}
     faults: collections.Counter[str] = collections.Counter()
-    end, start = None, seed
-    while end is None or time.monotonic() < end:
+    end, start, left = None, seed, most
+    while end is None or (time.monotonic() < end and left > 0):
         with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
             ours, theirs = mp.Pipe()
             worker = mp.get_context("spawn").Process(target=work, args=(folder, start, wanted, theirs), daemon=True)
@@ -191,7 +192,7 @@ def fuzz(seconds: float, seed: int, wanted: str | None, failures: Path) -> int:
                 sys.exit("a true file is not read; see what the worker says without its output shut")
             end = end or time.monotonic() + seconds
             for _ in range(FRESH):
-                if time.monotonic() > end:
+                if time.monotonic() > end or left <= 0:
                     break
                 try:
                     name, file, content = ours.recv()
@@ -204,6 +205,7 @@ def fuzz(seconds: float, seed: int, wanted: str | None, failures: Path) -> int:
                 except (EOFError, ConnectionResetError):
                     worker.join()
                     outcome = Outcome(False, f"the worker died ({worker.exitcode})")
+                left -= 1
                 counts[name]["failed" if outcome.fault else "refused" if outcome.refused else "read"] += 1
                 if outcome.fault:
                     faults[keep(failures, name, file, content, outcome.fault)] += 1
@@ -234,11 +236,12 @@ def keep(failures: Path, name: str, file: str, content: bytes, fault: str) -> st
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60)
+    parser.add_argument("--inputs", type=float, default=math.inf, help="stop after so many")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kind")
     parser.add_argument("--failures", type=Path, default=Path(tempfile.gettempdir()) / "semstab-fuzz")
     given = parser.parse_args()
-    found = fuzz(given.seconds, given.seed, given.kind, given.failures)
+    found = fuzz(given.seconds, given.inputs, given.seed, given.kind, given.failures)
     if found:
         print(f"{found} inputs failed; they are in {given.failures}")
     return int(found > 0)

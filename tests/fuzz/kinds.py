@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import cv2
-import damages
 import image_files as images
 import looking_down as down
 import numpy as np
 import test_readers_odm as odm
 import tiny_scene
 import yaml
-from damages import Damage
 from dataset_writers import CLASSES, FORMATS, Format, save_depth_map, write_labels
+from kept_kinds import of_kept
+from kind import Kind, Read
 from posed_config import configure
 from rich.console import Console
 
@@ -38,8 +37,6 @@ from semstab.datasets.formats.images import color_size, read_color, read_depth, 
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.surfaces.surface import Surface
 from semstab.engine import load_result
-from semstab.engine.tiling.sights import Sights, look_at
-from semstab.engine.units import make_plan
 from semstab.gating import gate_config
 from semstab.gating.rules import parse
 from semstab.model.frames import Frame, Intrinsics
@@ -55,40 +52,20 @@ from semstab.predict.disk.folder import PredictionFolder
 from semstab.runtime.files import read_json
 from semstab.runtime.json_form import from_json
 from semstab.settings import load_config, load_study
-from semstab.statistics.commit import Commit
+from semstab.statistics.judging.commit import Commit
 from semstab.statistics.looks import Looks
 from semstab.statistics.sampling.influence import InfluenceSums
-
-Read = Callable[[Path], object]
 
 SHAPE = (12, 16)
 CAMERA = Intrinsics(12, 12, 7.5, 5.5)
 SWEEPS = {"voxel_size": [0.1, 0.2], "depth_noise": {"values": [0, 0.1], "repeats": 2}}
 RGB = np.random.default_rng(1).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
-BY_SUFFIX: dict[str, Damage] = {
-    ".png": damages.of_png, ".npz": damages.of_npz, ".semstab": damages.of_npz, ".json": damages.of_json,
-    ".geojson": damages.of_json, ".yaml": damages.of_yaml, ".txt": damages.of_words, ".csv": damages.of_words,
-    ".tsv": damages.of_words, ".obj": damages.of_words, ".parquet": damages.of_parquet,
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Kind:
-    """Files of which one at a time is damaged; `read` is called with the damaged one."""
-
-    name: str
-    files: tuple[Path, ...]
-    read: Read
-
-    def damaged(self, file: Path) -> Damage:
-        """How a file of that suffix is damaged."""
-        return BY_SUFFIX.get(file.suffix, damages.of_bytes)
 
 
 def kinds(folder: Path) -> list[Kind]:
     """All of them, written into a folder."""
     return [*of_images(folder / "images"), *of_surfaces(folder / "surfaces"), *of_settings(folder / "settings"),
-            *of_datasets(folder / "datasets"), *of_results(folder / "results")]  # fmt: skip
+            *of_datasets(folder / "datasets"), *of_results(folder / "results"), *of_kept(folder / "kept")]  # fmt: skip
 
 
 def of_images(folder: Path) -> Iterator[Kind]:
@@ -252,14 +229,6 @@ def of_results(folder: Path) -> Iterator[Kind]:
     for pattern, read in first.items():
         if found := sorted(run.glob(pattern)):
             yield Kind(f"run {pattern}", (found[0],), read)
-    tiled = config.model_copy(update={"tile_size": 8, "events": False, "statistics": False})
-    semstab.run(tiled, out=folder / "tiled", report=False)
-    tile = min((folder / "tiled").glob("voxels/*/*.parquet"))
-    yield Kind("tile of a map", (tile,), lambda file: VoxelTable.load(file.parent))
-    sights = folder / "sights.npz"
-    look_at(make_plan(tiled).tasks[0], 0.25).save(sights)
-    yield Kind("sights", (sights,), Sights.load)
-    small = folder / "small.semstab"
     small = folder / "small.semstab"
     save_summary(open_contender(f"{run}:a"), small)
     yield Kind("small summary", (small,), lambda file: compared(file, f"{run}:b"))

@@ -15,6 +15,7 @@ import pytest
 import yaml
 from image_files import npy_bytes, npz_bytes
 
+from semstab.backbones.outside.class_list import class_names
 from semstab.backbones.segearth.prompts import read_prompts
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.las_files import opened
@@ -218,3 +219,10 @@ def test_sights_whose_header_ends_early_are_made_again(tmp_path) -> None:
     with zipfile.ZipFile(tmp_path / "sights.npz", "w") as archive:
         archive.writestr("size.npy", body)
     assert Sights.load(tmp_path / "sights.npz") is None
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\0x", b"", b"\n\n"])
+def test_names_of_classes_that_are_no_text_are_refused(tmp_path, content) -> None:
+    (tmp_path / "names.txt").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"classes .*names\.txt: "):
+        class_names(str(tmp_path / "names.txt"))

@@ -31,8 +31,8 @@ import numpy.typing as npt  # noqa: E402
 
 import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
-from semstab.backends.shared.pixel_keys import frame_terms, keys_of_row  # noqa: E402
-from semstab.backends.shared.score_vectors import total_of  # noqa: E402
+from semstab.backends.shared.pixels.pixel_keys import frame_terms, keys_of_row  # noqa: E402
+from semstab.backends.shared.scores.vectors import total_of  # noqa: E402
 from semstab.runtime.compiled import parallel  # noqa: E402
 from semstab.runtime.files import write_json  # noqa: E402
 

@@ -20,8 +20,8 @@ from semstab.comparison.opening import open_contender
 from semstab.metrics.matching import rows_of
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.commit import EVIDENCE, Commit, calibrate
 from semstab.statistics.correctness import Truth, join_truth
+from semstab.statistics.judging.commit import EVIDENCE, Commit, calibrate
 
 CLASSES = ("a", "b")
 

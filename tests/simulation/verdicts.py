@@ -14,10 +14,10 @@ from collections import Counter
 import numpy as np
 from flights import Flight, fly, sample_of, table_of, world
 
+from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import reach_of
 from semstab.statistics.sampling import influence_sums, judged_of, value
 from semstab.statistics.sampling.influence import FUNCTIONALS, columns_of
-from semstab.statistics.verdict import verdict
 
 BETTER = {"stable": ("stable", "partly stable"), "usable": ("stable", "partly stable", "usable")}
 """At each level, what says as much or more."""

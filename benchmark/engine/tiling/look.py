@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.backends.shared.hashing import mix
-from semstab.backends.shared.keys import HALF
-from semstab.backends.shared.pixel_keys import keys_of_row
+from semstab.backends.shared.pixels.keys import HALF
+from semstab.backends.shared.pixels.pixel_keys import keys_of_row
 from semstab.runtime.compiled import serial
 
 RECENT = 64

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.engine.tiling.sights import Sights
-from semstab.model.extent import Extent
+from semstab.model.voxels.extent import Extent
 
 ROOM = 4
 """A tile takes at most that part of what a task may take, where its size is not given."""
@@ -43,10 +43,15 @@ class Part:
 
 @dataclass(frozen=True)
 class Tiling:
-    """All parts of a unit's map. size is that of its tiles, in voxels."""
+    """All parts of a unit's map.
+
+    size    of its tiles, voxels
+    origin  voxel of the first camera
+    """
 
     size: int
     parts: tuple[Part, ...]
+    origin: tuple[int, int, int]
 
     @property
     def decodes(self) -> int:
@@ -66,7 +71,8 @@ def tiled(sights: Sights, cost: Cost, budget: float, size: int | None = None, le
     total = cost(float(tiles.voxels.sum()), float(tiles.observations.sum()))
     budget = min(budget, 1.1 * total / least)
     parts = [_part(tiles, rows) for rows in _split(tiles, cost, budget, np.arange(len(tiles.place)))]
-    return Tiling(tiles.size, tuple(part for part in parts if part.frames))
+    x, y, z = tiles.origin.tolist()
+    return Tiling(tiles.size, tuple(part for part in parts if part.frames), (x, y, z))
 
 
 def tile_size(sights: Sights, cost: Cost, budget: float) -> int:
@@ -103,19 +109,14 @@ def _middle(at: npt.NDArray[np.int32], weight: npt.NDArray[np.float64]) -> int:
 
 
 def _part(tiles: Sights, rows: npt.NDArray[np.int64]) -> Part:
-    place, (x, y, z) = tiles.place[rows], tiles.origin
+    place, (x, y, z) = tiles.place[rows], tiles.origin.tolist()
     low, high = place.min(axis=0), place.max(axis=0) + 1
     inside = ((tiles.cell >= low) & (tiles.cell < high)).all(axis=1)
     frames = np.unique(tiles.frame[inside])
     corner, end = (tuple(int(edge) * tiles.size for edge in edges) for edges in (low, high))
     return Part(
-        Extent((corner[0], corner[1]), (end[0], end[1]), (int(x), int(y), int(z))),
+        Extent((corner[0], corner[1]), (end[0], end[1]), (x, y, z)),
         tiles.size,
         tuple(frames.tolist()),
         round(float(tiles.voxels[rows].sum())),
     )
-
-
-def decodes_a_frame(tilings: Sequence[Tiling], frames: int) -> float:
-    """How often a frame is decoded, on average."""
-    return sum(tiling.decodes for tiling in tilings) / max(frames, 1)

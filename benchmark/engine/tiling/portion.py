@@ -14,13 +14,21 @@ import numpy.typing as npt
 
 from semstab.engine.series import FrameRow
 from semstab.engine.tiling.partition import Part
-from semstab.model.records import FrameQuality, ImageSpace
+from semstab.engine.tiling.stretches import Stretch
+from semstab.model.records import FrameQuality
 from semstab.model.results import Agreement, FrameReport, SizeAlpha
-from semstab.runtime.files import atomic_path, parse_json
+from semstab.runtime.array_files import read_arrays, write_arrays
+from semstab.runtime.files import parse_json
 from semstab.runtime.json_form import from_json, to_json
 
 PORTIONS = "parts"
 """Folder of what is finished of units in tiles, unit by unit, until they are whole."""
+
+TRUE_LOOKS = ".truth.parquet"
+"""What the file of looks at the ground truth ends in."""
+
+PART, STRETCH, SIZES = "part", "stretch", "sizes"
+"""Kinds of portions; the last one tells how the map hangs on the voxel size."""
 
 REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
           "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
@@ -33,10 +41,11 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Portion:
-    """What of a unit in tiles is computed in one go: the voxels of a part, or else what its frames tell without a map.
+    """What of a unit in tiles is computed in one go: the voxels of a part, or else what frames tell without its map.
 
     key      of the unit
-    part     None for the frames
+    part     whose voxels are fused
+    stretch  else the frames that are looked at; None where some of them are fused at several voxel sizes
     kept     whether the voxels are kept
     judged   whether the statistics say something of the map
     reduces  whether soft scores are also fused as labels
@@ -44,6 +53,7 @@ class Portion:
 
     key: str
     part: Part | None = None
+    stretch: Stretch | None = None
     kept: bool = False
     judged: bool = False
     reduces: bool = False
@@ -51,21 +61,42 @@ class Portion:
     @property
     def name(self) -> str:
         """Of the file of what is left of it."""
-        return "frames" if self.part is None else self.part.name
+        return next((each.name for each in (self.part, self.stretch) if each is not None), SIZES)
+
+    @property
+    def kind(self) -> str:
+        """PART, STRETCH or SIZES."""
+        return PART if self.part is not None else STRETCH if self.stretch is not None else SIZES
+
+    @property
+    def looks_file(self) -> str:
+        """Of what was sampled of a stretch, in the folder, until the unit is whole."""
+        return f"{PORTIONS}/{self.key}/{self.name}.parquet"
+
+    @property
+    def true_looks_file(self) -> str:
+        """The same of its ground truth."""
+        return f"{PORTIONS}/{self.key}/{self.name}{TRUE_LOOKS}"
+
+    @property
+    def folder(self) -> str:
+        """Of what is left of the unit until it is whole, in that of the run."""
+        return f"{PORTIONS}/{self.key}"
 
 
 @dataclass(frozen=True)
 class About:
     """What is no array of a finished portion.
 
+    kind     see `Portion.kind`
     files    digests of its files, by their path in the folder
     checked  how far it agrees with the reference on a sample of its voxels
-    image_space, sizes, quality  of the frames
+    sizes, quality  of the frames
     """
 
+    kind: str
     files: Mapping[str, str] = field(default_factory=dict)
     checked: Agreement | None = None
-    image_space: ImageSpace | None = None
     sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None
 
@@ -75,9 +106,10 @@ class Finished:
     """What is left of a portion.
 
     series   (F, C) a row a frame: REPORT, then ROW
-    sums     over the voxels, by name: those of `TableSums`, or of `MapSums` where its map is judged
+    sums     over the voxels, by name: those of `TableSums`, or of `FirstSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     poses    (F, 4, 4) of the frames, where it is of these
+    image    (F, C) what each of them tells in image coordinates, see `ImageSpaceMeter`
     """
 
     about: About
@@ -85,22 +117,25 @@ class Finished:
     sums: Mapping[str, Any] = field(default_factory=dict)
     reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     poses: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    image: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
         arrays: dict[str, Any] = {"series": self.series, "reduced": self.reduced, "poses": self.poses}
+        arrays["image"] = self.image
         arrays |= {f"sums {name}": value for name, value in self.sums.items()}
         text = json.dumps(to_json(self.about)).encode()
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, about=np.frombuffer(text, np.uint8), **arrays)
+        write_arrays(path, {"about": np.frombuffer(text, np.uint8), **arrays})
 
     @classmethod
-    def load(cls, path: Path) -> Finished:
-        """What `save` wrote. Raises DAMAGED_ARRAYS or DataError where it is not there or damaged."""
-        with path.open("rb") as file, np.load(file) as content:
-            about = from_json(About, parse_json(content["about"].tobytes()), path)
-            sums = {name[5:]: content[name] for name in content.files if name.startswith("sums ")}
-            return cls(about, content["series"], sums, content["reduced"], content["poses"])
+    def load(cls, path: Path) -> Finished | None:
+        """What `save` wrote; None where it is not there, or damaged. Raises DataError for that of another version."""
+        arrays = read_arrays(path)
+        if arrays is None:
+            return None
+        about = from_json(About, parse_json(arrays["about"].tobytes()), path)
+        sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
+        return cls(about, arrays["series"], sums, arrays["reduced"], arrays["poses"], arrays["image"])
 
 
 def series_array(rows: Sequence[FrameRow]) -> Float64:

@@ -6,18 +6,19 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.shared.association import check_depth
-from semstab.backends.shared.keys import index_of_keys, out_of_reach
-from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.backends.shared.pixels.keys import index_of_keys, out_of_reach
+from semstab.backends.shared.pixels.pixel_keys import frame_terms
 from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.pixels.perturbation import perturb
-from semstab.runtime.files import DAMAGED_ARRAYS, atomic_path
+from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.runtime.prefetch import prefetch
 from semstab.task import Task
 
@@ -72,18 +73,16 @@ class Sights:
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **vars(self))
+        write_arrays(path, vars(self))
 
     @classmethod
     def load(cls, path: Path) -> Sights | None:
         """What `save` wrote; None where there is no such file, or it is damaged."""
-        try:
-            with path.open("rb") as file, np.load(file) as content:
-                values = {field.name: content[field.name] for field in dataclasses.fields(cls)}
-            return cls(**values | {name: int(values[name]) for name in ("size", "frames")})
-        except DAMAGED_ARRAYS:
+        values = read_arrays(path)
+        if values is None or values.keys() != {field.name for field in dataclasses.fields(cls)}:
             return None
+        own: dict[str, Any] = {**values, **{name: int(values[name]) for name in ("size", "frames")}}
+        return cls(**own)
 
 
 def look_at(

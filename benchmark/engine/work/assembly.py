@@ -7,6 +7,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,34 +16,47 @@ import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import to_csv
-from semstab.engine.tiling.portion import Finished, joined_series
+from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
+from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduced_of, save_voxels, unit_summary
+from semstab.engine.work.image_space import image_space_of
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.summary import TableSums
-from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.results import Agreement, Deviation
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.parquet import tile_of
 from semstab.runtime.files import write_text
-from semstab.statistics import Looks
-from semstab.statistics.description import analyse_sums
-from semstab.statistics.map_sums import MapSums
+from semstab.statistics import Looks, Sample, Truth, join_truth
+from semstab.statistics.description import concluded
+from semstab.statistics.looks.sampler import merged
 from semstab.statistics.sampling import InfluenceSums
+from semstab.statistics.sums import FirstSums, SecondSums, Whole, second_look
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
 
 
-def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished], folder: Path) -> UnitContent:
-    """The unit's content; its series is written. Raises DataError where no pixel was valid."""
+def assembled(planned: PlannedUnit, finished: Mapping[str, Finished], folder: Path) -> UnitContent:
+    """The unit's content, from its portions by name, in order; its series is written.
+
+    Raises DataError where no pixel was valid.
+    """
     task, unit, config = planned.task, planned.unit, planned.config
+    stretches = [each for each in finished.values() if each.about.kind == STRETCH]
+    parts = [each for each in finished.values() if each.about.kind == PART]
     sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
     if not sums.total[2]:
         raise no_voxels(task, config)
-    found = _statistics(planned, parts, folder, frames.about.files) if planned.judged else None
-    rows = joined_series(frames.series, [part.series for part in parts])
+    files = {name: digest for each in finished.values() for name, digest in each.about.files.items()}
+    looks, true_looks = (_looks(stretches, folder, true=true) for true in (False, True))
+    sample = None if looks is None else looks.sample()
+    if sample is not None and true_looks is not None:
+        sample = sample.against(true_looks.sample())
+    found = _statistics(planned, parts, sample, folder, files) if planned.judged and sample is not None else None
+    rows = joined_series(np.concatenate([each.series for each in stretches]), [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
         task,
@@ -50,23 +64,28 @@ def assembled(planned: PlannedUnit, frames: Finished, parts: Sequence[Finished],
         sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
         None if found is None else found[0],
         reduced_of(np.sum(reduced, axis=0)) if reduced else None,
-        frames.about.sizes,
+        next((each.about.sizes for each in finished.values() if each.about.sizes), ()),
     )
-    files = {name: digest for each in (frames, *parts) for name, digest in each.about.files.items()}
+    files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
+    savers: Savers = {}
     if planned.kept:
-        savers: Savers = {f"{FRAMES}/{unit.slug}.csv": lambda path: write_text(path, to_csv(rows))}
+        savers[f"{FRAMES}/{unit.slug}.csv"] = lambda path: write_text(path, to_csv(rows))
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
-        files |= {name: _saved(save, folder / name) for name, save in savers.items()}
+            files |= found[2]
+        if looks is not None:
+            savers[f"{LOOKS}/{unit.slug}.parquet"] = looks.save
+    files |= {name: _saved(save, folder / name) for name, save in savers.items()}
     content = UnitContent(
         planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
     )
-    if not planned.image_space or frames.about.image_space is None:
+    if not planned.image_space:
         return content
-    image_space = replace(frames.about.image_space, flicker_percent=summary.flicker_percent)
+    image_space = image_space_of(np.concatenate([each.image for each in stretches]), summary.flicker_percent)
     tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
-    content = replace(content, quality=frames.about.quality)
-    return replace(content, image_space=image_space, up=_up(planned, tiles, int(sums.total[2]), frames.poses))
+    poses = np.concatenate([each.poses for each in stretches])
+    up = _up(planned, tiles, int(sums.total[2]), poses)
+    return replace(content, image_space=image_space, quality=stretches[0].about.quality, up=up)
 
 
 def _saved(save: Callable[[Path], None], path: Path) -> str:
@@ -75,21 +94,68 @@ def _saved(save: Callable[[Path], None], path: Path) -> str:
     return file_digest(path).hex()
 
 
+def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> Looks | None:
+    """What was sampled of all frames, or of their ground truth; None where nothing was."""
+    names = [name for each in stretches for name in each.about.files if name.startswith(f"{PORTIONS}/")]
+    chosen = [name for name in names if name.endswith(TRUE_LOOKS) == true]
+    return merged([Looks.load(folder / name) for name in chosen]) if chosen else None
+
+
 def _statistics(
-    planned: PlannedUnit, parts: Sequence[Finished], folder: Path, files: Iterable[str]
-) -> tuple[MapStatistics, InfluenceSums]:
-    """What the statistics say of all parts together, with the looks that were sampled of the frames."""
+    planned: PlannedUnit, parts: Sequence[Finished], sample: Sample, folder: Path, files: Iterable[str]
+) -> tuple[MapStatistics, InfluenceSums, dict[str, str]]:
+    """What the statistics say of all parts together, with the looks that were sampled of the frames.
+
+    Then each tile is looked at again, and written once more where the whole map tells more of its voxels: the digests
+    of these files.
+    """
     classes, config = planned.task.mapping.target.classes, planned.config
-    looks = next(Looks.load(folder / name) for name in files if name.startswith(f"{LOOKS}/"))
-    return analyse_sums(
-        MapSums.merged([MapSums.read(part.sums, classes) for part in parts]),
+    whole = Whole(FirstSums.merged([FirstSums.read(part.sums, classes) for part in parts]))
+    second, written = _second_looks(planned, whole, folder, files)
+    summary, sums = concluded(
+        whole,
+        second,
         voxel_size=config.voxel_size,
         classes=classes,
-        sample=looks.sample(),
+        sample=sample,
         name=planned.task.backbone,
         edges=config.strata,
         critical=config.critical_classes,
     )
+    return summary, sums, written
+
+
+def _second_looks(
+    planned: PlannedUnit, whole: Whole, folder: Path, files: Iterable[str]
+) -> tuple[SecondSums, dict[str, str]]:
+    unit, written = planned.unit, dict[str, str]()
+    found: list[SecondSums] = []
+    for name in (name for name in files if Path(name).parent.name in ("voxels", unit.slug)):
+        if not name.startswith((f"{VOXELS}/", f"{PORTIONS}/")):
+            continue
+        file, table = folder / name, VoxelTable.load(folder / name)
+        true = file.parents[1] / "truth" / file.name
+        truth = VoxelTable.load(true) if name.startswith(f"{PORTIONS}/") and true.exists() else None
+        known = None if whole.first.truth is None else _known(table, truth)
+        second, more = second_look(table, whole, known, truth)
+        found.append(second)
+        if planned.kept and planned.config.statistics:
+            maps = VoxelTable.columns(file, further_columns(file))
+            columns, tile = {**maps, **more, **whole.maps(table, maps)}, tile_of(file)
+            savers: Savers = {
+                f"{VOXELS}/{unit.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
+            }
+            if truth is not None and planned.image_space:
+                savers[f"{TRUTH}/{unit.slug}/{file.name}"] = partial(truth.save, tile=tile)
+            written |= {path: _saved(save, folder / path) for path, save in savers.items()}
+    return SecondSums.merged(found), written
+
+
+def _known(table: VoxelTable, truth: VoxelTable | None) -> Truth:
+    """The true classes of a tile; none where the ground truth saw nothing of it."""
+    if truth is None:
+        return Truth(np.zeros(len(table), np.bool_), np.full(len(table), -1, np.int64))
+    return join_truth(table, truth)
 
 
 def _checked(found: Sequence[Agreement | None]) -> Agreement | None:

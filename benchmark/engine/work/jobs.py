@@ -7,14 +7,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from semstab.check.views import evenly
 from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
 from semstab.engine.tiling.partition import Tiling
-from semstab.engine.tiling.portion import Portion
+from semstab.engine.tiling.portion import SIZES, Portion
+from semstab.engine.tiling.stretches import Stretch, stretches_of
 from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.work.image_space import CLIPS
+from semstab.engine.work.sizes import FRAMES
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
-from semstab.model.extent import Extent
 from semstab.model.records import UnitContent
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.files import TEMPORARY
 
 
@@ -51,7 +55,19 @@ class Request:
     @property
     def shown(self) -> bool:
         """Whether observers are shown its frames, though there is no map."""
-        return not self.fuses and self.portion is not None and self.portion.kept
+        return self.stretch is not None and self.portion is not None and self.portion.kept
+
+    @property
+    def stretch(self) -> Stretch | None:
+        """The frames that are looked at without a map."""
+        return None if self.portion is None else self.portion.stretch
+
+    @property
+    def sized(self) -> bool:
+        """Whether some frames are fused at other voxel sizes; filters share those of what they are put over."""
+        if self.portion is not None:
+            return self.portion.kind == SIZES
+        return self.image_space and self.judged and not self.config.frame_quality
 
     @property
     def reduces(self) -> bool:
@@ -59,16 +75,27 @@ class Request:
         return self.image_space if self.portion is None else self.portion.reduces
 
     @classmethod
-    def portions(cls, planned: PlannedUnit, key: str, tiling: Tiling) -> list[Request]:
-        """Those of a unit in tiles: of its frames, and of each part of its map."""
+    def portions(cls, planned: PlannedUnit, key: str, tiling: Tiling, width: int = 1) -> list[Request]:
+        """Those of a unit in tiles, for so many tasks at once: of its frames, and of each part of its map."""
         whole = replace(cls.of(planned), kept=False)
-        frames = replace(whole, sampled=False, portion=Portion(key, kept=planned.kept))
-        parts = []
+        frames, origin = planned.task.indices, tiling.origin
+        first = replace(whole, sampled=False)
+        lead = max(CLIPS) - 1
+        stretches = stretches_of(frames, origin, lead=lead, width=width, whole=whole.config.frame_quality)
+        found = [first._of(Portion(key, stretch=stretch, kept=planned.kept), stretch.frames) for stretch in stretches]
+        if first.sized:
+            some = [frames[k] for k in evenly(len(frames), FRAMES)]
+            found.append(replace(first, image_space=False, judged=False)._of(Portion(key), some))
+        fused = replace(whole, image_space=False, judged=False)
         for part in tiling.parts:
-            config = whole.config.model_copy(update={"frames": FrameSelection(list=part.frames)})
-            portion = Portion(key, part, planned.kept, planned.judged, planned.image_space)
-            parts.append(replace(whole, config=config, image_space=False, judged=False, portion=portion))
-        return [*parts, frames]
+            portion = Portion(key, part, None, planned.kept, planned.judged, planned.image_space)
+            found.append(fused._of(portion, part.frames))
+        return found
+
+    def _of(self, portion: Portion, frames: Sequence[int]) -> Request:
+        """The same, of these frames and that portion alone."""
+        config = self.config.model_copy(update={"frames": FrameSelection(list=tuple(frames))})
+        return replace(self, config=config, portion=portion)
 
     @classmethod
     def of(cls, planned: Planned) -> Request:

@@ -23,8 +23,8 @@ from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
 from semstab.errors import ConfigError, DataError
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
+from semstab.model.voxels.extent import Extent
 from semstab.runtime.memory import available_bytes, resident_bytes
 from semstab.runtime.prefetch import Fetched, prefetch
 from semstab.runtime.stopwatch import Stopwatch
@@ -137,13 +137,14 @@ class Pass:
         with self._failing([request]):
             (task,) = tasks_of(self._scene, request.config)
             task = dataclasses.replace(task, left_out=request.left_out)
-            truth = _truth_map(request.config, task) if request.config.statistics else None
-            sampler, of_truth = (_sampler(request, task) if wanted else None for wanted in (request.judged, truth))
+            truth = _truth_map(request, task) if request.config.statistics else None
+            sampler = _sampler(request, task) if request.judged else None
+            of_truth = None if sampler is None or truth is None else _sampler(request, task)
             fused = _new_map(request.config, task, request.within) if request.fuses else NoMap()
             made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
                 made.reference = NumpySample(request.config.voxel_size, len(task.mapping.target), request.within)
-            if request.image_space and request.judged and not request.config.frame_quality:  # filters share the sizes
+            if request.sized:
                 made.sizes = SizeMaps(task, request.config)
             return [made]
         return []
@@ -171,6 +172,8 @@ class Pass:
         watched = [one for one in stream.maps if one.request.kept]
         with self._failing([one.request for one in stream.maps]):
             now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
+            if now.frame.index in stream.ahead:
+                return
             for one in stream.maps:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
@@ -280,9 +283,11 @@ def _new_map(config: Config, task: Task, within: Extent | None = None) -> Fusion
     return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=within, **options)
 
 
-def _truth_map(config: Config, task: Task) -> FusionBackend | None:
+def _truth_map(request: Request, task: Task) -> FusionBackend | NoMap | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
-    return _map_without_log(config, task) if truth_task(task) else None
+    if truth_task(task) is None or not (request.fuses or request.judged):
+        return None
+    return _map_without_log(request.config, task, request.within) if request.fuses else NoMap()
 
 
 def _map_without_log(config: Config, task: Task, within: Extent | None = None) -> FusionBackend:
@@ -290,7 +295,8 @@ def _map_without_log(config: Config, task: Task, within: Extent | None = None) -
 
 
 def _sampler(request: Request, task: Task) -> Sampler:
-    return Sampler(request.config.voxel_size, len(task.mapping.target))
+    origin = None if request.stretch is None else request.stretch.origin
+    return Sampler(request.config.voxel_size, len(task.mapping.target), origin=origin)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()

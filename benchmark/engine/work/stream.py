@@ -58,7 +58,7 @@ class UnitMap:
     request: Request
     task: Task
     backend: FusionBackend
-    truth: FusionBackend | None = None
+    truth: FusionBackend | NoMap | None = None
     sampler: Sampler | None = None
     truth_sampler: Sampler | None = None
     reference: NumpySample | None = None
@@ -116,7 +116,11 @@ class Stream:
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
         self.truth_task = truth_task(self.task) if takes_truth else None
         self.poses: list[Any] = []
-        self.shown = self.task.indices[len(self.task.indices) // 2] if self.image_space is not None else None
+        stretch = maps[0].request.stretch
+        self.lead = 0 if stretch is None else stretch.lead
+        self.ahead = frozenset(self.task.indices[: self.lead])  # seen for the sake of those after them
+        middle = self.task.indices[len(self.task.indices) // 2]
+        self.shown = None if self.image_space is None else middle if stretch is None else stretch.shown
         self.overview: dict[str, Any] = {}
 
     def next_frame(self, decoded: Decoded, watch: Stopwatch, *, color: bool) -> Prepared:
@@ -135,10 +139,11 @@ class Stream:
             with watch("frame quality"):
                 model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
                 self.judge.add(frame, model, truth)
-        if decoded.index == self.shown:
+        if decoded.index == self.shown and decoded.index not in self.ahead:
             self.overview = _overview(self.task, decoded.frame)
             frame = frame if color else dataclasses.replace(frame, color=None)
-        self.poses.append(frame.T_wc)
+        if decoded.index not in self.ahead:
+            self.poses.append(frame.T_wc)
         self.previous = frame
         return Prepared(frame, truth, flicker, lap.seconds)
 

@@ -14,7 +14,7 @@ from semstab.outputs.export import las, mesh, ply, raster, tabular
 from semstab.outputs.export.onto import MEASURES as ONTO_MEASURES
 from semstab.outputs.export.onto import classify
 from semstab.outputs.export.voxels import Voxels, crs_name, iter_voxels, voxels_of
-from semstab.statistics.commit import Commit
+from semstab.statistics.judging.commit import Commit
 
 __all__ = ["SUFFIXES", "Exported", "export"]
 

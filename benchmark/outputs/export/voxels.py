@@ -16,16 +16,15 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import categories
 from semstab.metrics.matching import rows_of, voxel_keys
 from semstab.model import palette as colors
-from semstab.model import parquet
 from semstab.model.georeference import Georeference
 from semstab.model.labels import name_key
 from semstab.model.measures import dominant, measures
 from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import VoxelTable, parquet
 from semstab.outputs.plots.maps import Overview
 from semstab.statistics import psa
-from semstab.statistics.commit import Commit
+from semstab.statistics.judging.commit import Commit
 
 Float64 = npt.NDArray[np.float64]
 

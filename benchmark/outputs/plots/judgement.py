@@ -24,9 +24,9 @@ from semstab.outputs.plots.statistics import (
 from semstab.outputs.plots.style import Figure
 from semstab.outputs.plots.views import Views, column
 from semstab.statistics.agreement import ALPHA, PSA
-from semstab.statistics.comparison import compared
+from semstab.statistics.judging.verdict import RELIABLE, TENTATIVE
 from semstab.statistics.sampling import LEAST_FRAMES
-from semstab.statistics.verdict import RELIABLE, TENTATIVE
+from semstab.statistics.versus.comparison import compared
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

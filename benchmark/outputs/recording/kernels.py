@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from semstab.backends.shared.hashing import mix
-from semstab.backends.shared.pixel_keys import exact_keys_of_row
+from semstab.backends.shared.pixels.pixel_keys import exact_keys_of_row
 from semstab.model.labels import IGNORE_8BIT
 from semstab.runtime.compiled import serial
 

@@ -10,7 +10,7 @@ from typing import Any
 import rerun as rr
 
 from semstab.engine.units import Plan
-from semstab.errors import DataError
+from semstab.errors import DataError, one_line
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.results import RECURRENT, Unit
 from semstab.outputs.recording.entities import Clock, path
@@ -75,8 +75,10 @@ def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, cl
         numbers = [int(row["frame"]) for row in rows]
         stamps = [float(row["timestamp"]) if row["timestamp"] else None for row in rows]
         found = [values(row) for row in rows]
-    except (OSError, LookupError, TypeError, ValueError) as error:
-        raise DataError(f"{file}: not a time series of a run ({error!r}); delete the run folder's units/") from error
+    except (OSError, LookupError, TypeError, ValueError, csv.Error) as error:
+        raise DataError(
+            f"{file}: not a time series of a run ({one_line(error)}); delete the run folder's units/"
+        ) from error
     for name in columns(unit, task):
         at = [i for i, row in enumerate(found) if name in row]
         if at:

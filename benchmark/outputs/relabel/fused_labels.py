@@ -21,7 +21,7 @@ from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.export.lookup import NONE, VoxelLookup
 from semstab.statistics import psa
-from semstab.statistics.commit import Commit
+from semstab.statistics.judging.commit import Commit
 
 Int64 = npt.NDArray[np.int64]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from semstab.model.comparison import BackboneComparison, CommonLooks, MapCoverage
 from semstab.model.records import Result
+from semstab.model.statistics.comparison import BackboneComparison, CommonLooks, MapCoverage
 from semstab.outputs.tables.statistics import INTERVALS
 from semstab.outputs.tables.table import Column, Group, Row, Table
-from semstab.statistics.comparison import compared
+from semstab.statistics.versus.comparison import compared
 
 _COMMON = "On the voxels that every backbone saw twice or more, and on looks (a place in a frame) that all labelled."
 

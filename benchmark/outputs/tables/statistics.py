@@ -13,9 +13,9 @@ from semstab.model.statistics import UNDEFINED, DriftStatistics, DriftTests, Est
 from semstab.outputs.averages import by_backbone
 from semstab.outputs.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
-from semstab.statistics.drift import FLIP_RATE
+from semstab.statistics.judging.verdict import ADVICE
+from semstab.statistics.order.drift import FLIP_RATE
 from semstab.statistics.sampling import LEAST_FRAMES
-from semstab.statistics.verdict import ADVICE
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)

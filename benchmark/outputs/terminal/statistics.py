@@ -7,7 +7,6 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from semstab.model.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.model.measures import SBD, measures
 from semstab.model.statistics import (
     NEXT_FLIGHT,
@@ -19,9 +18,10 @@ from semstab.model.statistics import (
     Reach,
     RuleOutcome,
 )
+from semstab.model.statistics.comparison import BackboneComparison, CommonLooks, PairedDifference
 from semstab.statistics.agreement import ALPHA, KAPPA
-from semstab.statistics.comparison import compared
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
+from semstab.statistics.versus.comparison import compared
 
 Row = tuple[str, Estimate | float, str]
 Cell = str | float

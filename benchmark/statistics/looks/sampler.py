@@ -6,7 +6,9 @@ pixels go to cells a quarter as wide. Memory is bounded: whenever there is too m
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,12 +32,21 @@ Int64 = npt.NDArray[np.int64]
 
 
 class Sampler:
-    """Takes frames one by one, as they are fused; `sample` says what is there."""
+    """Takes frames one by one, as they are fused; `sample` says what is there.
 
-    def __init__(self, voxel_size: float, num_classes: int, budget: int = BUDGET) -> None:
+    origin  (3,) voxel of the first camera, where the first frame that is added is not the map's first
+    """
+
+    def __init__(
+        self,
+        voxel_size: float,
+        num_classes: int,
+        budget: int = BUDGET,
+        origin: tuple[int, int, int] | None = None,
+    ) -> None:
         self.voxel_size, self.K, self.budget = voxel_size, num_classes, budget
         self._share = 1 << 32
-        self._origin: Int64 | None = None
+        self._origin: Int64 | None = None if origin is None else np.array(origin, dtype=np.int64)
         self._parts: list[tuple[npt.NDArray[Any], ...]] = []
         self._entries = 0
         self._views: list[View] = []
@@ -114,3 +125,27 @@ class Sampler:
         child = np.stack([(key >> 4) & 3, (key >> 2) & 3, key & 3], axis=1)
         origin = np.zeros(3, dtype=np.int64) if self._origin is None else self._origin
         return CELLS * (of_voxel + origin) + child
+
+
+def merged(stretches: Sequence[Looks], budget: int = BUDGET) -> Looks:
+    """What one sampler would have of the stretches of a sequence, in order: voxels go by their hash alone."""
+    share = min(looks.share for looks in stretches)
+    while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:
+        share //= 2
+    kept = [looks.only(looks.drawn < share) for looks in stretches]
+    before = np.cumsum([0, *(len(looks.views) for looks in stretches)])
+
+    def joined(name: str) -> npt.NDArray[Any]:
+        return np.concatenate([getattr(looks, name) for looks in kept])
+
+    return dataclasses.replace(
+        stretches[0],
+        cell=joined("cell"),
+        label=joined("label"),
+        weight=joined("weight"),
+        drawn=joined("drawn"),
+        view=np.concatenate([looks.view + first for looks, first in zip(kept, before, strict=False)]),
+        views=tuple(view for looks in stretches for view in looks.views),
+        share=share,
+        soft=any(looks.soft for looks in stretches),
+    )

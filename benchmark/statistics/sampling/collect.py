@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,9 @@ from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, mos
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
 
+STRETCH = 1 << 17
+"""So many voxels are looked at together, where sums over all of them are wanted."""
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
@@ -31,6 +35,7 @@ def influence_sums(
     sample: tuple[Events, Events] | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
+    likely: Literal["known"] | None = "known",
 ) -> InfluenceSums:
     """The sums of a map.
 
@@ -42,11 +47,12 @@ def influence_sums(
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
+    likely      None leaves open how likely places are stable: of a part of a map, see `StableLooks`
     """
     index = table.index[table.op >= 2]
     edge = cell_edge(index, table.voxel_size) if edge is None else edge
-    likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
-    whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
+    stable = np.nan_to_num(steady(table)) if true_label is not None and likely else np.zeros(len(table))
+    whole = _of_table(table, true_label, edge, stable) if events is None else _of_log(events, true_label, edge, stable)
     whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)
     return whole if sample is None else with_sample(whole, sample, logged=events is not None)
 
@@ -147,23 +153,44 @@ def _with_places(
     )
 
 
+def stretches(rows: int) -> Iterator[slice]:
+    """Consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
+    return (slice(first, min(first + STRETCH, rows)) for first in range(0, max(rows, 1), STRETCH))
+
+
 def cells_of(
     index: npt.NDArray[np.int32], voxel_size: float, edge: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """The cubes (G, 3) that hold voxels (n, 3), and which of them each is in."""
-    at = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
-    (key,) = voxel_keys(at)
-    _, first, of = np.unique(key, return_index=True, return_inverse=True)
-    return at[first].astype(np.int32), of.astype(np.int64)
+    parts = [_distinct(_at(index[some], voxel_size, edge)) for some in stretches(len(index))]
+    cells, of = _distinct(np.concatenate(parts)), np.empty(len(index), dtype=np.int64)
+    for some in stretches(len(index)):
+        keys, sorted_keys = voxel_keys(_at(index[some], voxel_size, edge), cells)
+        of[some] = np.searchsorted(sorted_keys, keys)
+    return cells.astype(np.int32), of
 
 
 def cell_edge(index: npt.NDArray[np.int32], voxel_size: float) -> float:
     """The smallest power of 2, in metres and no smaller than a voxel, that leaves at most MOST_CELLS cubes."""
     edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
-    cells = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
-    while len(cells := cells[np.unique(voxel_keys(cells)[0], return_index=True)[1]]) > MOST_CELLS:
-        cells, edge = cells // 2, 2 * edge
+    cells = np.zeros((0, 3), dtype=np.int64)
+    for some in stretches(len(index)):
+        cells = _distinct(np.concatenate([cells, _at(index[some], voxel_size, edge)]))
+        while len(cells) > MOST_CELLS:
+            cells, edge = _distinct(cells // 2), 2 * edge
     return edge
+
+
+def _at(index: npt.NDArray[np.int32], voxel_size: float, edge: float) -> Int64:
+    """The cube (n, 3) that each voxel is in."""
+    cell: Int64 = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
+    return cell
+
+
+def _distinct(cells: Int64) -> Int64:
+    """Each of the cubes (n, 3) once, sorted."""
+    (key,) = voxel_keys(cells)
+    return cells[np.unique(key, return_index=True)[1]]
 
 
 def _step(frame: npt.NDArray[np.int32], K: int) -> int:
@@ -186,7 +213,7 @@ def _sums_of_log(
     likely: Float64,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
-    from semstab.statistics.kernels import in_chunks
+    from semstab.statistics.loops.kernels import in_chunks
     from semstab.statistics.sampling import loops
 
     K = int(events.evidence.shape[1])

@@ -240,7 +240,18 @@ def merged(*parts: InfluenceSums) -> InfluenceSums:
         seen=_merged([part.seen for part in parts]),
         limit=_merged([part.limit for part in parts]),
     )
-    return together.coarsened(together.edge, together.step).bounded()
+    return _known(together.coarsened(together.edge, together.step).bounded())
+
+
+def _known(sums: InfluenceSums) -> InfluenceSums:
+    """Where one part does not tell what frames have to do with a class, all of them do not."""
+    by_class = [own for name, own in layout(sums.K, truth=sums.truth).items() if name in ("class_own", "class_apart")]
+    if not any(np.isnan(sums.columns[:, own]).any() for own in by_class):
+        return sums
+    columns = sums.columns.copy()
+    for own in by_class:
+        columns[sums["voxels"][:, 0] != 0, own] = np.nan
+    return dataclasses.replace(sums, columns=columns)
 
 
 def _merged(parts: Sequence[InfluenceSums | None]) -> InfluenceSums | None:
@@ -291,7 +302,7 @@ def class_alpha_of(sums: Float64) -> Float64:
     apart, n, total, squares = np.moveaxis(sums, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
-        value: Float64 = 1 - (apart / n) / np.where(expected > ONE_HOT, expected, np.nan)
+        value: Float64 = 1 - (apart / n) / np.where(expected.real > ONE_HOT, expected, np.nan)
     return value
 
 
@@ -307,7 +318,7 @@ def reached_of(of: Statistic) -> Statistic:
     def ratio(sums: Float64) -> Float64:
         seen, limit = np.split(sums, 2, axis=-1)
         ceiling = of(limit)
-        share: Float64 = of(seen) / np.where(ceiling > 0, ceiling, np.nan)
+        share: Float64 = of(seen) / np.where(ceiling.real > 0, ceiling, np.nan)
         return share
 
     return ratio

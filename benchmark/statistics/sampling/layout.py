@@ -50,7 +50,7 @@ def iou_of(sums: Float64) -> Float64:
     right, _, true, predicted = np.moveaxis(sums, -1, 0)
     union = true + predicted - right
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio: Float64 = np.where(union > 0, right / union, np.nan)
+        ratio: Float64 = np.where(union.real > 0, right / union, np.nan)
     return ratio
 
 
@@ -58,7 +58,7 @@ def miou_of(sums: Float64) -> Float64:
     """Its mean (...,) over the classes that are true or predicted anywhere; a count twice, then the same three."""
     right, true, predicted = np.split(sums[..., 2:], 3, axis=-1)
     union = true + predicted - right
-    there = union > 0
+    there = union.real > 0
     with np.errstate(invalid="ignore", divide="ignore"):
         mean: Float64 = np.where(there, right / np.where(there, union, 1), 0).sum(axis=-1) / there.sum(axis=-1)
     return mean
@@ -66,6 +66,7 @@ def miou_of(sums: Float64) -> Float64:
 
 def ece_of(sums: Float64) -> Float64:
     """Expected calibration error (...,) from a count twice, and from right less confidence, summed in each bin."""
+    gap = sums[..., 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
-        error: Float64 = np.abs(sums[..., 2:]).sum(axis=-1) / sums[..., 1]
+        error: Float64 = (np.sign(gap.real) * gap).sum(axis=-1) / sums[..., 1]
     return error

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.metrics.matching import require_same_grid, shared_rows
-from semstab.model.comparison import MapCoverage, Paired, Rank, Ranking
 from semstab.model.measures import Quantity, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNDEFINED, Estimate
+from semstab.model.statistics.comparison import MapCoverage, Paired, Rank, Ranking
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import (
     ALPHA,
@@ -33,7 +33,7 @@ from semstab.statistics.blocks import (
     spatial_blocks,
 )
 from semstab.statistics.correctness import ACCURACY, join_truth
-from semstab.statistics.differences import OnCommonPlaces, differences
+from semstab.statistics.versus.differences import OnCommonPlaces, differences
 
 Float64 = npt.NDArray[np.float64]
 Tables = Mapping[str, VoxelTable]
@@ -115,7 +115,7 @@ def standardised(
     def weighted(sums: Float64) -> Float64:
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums[..., :S] / sums[..., S:]
-        used = (w > 0) & (sums[..., S:] > 0)
+        used = (w > 0) & (sums[..., S:].real > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             value: Float64 = np.where(used, w * means, 0.0).sum(axis=-1) / np.where(used, w, 0.0).sum(axis=-1)
         return value

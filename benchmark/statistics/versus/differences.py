@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import observations, rows_of
-from semstab.model.comparison import BackboneComparison, PairedDifference
 from semstab.model.measures import ENTROPY, Quantity
 from semstab.model.statistics import UNKNOWN, Estimate, Interval
+from semstab.model.statistics.comparison import BackboneComparison, PairedDifference
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.blocks import Statistic

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.shared.hashing import PARTITIONS
-from semstab.backends.shared.keys import HALF
 from semstab.backends.shared.observed import Observed, WorkSpace
-from semstab.backends.shared.pixel_keys import BLOCK, columns_of, frame_terms
-from semstab.backends.shared.tile_loops import (
+from semstab.backends.shared.pixels.keys import HALF
+from semstab.backends.shared.pixels.pixel_keys import BLOCK, columns_of, frame_terms
+from semstab.backends.shared.pixels.tile_loops import (
     COLUMNS,
     NEAR,
     ROWS,
@@ -22,9 +22,9 @@ from semstab.backends.shared.tile_loops import (
     merge_words,
     scatter_words,
 )
-from semstab.model.extent import Extent
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
+from semstab.model.voxels.extent import Extent
 
 Int64 = npt.NDArray[np.int64]
 

@@ -11,9 +11,9 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import PARTITIONS, partition_of
-from semstab.backends.shared.pixel_keys import keep_columns, keys_of_row
+from semstab.backends.shared.pixels.pixel_keys import keep_columns, keys_of_row
 from semstab.backends.shared.prefetch import touch
-from semstab.backends.shared.score_vectors import LANES, add_scaled, total_of
+from semstab.backends.shared.scores.vectors import LANES, add_scaled, total_of
 from semstab.runtime.compiled import parallel, serial
 
 ROWS, COLUMNS = 16, 128

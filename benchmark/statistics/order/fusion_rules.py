@@ -62,7 +62,7 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
     0.01, or 1/K where that is less.
     Raises ConfigError for another rule, or a floor outside (0, 1/K].
     """
-    from semstab.statistics import kernels, log_kernels
+    from semstab.statistics.loops import kernels, log_kernels
 
     K = events.evidence.K
     floor = min(FLOOR, 1 / K) if floor is None else floor

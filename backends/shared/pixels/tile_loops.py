@@ -12,8 +12,8 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.hashing import PARTITIONS, partition_of
-from semstab.backends.shared.keys import HALF
-from semstab.backends.shared.pixel_keys import BLOCK, exact_keys_of_row
+from semstab.backends.shared.pixels.keys import HALF
+from semstab.backends.shared.pixels.pixel_keys import BLOCK, exact_keys_of_row
 from semstab.runtime.compiled import compiled, parallel, serial
 
 NEAR = 1 << 15

@@ -90,6 +90,14 @@ def files_of(path: str | Path) -> list[Path]:
     return files
 
 
+def tile_of(path: Path) -> Tile:
+    """Which tile a file is. Raises DataError where it is none."""
+    about = _about(path)
+    with reading(path):
+        x, y = about["tile"]
+        return Tile(x, y, about["tile_size"], about["map"])
+
+
 def _about(path: Path) -> dict[str, Any]:
     import pyarrow.parquet as pq
 

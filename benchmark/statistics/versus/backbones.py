@@ -9,12 +9,16 @@ import numpy as np
 
 from semstab.errors import ConfigError
 from semstab.metrics.matching import require_same_map
-from semstab.model.comparison import BackboneComparison, Paired, RuleComparison, Standardised
 from semstab.model.measures import Measure, Quantity, measures
 from semstab.model.statistics import RuleMeans
+from semstab.model.statistics.comparison import BackboneComparison, Paired, RuleComparison, Standardised
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import fusion_rules
-from semstab.statistics.comparison import (
+from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
+from semstab.statistics.looks import Looks
+from semstab.statistics.looks.common import decided
+from semstab.statistics.looks.ignored import Shared, common_looks
+from semstab.statistics.order import fusion_rules
+from semstab.statistics.versus.comparison import (
     EDGES,
     Tables,
     coverage,
@@ -25,10 +29,6 @@ from semstab.statistics.comparison import (
     thin,
     voxelwise,
 )
-from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
-from semstab.statistics.looks import Looks
-from semstab.statistics.looks.common import decided
-from semstab.statistics.looks.ignored import Shared, common_looks
 
 SCHEMA = 1
 

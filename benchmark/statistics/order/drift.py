@@ -6,6 +6,7 @@ less. So it is compared with what a random order of the very same observations g
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,9 @@ from random orders; a lower one becomes the lowest that these could give."""
 DRIFT_SAMPLE = 5_000
 """At most so many voxels are tested for an unusual SBD."""
 
+ROUNDED = 12
+"""Bits of p-values that are kept: so few different ones are told apart that they can be counted."""
+
 TESTABLE = 6
 """Lowest OP of the voxels that are tested one by one: of fewer one-hot labels no order is rare enough."""
 
@@ -63,6 +67,53 @@ class VoxelDrift:
 
 
 @dataclass(frozen=True, eq=False)
+class PValues:
+    """P-values of many voxels, which add up over the parts of a map: rounded up to ROUNDED bits, and how often each.
+
+    value  (v,) ascending; count (v,)
+    """
+
+    value: Float64
+    count: Int64
+
+    @classmethod
+    def of(cls, p: Float64) -> PValues:
+        """Those that are no NaN, which is not a test."""
+        value, count = np.unique(_rounded_up(p[~np.isnan(p)]), return_counts=True)
+        return cls(value, count.astype(np.int64))
+
+    @classmethod
+    def merged(cls, parts: Sequence[PValues]) -> PValues:
+        """Those of a map from its parts."""
+        value, of = np.unique(np.concatenate([part.value for part in parts]), return_inverse=True)
+        count = np.bincount(of, weights=np.concatenate([part.count for part in parts]), minlength=len(value))
+        return cls(value, count.astype(np.int64))
+
+    def adjusted(self, p: Float64) -> Float64:
+        """What `benjamini_hochberg` makes of some of them (n,); NaN stays."""
+        q = self._adjusted()
+        found = np.full(len(p), np.nan)
+        tested = ~np.isnan(p)
+        found[tested] = q[np.searchsorted(self.value, _rounded_up(p[tested]))]
+        return found
+
+    def found(self, rate: float) -> int:
+        """How many are below that rate when they are adjusted."""
+        return int(self.count[self._adjusted() <= rate].sum())
+
+    def _adjusted(self) -> Float64:
+        raised = self.value * self.count.sum() / np.cumsum(self.count)
+        lowest: Float64 = np.minimum.accumulate(raised[::-1])[::-1]
+        return np.minimum(lowest, 1.0)
+
+
+def _rounded_up(p: Float64) -> Float64:
+    part, exponent = np.frexp(p)
+    rounded: Float64 = np.ldexp(np.ceil(np.ldexp(part, ROUNDED)), exponent - ROUNDED)
+    return rounded
+
+
+@dataclass(frozen=True, eq=False)
 class Flips:
     """Changes of the predicted class between successive observations of a voxel (n,); NaN where undefined.
 
@@ -81,7 +132,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
     NaN where OP < 2, where a frame's pixels in the voxel disagree, or where OP exceeds 256.
     """
-    from semstab.statistics import kernels
+    from semstab.statistics.loops import kernels
 
     T = table.op.astype(np.int64)
     known = (T >= 2) & (T <= kernels.LONGEST_TABLE) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
@@ -165,7 +216,7 @@ class _Orders:
 
     @classmethod
     def of(cls, table: VoxelTable, events: Events, where: npt.NDArray[np.bool_], seed: int) -> _Orders:
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         first, T = events.starts[where], table.op[where].astype(np.int64)
         seeds = streams(table.rows(where).index, seed)
@@ -173,7 +224,7 @@ class _Orders:
 
     def measure(self, draws: int) -> tuple[Float64, Float64, Float64]:
         """Fill `seen`; the null of the drifts (n,), p-values (n, 3) of few observations, the trend's variance."""
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         null, p, variance = np.zeros(len(self.T)), np.zeros((len(self.T), 3)), np.zeros(len(self.T))
         kernels.in_chunks(kernels.measure_voxels, *self._shared(), draws, self.seen, null, p, variance)
@@ -181,7 +232,7 @@ class _Orders:
 
     def test(self, which: Int64, *, by_drift: bool, most: int, enough: int) -> Float64:
         """P-values (r,) of the voxels of these numbers."""
-        from semstab.statistics import kernels
+        from semstab.statistics.loops import kernels
 
         p = np.zeros(len(which))
         kernels.in_chunks(kernels.permute_voxels, which, *self._shared(), by_drift, most, enough, self.seen, p)
@@ -190,6 +241,22 @@ class _Orders:
     def _shared(self) -> tuple[Any, ...]:
         entries = self.log[0][self.first + self.T] - self.log[0][self.first]
         return self.first, self.T, self.log, self.K, int(entries.max(initial=0)), *drift_tables(self.T), self.seeds
+
+
+def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -> Int64:
+    """The rows (r,) of the voxels whose orders stand for all: those of the lowest hashes whose observations differ.
+
+    They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
+    what is drawn of a map is drawn of any part of it that holds it.
+    """
+    from semstab.statistics.loops import kernels
+
+    vary, _, T = varying(table, events)
+    order = np.argsort(streams(table.rows(vary).index, seed))
+    enough = order[: np.searchsorted(np.cumsum(T[order]), observations) + 1]
+    tested = order[T[order] > kernels.ENUMERATED][:DRIFT_SAMPLE]
+    rows: Int64 = np.flatnonzero(vary)[np.union1d(enough, tested)]
+    return rows
 
 
 def _beta_tail(trend: Float64, variance: Float64, T: Int64) -> Float64:
@@ -212,7 +279,7 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
 
 def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
-    from semstab.statistics import kernels, log_kernels
+    from semstab.statistics.loops import kernels, log_kernels
 
     n, bounds = len(events.ix), np.append(events.starts, len(events))
     changes, differing, since = np.zeros(n), np.zeros(n), np.full(n, np.nan)
@@ -263,7 +330,7 @@ def varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], I
 
 def drift_tables(T: Int64) -> tuple[Float64, Float64]:
     """What the kernels look up for voxels of up to that OP."""
-    from semstab.statistics import kernels
+    from semstab.statistics.loops import kernels
 
     longest = int(T.max(initial=2))
     return kernels.one_hot_drifts(min(longest, kernels.LONGEST_TABLE)), kernels.step_terms(longest)
@@ -271,7 +338,7 @@ def drift_tables(T: Int64) -> tuple[Float64, Float64]:
 
 def streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
     """A random number (n,) of each voxel that depends on its index (n, 3) and the seed only."""
-    from semstab.statistics import kernels
+    from semstab.statistics.loops import kernels
 
     drawn = np.empty(len(index), np.uint64)
     kernels.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)

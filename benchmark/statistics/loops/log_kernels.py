@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term
 from semstab.runtime.compiled import serial
-from semstab.statistics.kernels import CHUNKS, load
+from semstab.statistics.loops.kernels import CHUNKS, load
 
 
 @serial

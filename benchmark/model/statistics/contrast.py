@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from semstab.model.comparison import CommonLooks, MapCoverage
 from semstab.model.statistics import Interval
+from semstab.model.statistics.comparison import CommonLooks, MapCoverage
 
 Basis = Literal["looks", "voxels", "cubes", "flights"]
 """What was paired: looks (a place in a frame) that all made; voxels that all saw twice or more; cubes of space, each

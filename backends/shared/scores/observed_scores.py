@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.shared.hashing import PARTITIONS
-from semstab.backends.shared.merging import group, scatter
 from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import columns_of, frame_terms, keep_columns
-from semstab.backends.shared.score_loops import ROWS, TABLE_BITS, merge_sums, sum_scores
-from semstab.backends.shared.score_vectors import LANES
-from semstab.model.extent import Extent
+from semstab.backends.shared.pixels.merging import group, scatter
+from semstab.backends.shared.pixels.pixel_keys import columns_of, frame_terms, keep_columns
+from semstab.backends.shared.scores.loops import ROWS, TABLE_BITS, merge_sums, sum_scores
+from semstab.backends.shared.scores.vectors import LANES
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
+from semstab.model.voxels.extent import Extent
 
 Int64 = npt.NDArray[np.int64]
 

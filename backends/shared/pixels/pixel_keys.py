@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.pixels.keys import HALF
 from semstab.runtime.compiled import compiled, serial
 
 Float64 = npt.NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""From soft scores to sums by voxel: one pass over the scores, in vectors."""

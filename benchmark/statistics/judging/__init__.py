@@ -1,0 +1,1 @@
+"""What may be done with a map: its ceiling, its verdict, which places flip, which labels may be acted on."""

@@ -1,0 +1,124 @@
+"""What is kept for a later start or a later command: tiles, portions, casts, predictions, comparisons, recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import predicted_scene
+import rerun as rr
+import tiny_scene
+import yaml
+from kind import Kind
+from posed_config import configure
+
+import semstab
+from semstab.backbones import Backbone, Prediction
+from semstab.backbones.outside.class_list import class_names
+from semstab.comparison.writing import compare, load_comparison
+from semstab.conformance import case_folder, compared
+from semstab.datasets import open_dataset
+from semstab.datasets.surfaces.casting import View
+from semstab.datasets.surfaces.casts import Casts
+from semstab.engine.tiling.portion import About, Finished
+from semstab.engine.tiling.sights import Sights, look_at
+from semstab.engine.units import make_plan
+from semstab.errors import DataError
+from semstab.model.frames import Intrinsics
+from semstab.model.labels import LabelSpace
+from semstab.model.voxels import VoxelTable
+from semstab.outputs.recording import Recording
+from semstab.outputs.recording.entities import Clock
+from semstab.outputs.recording.series import send_rows
+from semstab.outputs.recording.target import is_whole
+from semstab.predict.filters import parse
+from semstab.predict.kept import Kept
+from semstab.settings import load_config, resolve
+
+
+def of_kept(folder: Path) -> Iterator[Kind]:
+    """All of them; each is read again, or made again where it is damaged."""
+    folder.mkdir()
+    wall = tiny_scene.write(folder / "wall")
+    config = configure(wall, check=None, tile_size=8)
+    tiled = folder / "tiled"
+    semstab.engine.run(config, out=tiled, observers=[Recording(tiled / "recording.rrd")])
+    tile = min(tiled.glob("voxels/*/*.parquet"))
+    yield Kind("tile of a map", (tile,), lambda file: VoxelTable.load(file.parent))
+    task = make_plan(config).tasks[0]
+    look_at(task, 0.25).save(folder / "sights.npz")
+    yield Kind("sights", (folder / "sights.npz",), Sights.load)
+    portion = folder / "frames.npz"
+    Finished(About({"a.csv": "0"}), np.zeros((3, 18)), {"strata": np.zeros(4)}).save(portion)
+    yield Kind("portion of a unit", (portion,), Finished.load)
+    view = View(Intrinsics(12, 12, 7.5, 5.5), np.eye(4), (12, 16))
+    casts = Casts(folder / "casts", b"surface")
+    casts.put(view, np.ones((12, 16), np.float32))
+    yield Kind("cast depth", (next((folder / "casts").rglob("*.cast")),), lambda _: casts.get(view))
+    images = [predicted_scene.image(0)]
+    model = Kept(Halves(), folder / "predictions")
+    model.predict(images)
+    yield Kind("kept prediction", (next((folder / "predictions").glob("*.npz")),), lambda _: model.predict(images))
+    compare([f"{tiled}:a", f"{tiled}:b"], folder / "compared")
+    yield Kind("comparison.json", (folder / "compared/comparison.json",), lambda file: load_comparison(file.parent))
+    yield Kind("recording.rrd", (tiled / "recording.rrd",), is_whole)
+    series = min(tiled.glob("frames/*.csv"))
+    stream = rr.RecordingStream("fuzz")
+    yield Kind("series of a recording", (series,), lambda file: send_rows(stream, task.units[0], task, file, Clock()))
+    yield from of_text(folder)
+
+
+class Halves(Backbone):
+    """A model that is as sure of each of two classes."""
+
+    label_space = LabelSpace("two", ("a", "b"))
+    gives_scores = True
+
+    def predict(self, images, *, scores=False):
+        """See `Backbone`."""
+        half = np.full((*images[0].shape[:2], 2), 0.5, np.float32)
+        return [Prediction(image[..., 0] % 2, half if scores else None) for image in images]
+
+    def identity(self):
+        """See `Backbone`."""
+        return {"halves": 1}
+
+
+def of_text(folder: Path) -> Iterator[Kind]:
+    """Names of classes, filters, tables of outside programs, predictions over filters."""
+    names = folder / "names.txt"
+    names.write_text("wall\ndoor\nwindow\n")
+    yield Kind("names of classes", (names,), lambda file: class_names(str(file)))
+    chains = folder / "filters.txt"
+    chains.write_text("ema:0.6\nvote-warped:5\nguided:4\nthreshold:0.5\nmap-prior:0.1\n")
+    yield Kind("filters", (chains,), read_filters)
+    flight = predicted_scene.write(folder / "flight", frames=2)
+    model = {"backbone": "colour-clusters", "filters": ["ema:0.6", "threshold:0.5"]}
+    inner = {"name": "posed_folder", "options": {"root": str(flight)}}
+    content = {"dataset": {"name": "predicted", "options": {"dataset": inner, "backbones": [model]}}, "top_k": 2}
+    (folder / "predicted.yaml").write_text(yaml.safe_dump(content))
+    yield Kind("predicted.yaml", (folder / "predicted.yaml",), open_predicted)
+    case = case_folder("drift")
+    table = folder / "table.csv"
+    table.write_bytes((case / "expected.csv").read_bytes())
+    yield Kind("table of a program", (table,), lambda file: read_table(case, file))
+
+
+def read_filters(file: Path) -> None:
+    """A filter a line."""
+    for line in file.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
+        parse(line)
+
+
+def open_predicted(file: Path) -> None:
+    """The scene and its labels' names."""
+    dataset = resolve(load_config(file)).dataset
+    opened = open_dataset(dataset.name, dataset.options)
+    opened.scene(opened.scenes[0]).backbones  # noqa: B018
+
+
+def read_table(case: Path, file: Path) -> None:
+    """What is wrong with it is told, not raised."""
+    if problem := compared(case, file):
+        raise DataError(problem)
