@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-import math
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,9 +21,10 @@ from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduc
 from semstab.engine.work.image_space import image_space_of
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
+from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
-from semstab.model.results import Agreement, Deviation
+from semstab.model.results import Agreement
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.parquet import tile_of
@@ -161,24 +161,7 @@ def _known(table: VoxelTable, truth: VoxelTable | None) -> Truth:
 def _checked(found: Sequence[Agreement | None]) -> Agreement | None:
     """The agreement on all parts, from that on each; None where it was not checked."""
     there = [each for each in found if each is not None]
-    if not there or len(there) < len(found):
-        return None
-    shared = [each.voxels[0] - each.only_in[0] for each in there]
-    return replace(
-        there[0],
-        voxels=(sum(each.voxels[0] for each in there), sum(each.voxels[1] for each in there)),
-        only_in=(sum(each.only_in[0] for each in there), sum(each.only_in[1] for each in there)),
-        differences=dict(_deviations(there, shared)),
-        agrees=all(each.agrees for each in there),
-    )
-
-
-def _deviations(there: Sequence[Agreement], shared: Sequence[int]) -> Iterator[tuple[str, Deviation]]:
-    total = sum(shared)
-    for name in there[0].differences:
-        own = [(each.differences[name], n) for each, n in zip(there, shared, strict=True) if n]
-        largest = max((each.max for each, _ in own), default=math.nan)
-        yield name, Deviation(largest, sum(each.mean * n for each, n in own) / total if total else math.nan)
+    return together(there) if there and len(there) == len(found) else None
 
 
 def _up(

@@ -98,6 +98,13 @@ def tile_of(path: Path) -> Tile:
         return Tile(x, y, about["tile_size"], about["map"])
 
 
+def voxel_size_of(path: Path) -> float:
+    """The edge of a table's voxels, metres."""
+    about = _about(path)
+    with reading(path):
+        return float(about["voxel_size"])
+
+
 def _about(path: Path) -> dict[str, Any]:
     import pyarrow.parquet as pq
 
