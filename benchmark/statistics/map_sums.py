@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.summary import STRATA, TableSums
+from semstab.model.evidence import stretches
 from semstab.model.measures import sbd, vss
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
 from semstab.statistics.order.drift import expected_sbd
-from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged, stretches
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.model.evidence import stretches
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE
@@ -47,7 +48,7 @@ class Votes:
     @classmethod
     def of(cls, table: VoxelTable) -> Votes:
         """Those of a table."""
-        return _votes(table)[0]
+        return cls.merged([_votes(table.rows(some))[0] for some in stretches(len(table))])
 
     @classmethod
     def merged(cls, parts: Sequence[Votes]) -> Votes:
@@ -110,8 +111,9 @@ def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = 
     and Wolfowitz 1956, Annals of Mathematical Statistics 27; by the EM algorithm), then Bayes' theorem is applied.
     `shares` are those of all places, where the table has but some of them.
     """
-    votes, of = _votes(table)
+    shares = Votes.of(table).shares() if shares is None else shares
     found = np.full(len(table), np.nan)
-    likely = votes.stable(votes.shares() if shares is None else shares, stable=stable)
-    found[table.op >= 2] = likely[of]
+    for some in stretches(len(table)):
+        votes, of = _votes(table.rows(some))
+        found[some][table.op[some] >= 2] = votes.stable(shares, stable=stable)[of]
     return found

@@ -68,7 +68,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     """Measure a finished map and write its files. Raises DataError where no pixel was valid."""
     task, config, unit = one.task, one.request.config, one.task.units[0]
     kept = one.request.kept
-    with watch("measure"):
+    with watch("table"):
         table = _table(one.backend, task)
         _require_voxels(task, config, table)
         if not (config.statistics or config.events):
@@ -216,9 +216,9 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     """Write what is left of a portion of a unit in tiles: of the map its voxels, tile by tile, and sums."""
     portion = one.request.portion
     assert portion is not None
-    with watch("measure"):
+    with watch("table"):
         table = _table(one.backend, one.task) if one.request.fuses else None
-    with watch("statistics" if one.request.config.statistics else "measure"):
+    with watch("statistics"):
         found = None if table is None else _looked_at(one, table, judged=portion.judged)
     with watch("reference"):
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
@@ -280,14 +280,22 @@ def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part
     voxels = f"{portion.folder}/voxels" if again else f"{VOXELS}/{unit.slug}"
     for tile, rows in tiles_of(found.table, portion.part.size, portion.key):
         if portion.kept or again:
-            columns = {name: values[rows] for name, values in found.maps.items()}
-            savers[f"{voxels}/{tile.name}"] = partial(save_voxels, found.table.rows(rows), columns=columns, tile=tile)
+            savers[f"{voxels}/{tile.name}"] = partial(_save_tile, found, rows, tile)
         if found.events is not None and config.events and portion.kept:
             savers[f"{EVENTS}/{unit.slug}/{tile.name}"] = partial(_save_events, found.events, rows, tile)
     if found.truth is not None:
         for tile, rows in tiles_of(found.truth, portion.part.size, portion.key):
-            savers[f"{portion.folder}/truth/{tile.name}"] = partial(found.truth.rows(rows).save, tile=tile)
+            savers[f"{portion.folder}/truth/{tile.name}"] = partial(_save_truth, found.truth, rows, tile)
     return savers
+
+
+def _save_tile(found: _Part, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+    columns = {name: values[voxels] for name, values in found.maps.items()}
+    save_voxels(found.table.rows(voxels), path, columns, tile)
+
+
+def _save_truth(truth: VoxelTable, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+    truth.rows(voxels).save(path, tile=tile)
 
 
 def _save_events(events: Events, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
@@ -297,12 +305,12 @@ def _save_events(events: Events, voxels: npt.NDArray[np.int64], tile: Tile, path
 def tiles_of(table: VoxelTable, size: int, key: str) -> Iterator[tuple[Tile, npt.NDArray[np.int64]]]:
     """The rows of a table by tile of that edge, of the map of that key."""
     shift = size.bit_length() - 1
-    place = np.stack([table.ix >> shift, table.iy >> shift], axis=1)
-    tiles, of = np.unique(place, axis=0, return_inverse=True)
-    order = np.argsort(of.ravel(), kind="stable")
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(of.ravel(), minlength=len(tiles)))])
-    for (x, y), first, last in zip(tiles.tolist(), bounds, bounds[1:], strict=False):
-        yield Tile(x, y, size, key), order[first:last]
+    place = (table.ix >> shift).astype(np.int64) << 32
+    place += table.iy >> shift
+    order = np.argsort(place, kind="stable")
+    first = np.flatnonzero(np.diff(place[order], prepend=-(2**63)))
+    for rows in np.split(order, first[1:]):
+        yield Tile(int(table.ix[rows[0]]) >> shift, int(table.iy[rows[0]]) >> shift, size, key), rows
 
 
 def _savers(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import row_chunks
+from semstab.model.evidence import row_chunks, stretches
 from semstab.model.statistics import Flipping
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
@@ -36,6 +36,10 @@ class FlippingSums:
     @classmethod
     def of(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
         """Of a table, by the probability (n,) of `steady`, over cubes of that edge in metres."""
+        return cls.merged([cls._of_few(table.rows(some), stable[some], edge) for some in stretches(len(table))])
+
+    @classmethod
+    def _of_few(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
         rows = np.flatnonzero(~np.isnan(stable))
         unsteady = 1 - stable[rows]
         places = Places(table.index[rows], table.voxel_size, edge)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import voxel_keys
-from semstab.model.evidence import row_chunks
+from semstab.model.evidence import row_chunks, stretches
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
@@ -19,9 +18,6 @@ from semstab.statistics.agreement import ONE_HOT, psa
 from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
-
-STRETCH = 1 << 17
-"""So many voxels are looked at together, where sums over all of them are wanted."""
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -151,11 +147,6 @@ def _with_places(
         frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
         columns=np.concatenate([sums.columns, columns[some]]),
     )
-
-
-def stretches(rows: int) -> Iterator[slice]:
-    """Consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
-    return (slice(first, min(first + STRETCH, rows)) for first in range(0, max(rows, 1), STRETCH))
 
 
 def cells_of(
