@@ -20,6 +20,7 @@ from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.sizing import Sizing, sized
+from semstab.engine.survey import Survey
 from semstab.engine.tiled_unit import TiledUnit
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan, must_agree
@@ -106,6 +107,7 @@ def _execute(
         told.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()
+        executor.close()
     told.raise_first()
     return result, found.causes
 
@@ -156,7 +158,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
             found.geometry, found.advice = _checked(plan.config, missing, told)
     with folder.started() as start, lend(start, plan.scenes):
         with watch("sizing"):
-            sizing = sized(plan.config, missing, folder.path, executor.width)
+            sizing = sized(plan.config, missing, Survey(executor, folder, start))
         for line in sizing.remarks:
             told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         _refuse(sizing, missing, found, executor, told)
