@@ -197,7 +197,7 @@ def _work_off(
     factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
     requests = [request for tiled in in_tiles.values() for request in tiled.missing()]
     jobs = split(_jobs(plan.config, folder.path, start, whole, factories), executor.width)
-    jobs += _portion_jobs(plan.config, folder.path, start, requests, units)
+    jobs += _portion_jobs(plan.config, folder.path, start, requests, units, factories)
     kept = (tiled.take(None) for tiled in in_tiles.values())
     with contextlib.closing(executor.run(jobs, told)) as finished:
         done = (outcome for _, outcomes in finished for outcome in outcomes)
@@ -292,14 +292,23 @@ def _jobs(
 
 
 def _portion_jobs(
-    config: Config, folder: Path, start: str, requests: Sequence[Request], units: Mapping[str, Planned]
+    config: Config,
+    folder: Path,
+    start: str,
+    requests: Sequence[Request],
+    units: Mapping[str, Planned],
+    observers: Sequence[Factory],
 ) -> list[Job]:
-    """A job each, so that no two maps are in memory at once."""
+    """A job each, so that no two maps are in memory at once; a frame is shown to observers of one of them."""
     memory = None if config.memory_gb is None else config.memory_gb * GB
-    named = [(units[request.identity].unit, request) for request in requests]
-    return [
-        Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory) for unit, request in named
-    ]
+    jobs, shown = [], set()
+    for request in requests:
+        unit = units[request.identity].unit
+        frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
+        own = tuple(observers) if request.shown and frames not in shown else ()
+        shown.add(frames)
+        jobs.append(Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own))
+    return jobs
 
 
 def _result(plan: Plan, folder: Folder, found: _Found) -> Result:

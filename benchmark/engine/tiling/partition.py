@@ -133,7 +133,7 @@ def _best_cut(tiles: Sights, rows: npt.NDArray[np.int64], weight: npt.NDArray[np
         values, of = np.unique(place[:, axis], return_inverse=True)
         below = np.cumsum(np.bincount(of, weights=weight))[:-1]
         for at, part in zip(values[1:].tolist(), below.tolist(), strict=True):
-            twice = np.count_nonzero((low < at) & (high >= at))
+            twice = int(np.count_nonzero((low < at) & (high >= at)))
             parts = math.ceil(part) + math.ceil(total - part)
             imbalance = abs(part / total - 0.5)
             found.append(_Cut(parts, imbalance > UNEVEN, twice, imbalance, axis, at))
