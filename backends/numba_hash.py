@@ -31,7 +31,7 @@ from semstab.backends.numba_parts.loops import (
 )
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.hashing import PARTITIONS
+from semstab.backends.shared.hashing import PARTITIONS, mix
 from semstab.backends.shared.observed import Observed, ObservedScores
 from semstab.backends.shared.pixels.keys import columns_of_keys, index_of_keys
 from semstab.backends.shared.scores.vectors import LANES
@@ -158,6 +158,8 @@ class NumbaHash:
 
     def table(self) -> VoxelTable:
         """The map so far."""
+        self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)  # made anew for a further frame: the table needs the memory
+        self._records.resize(max(len(self), 1), refcheck=False)
         order = self._order()
         index = columns_of_keys(self._records["key"], order, self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
@@ -207,13 +209,25 @@ class NumbaHash:
         return self._history.events(order, columns_of_keys(self._records["key"], order, self.origin))
 
     def _make_slots(self, needed: int) -> None:
-        size = self._slots.shape[1]
+        there = self._slots.shape[1]
+        size = there or 64
         while needed > FULL * size:
             size *= 2
-        if size > self._slots.shape[1]:
+        if size > there:
             slots = np.empty((PARTITIONS, size), dtype=SLOT)
-            rehash(self._slots, slots)
+            rehash(self._slots if there else self._listed(), slots)
             self._slots = slots
+
+    def _listed(self) -> npt.NDArray[Any]:
+        """Keys and rows of all voxels by partition, as `rehash` takes them."""
+        keys = self._records["key"][: len(self)]
+        partition = (mix.py_func(keys) >> np.uint64(58)).astype(np.int64)
+        row = np.argsort(partition, kind="stable")
+        partition, at = partition[row], np.arange(len(row)) - np.repeat(np.cumsum(self._used) - self._used, self._used)
+        slots = np.empty((PARTITIONS, int(self._used.max())), dtype=SLOT)
+        slots["row"] = -1
+        slots["key"][partition, at], slots["row"][partition, at] = keys[row], row
+        return slots
 
     def _make_dense(self, seen: ObservedScores, row: Int64) -> Int64:
         """Room for a dense row for each of the frame's voxels; where those of each partition begin."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.backends.shared.association import (
     Int64,
@@ -34,6 +36,16 @@ ODD = np.array([[-0x61C8864680B583EB], [-0x3D4D51C2D82B14B1], [0x165667B19E3779F
 """Of each axis, to mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a frame says of voxels by their rows (n,): mean evidence, of which most is 0, and pixels (n,)."""
+
+    rows: npt.NDArray[np.int32]
+    frame: int
+    s_bar: Evidence
+    pixels: Int64
+
+
 class NumpyReference:
     """Fusion as the paper writes it: clear before fast; memory grows with every observation."""
 
@@ -45,7 +57,7 @@ class NumpyReference:
         self.num_classes = num_classes
         self.within = within
         self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
-        self._history: list[tuple[Int64, int, Observations]] = []  # (rows, frame, observations), frame after frame
+        self._history: list[_Seen] = []  # frame after frame
         self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
         self._op = np.zeros(0, dtype=np.int64)
         self._total = MapTotal(num_classes)
@@ -66,7 +78,7 @@ class NumpyReference:
         after = before + seen.s_bar
         self._evidence[rows] = after
         self._op[rows] += 1
-        self._history.append((rows, frame.index, seen))
+        self._history.append(_Seen(rows.astype(np.int32), frame.index, Evidence.of(seen.s_bar), seen.pixels))
         change = Change.between(before, after, self._op[rows], seen.pixels)
         return self._total.add(frame.index, change, started)
 
@@ -80,16 +92,17 @@ class NumpyReference:
         order = np.lexsort(voxels.T[::-1])
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        voxel = np.concatenate([rank[rows] for rows, _, _ in self._history] or [order])
-        frame = np.concatenate([np.full(len(rows), t) for rows, t, _ in self._history] or [order])
-        s_bar = np.concatenate([seen.s_bar for _, _, seen in self._history] or [np.zeros((0, self.num_classes))])
-        pixels = np.concatenate([seen.pixels for _, _, seen in self._history] or [order])
+        nothing = np.zeros(0, dtype=np.int64)
+        voxel = np.concatenate([nothing, *(rank[seen.rows] for seen in self._history)])
+        frame = np.concatenate([nothing, *(np.full(len(seen.rows), seen.frame) for seen in self._history)])
+        pixels = np.concatenate([nothing, *(seen.pixels for seen in self._history)])
+        s_bar = Evidence.joined([Evidence.of(np.zeros((0, self.num_classes))), *(seen.s_bar for seen in self._history)])
         by_voxel = np.argsort(voxel, kind="stable")  # stable: keeps the order of integration within a voxel
         return Events(
             **index_columns(voxels[order]),
             voxel=voxel[by_voxel],
             frame=frame[by_voxel].astype(np.int32),
-            evidence=Evidence.of(s_bar[by_voxel]),
+            evidence=s_bar.take(by_voxel),
             pixels=pixels[by_voxel],
             voxel_size=self.voxel_size,
         )
@@ -104,9 +117,9 @@ class NumpyReference:
         voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
         rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         if len(self._row) > len(self._op):
-            room = 2 * len(self._row) - len(self._op)
-            self._evidence = np.pad(self._evidence, ((0, room), (0, 0)))
-            self._op = np.pad(self._op, (0, room))
+            room = len(self._row) + len(self._row) // 4
+            self._evidence.resize((room, self.num_classes), refcheck=False)  # in place: nothing is there twice
+            self._op.resize(room, refcheck=False)
         return rows
 
 

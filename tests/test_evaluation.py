@@ -170,7 +170,9 @@ def test_the_log_counts_as_memory(tmp_path) -> None:
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
     assert expected - without > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):
-        semstab.engine.run(configure(root, backends=["numba"], check=None, statistics=True, memory_gb=1e-6))
+        semstab.engine.run(
+            configure(root, backends=["numba"], check=None, statistics=True, memory_gb=1e-6, tile_size="off")
+        )
 
 
 def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, capsys) -> None:

@@ -206,7 +206,22 @@ def test_voxels_that_span_too_much_are_refused(tmp_path):
     far = voxels_by_hand((2, 1, [1, 0, 0]))
     far = as_voxels(dataclasses.replace(far, ix=np.array([0, 2**22]), iy=np.array([0, 2**22])))
     fails(ConfigError, "choose larger ones with --cell", seen_from_above, far)
-    fails(ConfigError, "too much for a mesh", mesh.write, far, tmp_path / "far.glb")
+    fails(ConfigError, "too much for a mesh", mesh.write, Alone(far), tmp_path / "far.glb")
+
+
+class Alone:
+    """Voxels that are all that was chosen."""
+
+    size = None
+
+    def __init__(self, voxels):
+        self.first = voxels
+
+    def places(self):
+        return iter([(0, 0)])
+
+    def __getitem__(self, place):
+        return self.first
 
 
 # --- A given cloud ----------------------------------------------------------------------------------------------------

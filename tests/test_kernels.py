@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import numba as nb
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semstab.backends.shared.pixels import pixel_keys
+from semstab.backends.shared.pixels import pixel_keys, tile_loops
 from semstab.backends.shared.pixels.keys import HALF
+from semstab.backends.shared.pixels.run_vectors import LANES, runs_of_eight
 from semstab.model.labels import IGNORE_8BIT
 
 W = 300
@@ -59,3 +62,46 @@ def test_most_pixels_take_the_quick_way() -> None:
         depth = rng.uniform(1, 50, pixel_keys.BLOCK).astype(np.float32)
         doubts += bool(pixel_keys.keys_fused(depth, labels, IGNORE_8BIT, *rays, *start, *offset, margin, out))
     assert doubts <= 2
+
+
+def test_pixels_without_depth_are_not_in_doubt() -> None:
+    """They stand at the camera, here in a corner of voxels."""
+    n = pixel_keys.BLOCK
+    rays, margin = pixel_keys.frame_terms((np.arange(n) - 128.3) / 300, np.eye(4), 0.2)
+    nothing, labels, out = np.zeros(n, np.float32), np.zeros(n, np.uint8), np.empty(n, dtype=np.int64)
+    at = (0.0, 0.0, 5.0, HALF, HALF, HALF)
+    assert not pixel_keys.keys_fused(nothing, labels, IGNORE_8BIT, *rays, *at, margin, out)
+    assert (out == -1).all()
+
+
+@pytest.mark.parametrize("margin", [2.0**-31, 2.0**-30 * 1.01, 2.0**-20, 1e-3, 0.4, 1e4])
+def test_a_voxels_face_is_as_wide_as_its_margin_at_least(margin) -> None:
+    """A number with half the face added has none of the bits left exactly if it lies in the face."""
+    half, face = tile_loops.face_terms(margin)
+    assert half >= min(margin, 1.0)
+    for fraction in (0.0, 0.99 * half, -0.99 * half, 1.01 * half, -1.01 * half, 0.5):
+        bits = int(np.float64(tile_loops.REACH + 7 + fraction + half).view(np.int64))
+        assert (bits & face == 0) == (abs(fraction) < half or half >= 0.5)
+
+
+@pytest.mark.parametrize("features", [None, ""])
+def test_runs_are_the_same_with_and_without_wide_vectors(features, monkeypatch) -> None:
+    """None: the instructions of this machine."""
+    if features is not None:
+        monkeypatch.setattr("numba.core.codegen.JITCPUCodegen.magic_tuple", lambda _: ("", "", features))
+
+    @nb.njit
+    def runs(words, run_word, run_end):
+        n = 0
+        for at in range(0, words.shape[0] - LANES, LANES):
+            n = runs_of_eight(words, at, run_word, run_end, n)
+        return n
+
+    rng = np.random.default_rng(2)
+    for values in (1, 2, 50):
+        words = np.append(rng.integers(0, values, 10 * LANES), -1)
+        run_word, run_end = np.zeros((2, len(words) + LANES), dtype=np.int64)
+        n = runs(words, run_word, run_end)
+        last = np.flatnonzero(words[:-1] != words[1:])
+        np.testing.assert_array_equal(run_end[:n], last + 1)
+        np.testing.assert_array_equal(run_word[:n], words[last])

@@ -29,7 +29,9 @@ from semstab.model.frames import Frame, Intrinsics
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.extent import Extent
 from semstab.model.voxels.parquet import Tile
-from semstab.outputs.export import export
+from semstab.outputs.export import export, raster
+from semstab.outputs.relabel import Belief, relabel
+from semstab.statistics.sampling import InfluenceSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
 
@@ -172,8 +174,7 @@ def assert_same_run(whole, tiles) -> None:
     assert len(list((tiles / "voxels").glob("*/tile=*.parquet"))) > 4
     assert not (tiles / "parts").exists()
     found = differences(summary_of(whole), summary_of(tiles), tolerance=1e-12)
-    untold = ("voxels_file", ".flipping")  # places that flip need the prior of the whole map
-    assert [line for line in found if not any(word in line.split(":")[0] for word in untold)] == []
+    assert [line for line in found if "_file" not in line.split(":")[0]] == []
     one, other = (semstab.load(folder).table() for folder in (tiles, whole))
     assert_same_bits(one, other)
     for row, expected in zip(series_of(tiles), series_of(whole), strict=True):
@@ -189,6 +190,37 @@ def test_a_run_in_tiles_says_what_a_whole_one_says(both) -> None:
 @pytest.mark.parametrize(("scene", "backend"), [("soft_wall", "numba"), ("wall", "numpy")])
 def test_so_it_does_with_soft_scores_and_other_backends(scene, backend, tmp_path, request) -> None:
     assert_same_run(*run_both(request.getfixturevalue(scene), tmp_path, **SETTINGS | {"backends": [backend]}))
+
+
+@pytest.fixture(scope="module")
+def judged(wall, tmp_path_factory):
+    """The same of a run with all statistics and its log."""
+    settings = SETTINGS | {"statistics": True, "events": True, "backbones": ["a"]}
+    return run_both(wall, tmp_path_factory.mktemp("judged"), **settings)
+
+
+def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
+    """With log and ground truth: tests of drift, flips, fusion rules, quadrants; each column of each voxel."""
+    assert_same_run(*judged)
+    whole, tiles = judged
+    (statistics,) = (run["statistics"] for run in summary_of(tiles)["runs"])
+    assert all(statistics[name] is not None for name in ("geometry", "correctness", "fusion_rules", "flipping"))
+    assert statistics["drift"]["tests"]["tested_voxels"] > 0
+    one, other = (semstab.load(folder) for folder in (tiles, whole))
+    names = parquet.read_schema(other.result.records[0].voxels_file).names
+    names = [name for name in names if name != "evidence"]
+    columns, expected = (VoxelTable.columns(run.result.records[0].voxels_file, names) for run in (one, other))
+    for name in names:
+        np.testing.assert_allclose(columns[name], expected[name], rtol=1e-12, err_msg=name)
+    assert_same_bits(*(VoxelTable.load(run.result.records[0].truth_file) for run in (one, other)))
+    logs = one.events(), other.events()
+    for name in ("ix", "iy", "iz", "voxel", "frame", "pixels", "evidence"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(log, name)) for log in logs))
+    sums = [InfluenceSums.load(run.result.records[0].influence_file) for run in (one, other)]
+    ordered = [
+        own.columns[np.lexsort((own.frame, *own.cell.T))] for own in (own.coarsened(own.edge, own.step) for own in sums)
+    ]
+    np.testing.assert_allclose(*ordered, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".ply", ".laz"])
@@ -228,6 +260,66 @@ def laspy_points(path):
     cloud = laspy.read(path)
     names = [name for name in cloud.point_format.dimension_names if name not in ("X", "Y", "Z")]
     return zip(*(cloud[name] for name in ("x", "y", "z", *names)), strict=True)
+
+
+def test_rasters_and_meshes_of_tiles_are_those_of_the_whole_map(both, tmp_path, monkeypatch) -> None:
+    """Each pixel of each band; each triangle with its colour: no side is seen between two tiles."""
+    rasterio, trimesh = pytest.importorskip("rasterio"), pytest.importorskip("trimesh")
+    rasters, meshes = [], []
+    for folder, window in zip(both, (1024, 4), strict=True):
+        monkeypatch.setattr(raster, "WINDOW", window)
+        files = [tmp_path / f"{folder.name}{suffix}" for suffix in (".tif", ".glb")]
+        export(folder, files, min_op=2)
+        for file in (files[0], files[0].with_suffix(".class.tif")):
+            with rasterio.open(file) as bands:
+                rasters.append((bands.read(), bands.transform, bands.descriptions, bands.tags(1)))
+        scene = trimesh.load(files[1])
+        found = []
+        for own in scene.geometry.values():
+            corners = own.triangles.round(5).reshape(len(own.faces), -1)
+            found += [(*row, *own.visual.vertex_colors[face[0]]) for row, face in zip(corners, own.faces, strict=True)]
+        meshes.append(sorted(map(tuple, np.array(found).tolist())))
+    for one, other in zip(rasters[:2], rasters[2:], strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[1:] == other[1:]
+    assert len(meshes[0]) > 400
+    assert meshes[0] == meshes[1]
+
+
+def test_a_cloud_takes_from_tiles_what_it_takes_from_the_whole_map(both, tmp_path) -> None:
+    """Points in voxels, and beside them, also across the edge of a tile."""
+    rng, table = np.random.default_rng(0), VoxelTable.load(both[1] / "voxels" / "wall__a__numba")
+    points = table.centers[rng.integers(len(table), size=2000)] + rng.uniform(-0.4, 0.4, (2000, 3))
+    cloud = tmp_path / "cloud.ply"
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 2000\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+    cloud.write_bytes(header.encode() + points.astype("<f8").tobytes())
+    written = []
+    for folder in both:
+        out = tmp_path / f"{folder.name}.ply"
+        (exported,) = export(folder, out, onto=cloud, radius=0.3)
+        written.append((out.read_bytes(), exported.content))
+    assert written[0] == written[1]
+    assert "100.0%" not in written[0][1]
+
+
+@pytest.mark.parametrize("leave_own_out", [False, True])
+def test_labels_from_tiles_are_those_from_the_whole_map(leave_own_out, both, tmp_path) -> None:
+    found = []
+    for folder in both:
+        report = relabel(folder, tmp_path / folder.name, belief=Belief(min_op=2, leave_own_out=leave_own_out))
+        files = sorted((tmp_path / folder.name / "labels" / "a-fused").glob("*.png"))
+        found.append(([file.read_bytes() for file in files], dataclasses.replace(report, folder="")))
+    assert found[0] == found[1]
+    assert len(found[0][0]) == 30
+
+
+def test_backends_are_held_against_each_other_tile_by_tile(wall, tmp_path) -> None:
+    whole, tiles = run_both(wall, tmp_path, backends=["numba"], check="numpy")
+    one, other = (summary_of(folder)["agreement"] for folder in (whole, tiles))
+    assert len(one) == 1
+    assert differences(one, other, tolerance=1e-12) == []
+    assert all(row["agrees"] for row in other)
 
 
 def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
@@ -284,7 +376,6 @@ def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
     ("settings", "message"),
     [
         ({"tile_size": 12}, r"tile_size: use a power of 2 from 8, or off"),
-        ({"tile_size": 8, "statistics": True}, r"tile_size = 8: statistics and events keep every observation"),
         ({"tile_size": 8, "backends": ["open3d-projective"]}, r"tile_size = 8: backend 'open3d-projective' cannot"),
     ],
 )

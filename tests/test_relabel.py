@@ -20,6 +20,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import CATEGORIES, categories
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
+from semstab.model.voxels.tiles import Tiles
 from semstab.outputs.relabel import Belief, relabel
 from semstab.outputs.relabel.fused_labels import UNSEEN, UNSTABLE, FusedLabels
 from semstab.statistics import psa
@@ -100,10 +101,14 @@ def test_without_its_own_vote_a_frame_sees_the_map_of_the_others(soft):
     for i, frame in enumerate(frames):
         rest = table_of([*frames[:i], *frames[i + 1 :]])
         rest = dataclasses.replace(rest, evidence=np.round(rest.evidence, 9))  # ties are no matter of rounding
-        others = FusedLabels(rest, Belief(min_op=2, min_psa=0.3)).of(frame)
-        without = FusedLabels(whole, Belief(min_op=2, min_psa=0.3, leave_own_out=True)).of(frame)
+        others = labels(rest, Belief(min_op=2, min_psa=0.3)).of(frame)
+        without = labels(whole, Belief(min_op=2, min_psa=0.3, leave_own_out=True)).of(frame)
         np.testing.assert_array_equal(np.maximum(without, UNSEEN), np.maximum(others, UNSEEN))
         assert len(np.unique(without)) > 2
+
+
+def labels(table, belief):
+    return FusedLabels(Tiles.of(table), belief, table.K)
 
 
 def table_of(frames):
@@ -116,7 +121,7 @@ def table_of(frames):
 def test_pixels_of_voxels_that_are_not_believed_are_ignored(fused):
     table = semstab.load_result(fused / "run").record().table()
     frame = dataclasses.replace(tiny_scene.frame(2, np.zeros((6, 8), np.uint8)), labels=np.full((6, 8), 255, np.uint8))
-    free = FusedLabels(table, Belief()).of(frame)
+    free = labels(table, Belief()).of(frame)
     assert (free >= 0).all()  # whatever the frame's own labels
     kinds = {CATEGORIES[k] for k in np.unique(categories(table))}
     assert {"low persistence", "stable"} <= kinds
@@ -125,9 +130,9 @@ def test_pixels_of_voxels_that_are_not_believed_are_ignored(fused):
         (Belief(min_psa=0.9), np.nan_to_num(psa(table)) >= 0.9),
         (Belief(categories=("stable", "uncertain")), categories(table) >= 2),
     ):
-        found = FusedLabels(table, belief).of(frame)
+        found = labels(table, belief).of(frame)
         assert (found[found >= 0] == free[found >= 0]).all()
-        rows = FusedLabels(dataclasses.replace(table, evidence=np.eye(len(table)), classes=()), Belief()).of(frame)
+        rows = labels(dataclasses.replace(table, evidence=np.eye(len(table)), classes=()), Belief()).of(frame)
         np.testing.assert_array_equal(found == UNSTABLE, ~kept[rows])
         assert set(np.unique(found == UNSTABLE)) == {False, True}
 

@@ -16,7 +16,7 @@ from semstab.backends.shared.beliefs import js_term, observe_row, plogp
 from semstab.backends.shared.hashing import PARTITIONS, mix
 from semstab.backends.shared.prefetch import AHEAD, touch
 from semstab.model.results import RECURRENT
-from semstab.runtime.compiled import parallel, serial
+from semstab.runtime.compiled import compiled, parallel, serial
 
 ALONE, DENSE = -1, -2
 
@@ -42,7 +42,7 @@ def look_up(key, bounds, slots, row, slot, new):
         n = 0
         mine, last = slots[p], bounds[p + 1]
         for v in range(bounds[p], last):
-            touch(mine, np.int64(mix(key[min(v + AHEAD, last - 1)]) & mask))
+            touch(mine, np.int64(mix(key[min(v + 2 * AHEAD, last - 1)]) & mask))
             at = np.int64(mix(key[v]) & mask)
             while mine[at].row != -1 and mine[at].key != key[v]:
                 at = (at + 1) & np.int64(mask)
@@ -98,7 +98,7 @@ def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out)
         s[label[e]] = 0.0
 
 
-@serial
+@compiled(forceinline=True)
 def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
     """Add one observation to a voxel that disagrees with itself, or with the frame.
 
@@ -115,13 +115,15 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
     while True:
         lab = np.int64(record.label if at == -2 else nodes[at].label)
         value = np.float64(record.value) if at == -2 else np.float64(nodes[at].value)
-        if value > most_before or (value == most_before and lab < dominant_before):
-            most_before, dominant_before = value, lab
+        leads = (value > most_before) | ((value == most_before) & (lab < dominant_before))
+        dominant_before = lab if leads else dominant_before
+        most_before = max(most_before, value)
         p = value * before
         value += s[lab]
         s[lab] = 0.0
-        if value > most_after or (value == most_after and lab < dominant_after):
-            most_after, dominant_after = value, lab
+        leads = (value > most_after) | ((value == most_after) & (lab < dominant_after))
+        dominant_after = lab if leads else dominant_after
+        most_after = max(most_after, value)
         q = value * after
         if at == -2:
             record.value = value
@@ -166,6 +168,18 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
     out[3], out[4] = dominant_before, dominant_after
 
 
+@compiled(forceinline=True)
+def _touch_ahead(v, last, row, records, nodes, dense):
+    """Ask for the records of later voxels, which lie across two lines of the cache, and for where they go on."""
+    soon = max(row[min(v + 2 * AHEAD, last)], 0)
+    touch(records, soon)
+    touch(records, soon + 1)
+    following = np.int64(records[max(row[min(v + AHEAD, last)], 0)].next)
+    touch(nodes, max(following, 0))
+    if dense.shape[0] > 1:
+        touch(dense.reshape(-1), max(DENSE - following, 0) * dense.shape[1])
+
+
 @parallel
 def update(
     key, pixels, start, label, weight, bounds, frame, row, slot, base, slots, records, nodes, dense, ranges, sums,
@@ -182,12 +196,7 @@ def update(
         vss = entropy = drift = 0.0
         reached = 0
         for v in range(bounds[p], bounds[p + 1]):
-            touch(records, max(row[min(v + AHEAD, bounds[p + 1] - 1)], 0))
-            following = records[max(row[min(v + AHEAD // 2, bounds[p + 1] - 1)], 0)].next
-            if following >= 0:
-                touch(nodes, np.int64(following))
-            elif following <= DENSE:
-                touch(dense.reshape(-1), np.int64(DENSE - following) * dense.shape[1])
+            _touch_ahead(v, bounds[p + 1] - 1, row, records, nodes, dense)
             first, last = start[v], start[v + 1]
             r = row[v]
             if r < 0:

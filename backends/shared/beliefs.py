@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.scores.logarithm import bits_of, plogp_fast
+from semstab.backends.shared.bits import bits_of
+from semstab.backends.shared.scores.logarithm import plogp_fast
 from semstab.runtime.compiled import compiled, serial
 
 

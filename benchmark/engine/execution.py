@@ -29,9 +29,11 @@ from semstab.engine.work.jobs import Job, Outcome, Request, split
 from semstab.engine.work.passes import lend
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import compare
+from semstab.metrics.agreement import together
 from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
 from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.tiles import side_by_side
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 from semstab.statistics import BackboneComparison, Looks, claimed_together
@@ -208,7 +210,8 @@ def _work_off(
                 found.watch.seconds[stage] += seconds
             if tiled is not None and outcome.portion is not None:
                 told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
-                ended = tiled.take(outcome)
+                with found.watch("assemble"):
+                    ended = tiled.take(outcome)
             if ended is not None and ended.identity not in found.errors:
                 _keep(folder, found, each, ended)
                 if tiled is not None and ended.content is not None:
@@ -363,7 +366,7 @@ def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Ite
     for group in _by_backend(records).values():
         there = [record for record in group if record.unit.backend in checked]
         for a, b in itertools.combinations(there, 2):
-            yield compare(tables.of(a), tables.of(b), (a.unit, b.unit), tolerance=config.tolerance)
+            yield _alike(config, a, b, tables)
 
 
 def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
@@ -372,8 +375,15 @@ def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iter
     for first, *others in _by_backend(records).values():
         for other in others:
             if free & {first.unit.backend, other.unit.backend}:
-                units = (first.unit, other.unit)
-                yield compare(tables.of(first), tables.of(other), units, tolerance=config.tolerance)
+                yield _alike(config, first, other, tables)
+
+
+def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
+    """How far two units agree, voxel by voxel; tile by tile where one is in tiles."""
+    units, files = (a.unit, b.unit), [record.voxels_file for record in (a, b) if record.voxels_file is not None]
+    if not (a.in_tiles or b.in_tiles):
+        return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
+    return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(files)])
 
 
 def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:

@@ -139,14 +139,15 @@ class Folder:
         return found if found is not None and self._are_whole(found.about.files) else None
 
     def clear(self, planned: PlannedUnit, keep: Collection[str]) -> None:
-        """Remove what was left of a unit's voxels, a file or tiles, but for these files."""
+        """Remove what was left of a unit's voxels, truth and log, a file or tiles, but for these files."""
         slug = planned.unit.slug
-        tiles = self.path.glob(f"{VOXELS}/{glob.escape(slug)}/*.parquet")
-        for file in (self.path / f"{VOXELS}/{slug}.parquet", *tiles):
-            if planned.kept and file.relative_to(self.path).as_posix() not in keep:
-                file.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            (self.path / VOXELS / slug).rmdir()  # where it is empty
+        for name in (VOXELS, TRUTH, EVENTS) if planned.kept else ():
+            tiles = self.path.glob(f"{name}/{glob.escape(slug)}/*.parquet")
+            for file in (self.path / f"{name}/{slug}.parquet", *tiles):
+                if file.relative_to(self.path).as_posix() not in keep:
+                    file.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                (self.path / name / slug).rmdir()  # where it is empty
 
     def save_trace(self, outcome: Outcome) -> None:
         """Keep where a unit's error was raised, for who mends it: failures.log of this start."""
@@ -157,8 +158,9 @@ class Folder:
     def record(self, planned: PlannedUnit, content: UnitContent) -> Record:
         """The record of a unit from the content of its file."""
         assert content.summary is not None
-        voxels = f"{VOXELS}/{planned.unit.slug}" + ("" if _in_tiles(planned.unit, content) else ".parquet")
-        truth = self.path / f"{TRUTH}/{planned.unit.slug}.parquet"
+        suffix = "" if _in_tiles(planned.unit, content) else ".parquet"
+        voxels, truth = (f"{name}/{planned.unit.slug}{suffix}" for name in (VOXELS, TRUTH))
+        has_truth = any(name.startswith(truth) for name in content.files)
         return Record(
             key=unit_key(planned.identity, content.input),
             variation=planned.variation,
@@ -166,7 +168,7 @@ class Folder:
             image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
             quality=content.quality if planned.image_space else None,
             voxels_file=self.path / voxels if planned.kept else None,
-            truth_file=truth if planned.image_space and f"{TRUTH}/{truth.name}" in content.files else None,
+            truth_file=self.path / truth if planned.image_space and has_truth else None,
         )
 
     def save_result(self, result: Result) -> None:
@@ -218,13 +220,13 @@ class Folder:
         if planned.kept and planned.judged:
             wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and planned.logged:
-            wanted.append(f"{EVENTS}/{unit.slug}.parquet")
+            wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
 
 
-def _in_tiles(unit: Unit, content: UnitContent) -> list[str]:
+def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:
     """The files of the unit's tiles, where it has any."""
-    return [name for name in content.files if name.startswith(f"{VOXELS}/{unit.slug}/")]
+    return [name for name in content.files if name.startswith(f"{of}/{unit.slug}/")]
 
 
 def unit_key(identity: str, digest: str) -> str:

@@ -124,8 +124,6 @@ def _cannot_be_tiled(config: Config, group: Sequence[PlannedUnit]) -> str | None
     """Why not; None where they can."""
     if config.tile_size == "off":
         return "tile_size: off forbids to fuse it in tiles"
-    if config.statistics or config.events:
-        return "statistics and events keep every observation; without them it can be fused in tiles"
     other = [each.unit.backend for each in group if not restrictable(each.unit.backend)]
     return f"backend '{other[0]}' cannot be restricted to tiles" if other else None
 

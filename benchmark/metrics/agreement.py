@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,25 @@ def compare(
         differences=differences,
         agrees=same_voxels and same_values,
     )
+
+
+def together(parts: Sequence[Agreement]) -> Agreement:
+    """The agreement on a map, from that on each of its parts."""
+    shared = [part.voxels[0] - part.only_in[0] for part in parts]
+    return replace(
+        parts[0],
+        voxels=(sum(part.voxels[0] for part in parts), sum(part.voxels[1] for part in parts)),
+        only_in=(sum(part.only_in[0] for part in parts), sum(part.only_in[1] for part in parts)),
+        differences={
+            name: _together([part.differences[name] for part in parts], shared) for name in parts[0].differences
+        },
+        agrees=all(part.agrees for part in parts),
+    )
+
+
+def _together(parts: Sequence[Deviation], voxels: Sequence[int]) -> Deviation:
+    there = [(part, n) for part, n in zip(parts, voxels, strict=True) if n]
+    return _deviation([(part.max, part.mean * n) for part, n in there], sum(voxels))
 
 
 @dataclass(frozen=True, eq=False)

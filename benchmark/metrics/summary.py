@@ -88,7 +88,7 @@ class TableSums:
 
         def means(name: str, sums: Float64, group: int) -> Means:
             n = int(sums[0, group])
-            return Means(name, n / voxels if voxels else math.nan, n, _means(sums[:, group]))
+            return Means(name, n / voxels if voxels else math.nan, n, MeasureMeans.of_sums(sums[1:, group]))
 
         return TableSummary(
             K=K,
@@ -97,7 +97,7 @@ class TableSums:
             observations=observations,
             voxels=voxels,
             mean_op=observations / voxels if voxels else math.nan,
-            means=_means(self.stratum.sum(axis=1)),
+            means=MeasureMeans.of_sums(self.stratum.sum(axis=1)[1:]),
             strata=tuple(means(name, self.stratum, g) for g, (name, _, _) in enumerate(strata(edges))),
             recurrent=means(f"OP>={RECURRENT}", self.recurrence, 1),
             classes=tuple(means(name, self.kind, k) for k, name in enumerate(names)),
@@ -122,13 +122,6 @@ def _by_group(values: Sequence[Float64], op: Int32, group: npt.NDArray[np.int64]
         rows.append(np.bincount(group[known], weights=value[known], minlength=groups))
         rows += [np.bincount(group[where], minlength=groups) for where in (known, often)]
     return np.stack(rows).astype(np.float64)
-
-
-def _means(sums: Float64) -> MeasureMeans:
-    """The mean of every measure from its sums (1 + 3 M,)."""
-    of = dict(zip(measures(), sums[1:].reshape(-1, 3), strict=True))
-    value = {measure.key: float(total) / n if n else math.nan for measure, (total, n, _) in of.items()}
-    return MeasureMeans(value, {m.key: int(often) for m, (_, _, often) in of.items() if m.lowest_op > 1})
 
 
 def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:

@@ -16,11 +16,19 @@ Int64 = npt.NDArray[np.int64]
 CHUNK_VALUES = 1 << 18
 """Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
 
+STRETCH = 1 << 17
+"""So many voxels are looked at together, where sums over all of them are wanted."""
+
 
 def row_chunks(rows: int, K: int) -> Iterator[slice]:
     """Slices of consecutive rows whose dense evidence has at most `CHUNK_VALUES` values; one at least, if empty."""
     step = max(1, CHUNK_VALUES // max(K, 1))
     return (slice(first, min(first + step, rows)) for first in range(0, max(rows, 1), step))
+
+
+def stretches(rows: int) -> Iterator[slice]:
+    """Consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
+    return (slice(first, min(first + STRETCH, rows)) for first in range(0, max(rows, 1), STRETCH))
 
 
 @dataclass(frozen=True, eq=False)

@@ -243,6 +243,13 @@ class MeasureMeans:
         rare = {m.key: int(np.count_nonzero(where & (op >= m.lowest_op))) for m in values if m.lowest_op > 1}
         return cls({measure.key: mean(value[where]) for measure, value in values.items()}, rare)
 
+    @classmethod
+    def of_sums(cls, sums: Float64) -> MeasureMeans:
+        """From (3 M,): of every measure its sum, over how many voxels it is defined, and in how many OP is enough."""
+        of = dict(zip(measures(), sums.reshape(-1, 3), strict=True))
+        value = {measure.key: float(total) / n if n else math.nan for measure, (total, n, _) in of.items()}
+        return cls(value, {m.key: int(often) for m, (_, _, often) in of.items() if m.lowest_op > 1})
+
     def __getitem__(self, measure: Measure) -> float:
         return self.value[measure.key]
 

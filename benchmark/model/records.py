@@ -165,8 +165,8 @@ class Record:
 
     @property
     def events_file(self) -> Path | None:
-        """File of its log of observations, which is there where it was asked for and its backend keeps one."""
-        return self._beside(EVENTS)
+        """File, or folder of tiles, of its log, which is there where it was asked for and its backend keeps one."""
+        return self._beside(EVENTS, "" if self.in_tiles else ".parquet")
 
     @property
     def influence_file(self) -> Path | None:

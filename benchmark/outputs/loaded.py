@@ -46,7 +46,7 @@ class Run:
     def events(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Events:
         """The log of a unit's observations. Raises ConfigError where the run kept none."""
         file = self.result.record(scene=scene, backbone=backbone, backend=backend).events_file
-        if file is None or not file.is_file():
+        if file is None or not file.exists():
             raise ConfigError(f"{self.folder}: the run kept no log of observations; run it with --events")
         return Events.load(file)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,8 @@ LEVEL = 0.95
 REPLICATES = 2000
 ROUNDING = 1e-9
 TINY = 1e-12
+MOST_CELLS = LEAST_BLOCKS * 16**3
+"""Cells that tell which edge leaves so many blocks: finer ones than an eighth of it do not matter."""
 STEP = 1e-20
 """Of a sum, into the complex plane: its square is nothing beside 1."""
 
@@ -77,9 +79,35 @@ def spatial_blocks(
     return Blocks(of.astype(np.int64), len(blocks), edge * voxel_size)
 
 
-def _largest_edge(index: npt.NDArray[np.integer], least: int) -> int:
+@dataclass(frozen=True, eq=False)
+class Occupied:
+    """Where voxels are, as finely as the edge of blocks asks for: cells (c, 3) of `unit` voxels, a power of 2."""
+
+    cells: npt.NDArray[np.integer]
+    unit: int
+
+    @classmethod
+    def of(cls, index: npt.NDArray[np.integer]) -> Occupied:
+        """Those of voxels (n, 3)."""
+        return cls.merged([cls(index, 1)])
+
+    @classmethod
+    def merged(cls, parts: Sequence[Occupied]) -> Occupied:
+        """Those of a map from its parts."""
+        unit = max(part.unit for part in parts)
+        cells = np.concatenate([part.cells // (unit // part.unit) for part in parts])
+        while len(cells := _distinct(cells)) > MOST_CELLS:
+            cells, unit = cells // 2, 2 * unit
+        return cls(cells, unit)
+
+    def edge(self, least: int = LEAST_BLOCKS) -> int:
+        """That of `spatial_blocks`, in voxels."""
+        return _largest_edge(self.cells, least, self.unit)
+
+
+def _largest_edge(index: npt.NDArray[np.integer], least: int, unit: int = 1) -> int:
     """The edge, in voxels: first the power of 2, then what can be added to it."""
-    cells, unit, steps = _distinct(index), 1, 1  # blocks of `steps` cells, cells of `unit` voxels
+    cells, steps = _distinct(index), 1  # blocks of `steps` cells, cells of `unit` voxels
     while len(_distinct(cells // (2 * steps))) >= max(least, 2):
         if steps < 8:
             steps *= 2

@@ -15,11 +15,11 @@ from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
 from semstab.model.measures import MeasureMeans, Quantity, dominant, measures, vss
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability, RuleMeans
+from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE, ratio_of
 from semstab.statistics.order.fusion_rules import Fused
-from semstab.statistics.sampling.places import Places
+from semstab.statistics.sampling.places import Places, PlaceSums
 from semstab.statistics.steady import LIKELY, steady
 
 Float64 = npt.NDArray[np.float64]
@@ -105,57 +105,97 @@ def correctness(belief: Float64 | Evidence, label: npt.NDArray[np.int64], name: 
 
 
 def _correctness(judged: Judged, name: str = "all") -> Correctness:
-    n = len(judged.label)
+    return correctness_of(judged_sums(judged), name)
+
+
+def judged_sums(judged: Judged) -> Float64:
+    """(3 + 3 BINS + 3 K,) what all that is said of them is a function of.
+
+    Voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right, true and
+    predicted ones.
+    """
+    right, K = judged.right, judged.K
+    of = np.clip(np.ceil(judged.confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
+    bins = [np.bincount(of, weights=values, minlength=BINS) for values in (None, judged.confidence, right)]
+    kinds = [np.bincount(label, minlength=K) for label in (judged.label[right], judged.label, judged.predicted)]
+    total = np.array([len(right), np.count_nonzero(right), judged.error.sum()])
+    return np.concatenate([total, *bins, *kinds])
+
+
+def correctness_of(sums: Float64, name: str = "all") -> Correctness:
+    """What is said of voxels of these sums, see `judged_sums`."""
+    n, right, error = sums[:3]
     if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
-    ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in _bins(judged) if row.voxels) / n
-    return Correctness(name, n, float(judged.right.mean()), _miou(judged), float(ece), float(judged.error.mean()))
+    ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in reliability_of(sums) if row.voxels) / n
+    hit, true, predicted = sums[3 + 3 * BINS :].reshape(3, -1)
+    union = true + predicted - hit
+    miou = float((hit[union > 0] / union[union > 0]).mean())
+    return Correctness(name, int(n), float(right / n), miou, float(ece), float(error / n))
 
 
-def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
-    """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
-    values = {measure: measure.of(fused) for measure in measures()}
-    means = MeasureMeans.over(values, fused.op, where)
-    if truth is None:
-        return RuleMeans(means)
-    known = where & truth.known
-    right = _correctness(Judged.of(fused.evidence, truth.label).rows(known))
-    return RuleMeans(means, right.accuracy, right.miou, right.ece, right.brier)
-
-
-def _miou(judged: Judged) -> float:
-    """Mean intersection over union of the most likely classes with the true ones."""
-    K = judged.K
-    confusion = np.bincount(judged.label * K + judged.predicted, minlength=K * K).reshape(K, K)
-    union = confusion.sum(axis=0) + confusion.sum(axis=1) - confusion.diagonal()
-    present = union > 0
-    return float((confusion.diagonal()[present] / union[present]).mean()) if present.any() else math.nan
-
-
-def reliability(belief: Float64 | Evidence, label: npt.NDArray[np.int64]) -> tuple[Reliability, ...]:
-    """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    return _bins(Judged.of(belief, label))
-
-
-def _bins(judged: Judged) -> tuple[Reliability, ...]:
-    confidence, right = judged.confidence, judged.right
-    of = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
-    count = np.bincount(of, minlength=BINS)
+def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
+    """The bins of the reliability diagram of voxels of these sums, see `judged_sums`."""
+    count, confidence, right = sums[3 : 3 + 3 * BINS].reshape(3, BINS)
     with np.errstate(invalid="ignore"):
-        mean_confidence = np.bincount(of, weights=confidence, minlength=BINS) / count
-        accuracy = np.bincount(of, weights=right, minlength=BINS) / count
+        confidence, accuracy = confidence / count, right / count
     return tuple(
-        Reliability(b / BINS, (b + 1) / BINS, int(count[b]), float(mean_confidence[b]), float(accuracy[b]))
+        Reliability(b / BINS, (b + 1) / BINS, int(count[b]), float(confidence[b]), float(accuracy[b]))
         for b in range(BINS)
     )
 
 
+def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
+    """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
+    return rule_means_of(rule_sums(fused, where, truth))
+
+
+def rule_sums(fused: Fused, where: Mask, truth: Truth | None) -> Float64:
+    """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`."""
+    rows: list[float] = []
+    for measure in measures():
+        values = measure.of(fused)[where]
+        defined = values[~np.isnan(values)]
+        rows += [defined.sum(), len(defined), float(np.count_nonzero(where & (fused.op >= measure.lowest_op)))]
+    if truth is None:
+        return np.array(rows)
+    return np.concatenate([rows, judged_sums(Judged.of(fused.evidence, truth.label).rows(where & truth.known))])
+
+
+def rule_means_of(sums: Float64) -> RuleMeans:
+    """Means from `rule_sums`."""
+    n = 3 * len(measures())
+    means = MeasureMeans.of_sums(sums[:n])
+    if len(sums) == n:
+        return RuleMeans(means)
+    right = correctness_of(sums[n:])
+    return RuleMeans(means, right.accuracy, right.miou, right.ece, right.brier)
+
+
+def reliability(belief: Float64 | Evidence, label: npt.NDArray[np.int64]) -> tuple[Reliability, ...]:
+    """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
+    return reliability_of(judged_sums(Judged.of(belief, label)))
+
+
 def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[Correctness, ...]:
     """Correctness of all voxels with a true class, then of each stratum of OP."""
+    return strata_of(stratum_sums(table, truth, edges), edges)
+
+
+def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
+    """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
     judged = Judged.of(table.evidence, truth.label)
-    groups = [("all", 1, np.iinfo(np.int32).max), *strata(edges)]
-    rows = [(name, truth.known & (table.op >= low) & (table.op <= high)) for name, low, high in groups]
-    return tuple(_correctness(judged.rows(where), name) for name, where in rows)
+    groups = [truth.known & (table.op >= low) & (table.op <= high) for _, low, high in _groups(edges)]
+    return np.stack([judged_sums(judged.rows(where)) for where in groups])
+
+
+def strata_of(sums: Float64, edges: Sequence[int]) -> tuple[Correctness, ...]:
+    """What is said of them, from `stratum_sums`."""
+    return tuple(correctness_of(own, name) for own, (name, _, _) in zip(sums, _groups(edges), strict=True))
+
+
+def _groups(edges: Sequence[int]) -> list[tuple[str, int, int]]:
+    return [("all", 1, np.iinfo(np.int32).max), *strata(edges)]
 
 
 def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
@@ -164,31 +204,38 @@ def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float 
     A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
     places were seen. `places` are those of all of the table's voxels.
     """
+    return quadrants_of(quadrant_sums(table, truth, steady(table, stable=stable), places.edge))
+
+
+QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
+
+
+def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> PlaceSums:
+    """What `quadrants_of` is a function of, over cubes of that edge, by the probability (n,) that each is stable."""
     counted, likely, right = _masks(table, truth, stable)
-    if not counted.any():
+    every, places = counted.astype(np.float64), Places(table.index, table.voxel_size, edge)
+    parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
+    columns = {name: np.stack([part * every, every], axis=1) for name, part in zip(QUADRANTS, parts, strict=True)} | {
+        "wrong_of_stable": np.stack([~right * every * likely, every * likely], axis=1)
+    }
+    return PlaceSums(places.cell, edge, {name: places.sums(values) for name, values in columns.items()})
+
+
+def quadrants_of(sums: PlaceSums) -> Quadrants:
+    """The shares, from `quadrant_sums`."""
+    voxels = int(sums["stable_right"][1])
+    if not voxels:
         return Quadrants(0, *[UNKNOWN] * 5)
-
-    def share(part: Float64, of: Float64) -> Interval:
-        return places.estimate(np.stack([part * of, of], axis=1), ratio_of)
-
-    every = counted.astype(np.float64)
-    return Quadrants(
-        voxels=int(counted.sum()),
-        stable_right=share(likely * right, every),
-        stable_wrong=share(likely * ~right, every),
-        unstable_right=share((1 - likely) * right, every),
-        unstable_wrong=share((1 - likely) * ~right, every),
-        wrong_of_stable=share((~right).astype(np.float64), every * likely),
-    )
+    return Quadrants(voxels, *(sums.estimate(name, ratio_of) for name in (*QUADRANTS, "wrong_of_stable")))
 
 
-def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
-    """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
-    counted, likely, right = _masks(table, truth, stable)
+def stable_wrong(table: VoxelTable, truth: Truth, shares: Float64 | None = None, *, stable: float = STABLE) -> Mask:
+    """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong. For `shares` see `steady`."""
+    counted, likely, right = _masks(table, truth, steady(table, shares, stable=stable))
     return counted & (likely >= LIKELY) & ~right
 
 
-def _masks(table: VoxelTable, truth: Truth, stable: float) -> tuple[Mask, Float64, Mask]:
+def _masks(table: VoxelTable, truth: Truth, stable: Float64) -> tuple[Mask, Float64, Mask]:
     """(n,) which voxels count, with what probability each is stable (0 where none is known), and which are right."""
     counted = truth.known & (table.op >= RECURRENT)
-    return counted, np.nan_to_num(steady(table, stable=stable)), dominant(table) == truth.label
+    return counted, np.nan_to_num(stable), dominant(table) == truth.label

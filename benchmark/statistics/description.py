@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import require_same_map
-from semstab.metrics.summary import STRATA, TableSums
-from semstab.model.measures import dominant, mean
+from semstab.metrics.summary import STRATA
 from semstab.model.results import TableSummary
 from semstab.model.statistics import (
     BeyondCoin,
@@ -21,72 +20,33 @@ from semstab.model.statistics import (
     ClassAgreement,
     CorrectnessStatistics,
     DriftStatistics,
-    DriftTests,
     EntropyParts,
-    Flipping,
     FlipRates,
     FrameAgreement,
     Interval,
+    Losses,
     MapStatistics,
     Repeated,
-    RuleOutcome,
     StratumStatistics,
 )
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.agreement import (
-    alpha_of,
-    between_of,
-    class_agreement,
-    class_agreement_of,
-    kappa_of,
-    ratio_of,
-)
-from semstab.statistics.correctness import (
-    Truth,
-    by_stratum,
-    join_truth,
-    quadrants,
-    reliability,
-    rule_means,
-    stable_wrong,
-)
-from semstab.statistics.judging.ceiling import losses
-from semstab.statistics.judging.flipping import flipping
+from semstab.statistics.agreement import alpha_of, between_of, class_agreement_of, kappa_of, ratio_of
+from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
+from semstab.statistics.judging.ceiling import losses_of
 from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import Sample, correlogram, reach_from
-from semstab.statistics.map_sums import (
-    BY_STRATUM,
-    Maps,
-    MapSums,
-    maps_of,
-    mean_columns,
-    place_sums,
-    stratum_sums,
-)
-from semstab.statistics.order import fusion_rules
-from semstab.statistics.order.drift import (
-    TESTABLE,
-    VoxelDrift,
-    benjamini_hochberg,
-    expected_sbd,
-    flips,
-    trend_columns,
-    voxel_drift,
-)
-from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, judged_of, with_sample
-from semstab.statistics.scene_drift import scene_drift
-from semstab.statistics.steady import steady
+from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
+from semstab.statistics.order.drift import expected_sbd
+from semstab.statistics.sampling import InfluenceSums, PlaceSums, judged_of, with_sample
+from semstab.statistics.sums import SecondSums, Whole, first_look, second_look
 
 SCHEMA = 1
-FALSE_DISCOVERIES = 0.05
-"""Rate at which trending voxels are named."""
-
 Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What the statistics say of a map; `maps` have one value a voxel (n,), NaN where undefined.
+    """What the statistics say of a map.
 
     sums  by frame and cube of space, from which intervals and differences follow without voxels
     make  gives the maps, when they are asked for
@@ -98,7 +58,7 @@ class Analysis:
 
     @functools.cached_property
     def maps(self) -> Maps:
-        """One value a voxel (n,) by name."""
+        """One value a voxel (n,) by name, NaN where undefined."""
         return self.make()
 
 
@@ -146,89 +106,60 @@ def analyse(
     that cannot be computed is None.
     Raises DataError where events, truth or limit do not belong to the table.
     """
-    if events is None and truth is None and limit is None:
-        return _of_table(table, sample=sample, name=name, seed=seed, edges=edges, critical=critical)
     if events is not None:
         require_same_map(table, events)
-    again = table.op >= 2
-    drift = None if events is None else voxel_drift(table, events, seed=seed)
-    maps = maps_of(table, expected_sbd(table) if drift is None else drift.null)
-    places = Places(table.index[again], table.voxel_size)
-    means = _Means(place_sums(table, maps, places), places, again)
     known = None if truth is None else join_truth(table, truth)
-    agreement = _agreement(means, class_agreement(table, events))
-    by_log = None if drift is None or events is None else _by_log(table, events, drift, means, maps, seed)
-    right = None if known is None else _correctness(table, known, means, maps, edges)
-    sums = influence_sums(
-        table,
-        events,
-        None if known is None else known.label,
-        sample=None if sample is None else sample.shared(),
-        sbd_excess=maps["sbd_excess"],
-        edge=places.edge,
-    )
-    stable = steady(table)
-    about = _About(name, seed, critical, TableSums.of(table, edges).summary(table.voxel_size, table.classes, edges))
-    summary = _concluded(
-        about,
-        means,
-        sums,
-        sample,
-        agreement=agreement,
-        flipping=flipping(table, stable, places),
-        drift=_drift(means, by_log),
-        strata=_strata(about.table, stratum_sums(table, maps, edges)),
-        geometry=None if limit is None else losses(table, limit, seed=seed),
-        correctness=right,
-        fusion_rules=None if events is None else _fusion_rules(table, events, known),
-    )
-    maps["stable"] = stable
-    return Analysis(summary, sums, lambda: maps)
-
-
-def _of_table(table: VoxelTable, *, edges: Sequence[int], **settings: Any) -> Analysis:
-    """What `analyse` says of a map alone: no number of each voxel is kept."""
-    sums = MapSums.of(table, edges)
-    stable = steady(table)
-    unstable = flipping(table, stable, Places(table.index[table.op >= 2], table.voxel_size, sums.places.edge))
-    summary, influence = analyse_sums(
-        sums, voxel_size=table.voxel_size, classes=table.classes, edges=edges, flipping=unstable, **settings
+    first, further, null = first_look(table, events, known, limit, edges=edges, seed=seed)
+    whole = Whole(first, seed)
+    second, more = second_look(table, whole, known, limit)
+    summary, sums = concluded(
+        whole,
+        second,
+        voxel_size=table.voxel_size,
+        classes=table.classes,
+        sample=sample,
+        name=name,
+        edges=edges,
+        critical=critical,
     )
 
     def maps() -> Maps:
-        return {**maps_of(table, expected_sbd(table)), "stable": stable}
+        own = maps_of(table, expected_sbd(table) if null is None else null)
+        return {**own, **further, **more, **whole.maps(table, further)}
 
-    return Analysis(summary, influence, maps)
+    return Analysis(summary, sums, maps)
 
 
-def analyse_sums(
-    sums: MapSums,
+def concluded(
+    whole: Whole,
+    second: SecondSums,
     *,
     voxel_size: float,
     classes: tuple[str, ...] = (),
     sample: Sample | None = None,
     name: str = "",
-    seed: int = 0,
     edges: Sequence[int] = STRATA,
     critical: Sequence[str] = (),
-    flipping: Flipping | None = None,
 ) -> tuple[MapStatistics, InfluenceSums]:
-    """What `analyse` says of a map without log and ground truth, from its sums, which may be those of its parts.
-
-    flipping  of the map, where that is known
-    """
-    about = _About(name, seed, critical, sums.table.summary(voxel_size, classes, edges))
-    means = _Means(sums.places)
-    influence = sums.influence if sample is None else with_sample(sums.influence, sample.shared())
+    """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts."""
+    first, own = whole.first, whole.first.own
+    about = _About(name, whole.seed, critical, own.table.summary(voxel_size, classes, edges))
+    means = _Means(own.places)
+    influence = whole.influence
+    if sample is not None:
+        influence = with_sample(influence, sample.shared(), logged=first.log is not None)
     summary = _concluded(
         about,
         means,
         influence,
         sample,
-        agreement=_agreement(means, class_agreement_of(sums.classes, classes)),
-        flipping=flipping,
-        drift=_drift(means),
-        strata=_strata(about.table, sums.strata),
+        agreement=_agreement(means, class_agreement_of(own.classes, classes)),
+        flipping=second.flipping.flipping(classes),
+        drift=_drift(means, whole),
+        strata=_strata(about.table, own.strata),
+        geometry=_geometry(whole, second, voxel_size),
+        correctness=_correctness(whole, second, edges),
+        fusion_rules=None if first.log is None else first.log.rule_outcomes(),
     )
     return summary, influence
 
@@ -247,14 +178,10 @@ class _About:
 
 
 class _Means:
-    """Means over the voxels with OP >= 2, with their intervals for this map; more of them for a table at hand."""
+    """Means over the voxels with OP >= 2, with their intervals for this map."""
 
-    def __init__(
-        self, sums: PlaceSums, places: Places | None = None, again: npt.NDArray[np.bool_] | None = None
-    ) -> None:
+    def __init__(self, sums: PlaceSums) -> None:
         self.sums = sums
-        self.places = places
-        self.again = again
 
     def mean(self, name: str, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
         """Of values by name, where they are defined."""
@@ -263,18 +190,6 @@ class _Means:
     def agreement(self, name: str, statistic: Callable[[Float64], Float64]) -> Interval:
         """Agreement beyond chance."""
         return self.sums.estimate(name, statistic, (-1.0, 1.0), "agreement")
-
-    def of(self, values: Float64, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
-        """The mean of values (n,) of the table's voxels, where they are defined."""
-        return self.function(mean_columns(values), ratio_of, bounds)
-
-    def function(
-        self, columns: Float64, statistic: Callable[[Float64], Float64], bounds: tuple[float, float] = (0.0, 1.0)
-    ) -> Interval:
-        """Of a statistic of the sums of columns (n, C) of the table's voxels."""
-        assert self.places is not None
-        assert self.again is not None
-        return self.places.estimate(columns[self.again], statistic, bounds)
 
 
 def _concluded(
@@ -293,7 +208,7 @@ def _concluded(
         about.name or "backbone",
         judged=judged,
         reach=reach,
-        flips=sections.get("flipping"),
+        flips=sections["flipping"],
         voxels=repeated.voxels,
         share=repeated.share,
         blocks=count,
@@ -314,7 +229,7 @@ def _concluded(
         correlogram=None if sample is None else correlogram(sample),
         uncertainty=EntropyParts(means.mean("entropy"), means.mean("entropy_within"), means.mean("entropy_between")),
         beyond_coin=BeyondCoin(means.sums.estimate("coin", _less, (-1.0, 1.0)), means.mean("steadier", (-1.0, 1.0))),
-        **({"flipping": None, "geometry": None, "correctness": None, "fusion_rules": None} | sections),
+        **sections,
     )
 
 
@@ -332,92 +247,44 @@ def _agreement(means: _Means, classes: tuple[ClassAgreement, ...]) -> FrameAgree
     )
 
 
-def _drift(means: _Means, by_log: tuple[DriftTests, FlipRates] | None = None) -> DriftStatistics:
+def _drift(means: _Means, whole: Whole) -> DriftStatistics:
     """Against its null; without a log only for one-hot evidence, and without tests."""
-    tests, changes = by_log or (None, None)
+    log = whole.first.log
     return DriftStatistics(
         voxels=int(means.sums["null"][1]),
         sbd=means.mean("sbd"),
         null=means.mean("null"),
         excess=means.mean("excess", (-1.0, 1.0)),
-        tests=tests,
-        flips=changes,
+        tests=None if log is None else whole.drift_tests(),
+        flips=None if log is None else _flips(_Means(log.places)),
     )
 
 
-def _by_log(
-    table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, maps: Maps, seed: int
-) -> tuple[DriftTests, FlipRates]:
-    return _tests(table, events, drift, means, maps, seed), _flips(events, means, maps)
-
-
-def _tests(table: VoxelTable, events: Events, drift: VoxelDrift, means: _Means, maps: Maps, seed: int) -> DriftTests:
-    tested = table.op >= TESTABLE
-    maps |= {
-        "drift_p": drift.p_value,
-        "drift_q": benjamini_hochberg(np.where(tested, drift.p_value, np.nan)),
-        "trend": drift.trend,
-        "trend_p": drift.trend_p,
-        "trend_q": benjamini_hochberg(np.where(tested, drift.trend_p, np.nan)),
-    }
-    scene = scene_drift(table, events, drift, seed=seed)
-    one_way, by_chance, all_of_it = trend_columns(table, drift).T
-    excess = np.stack([one_way - by_chance, all_of_it], axis=1)
-    return DriftTests(
-        sbd_p=scene.p_value,
-        trend=scene.trend,
-        trend_null=scene.trend_null,
-        trend_excess=means.function(excess, ratio_of, (-1.0, 1.0)),
-        trend_p=scene.trend_p,
-        stretches=scene.stretches,
-        voxels=scene.voxels,
-        tested_voxels=int(np.count_nonzero(~np.isnan(maps["trend_q"]))),
-        unusual_sbd_voxels=_discoveries(maps["drift_q"]),
-        trending_voxels=_discoveries(maps["trend_q"]),
-    )
-
-
-def _flips(events: Events, means: _Means, maps: Maps) -> FlipRates:
-    changes = flips(events)
-    maps |= {"flip_rate": changes.rate, "frames_since_flip": changes.since}
+def _flips(means: _Means) -> FlipRates:
     return FlipRates(
-        rate=means.of(changes.rate),
-        null=means.of(changes.null),
-        excess=means.of(changes.rate - changes.null, (-1.0, 1.0)),
-        frames_since=means.of(changes.since, (0.0, math.inf)),
+        rate=means.mean("flip_rate"),
+        null=means.mean("flip_null"),
+        excess=means.mean("flip_excess", (-1.0, 1.0)),
+        frames_since=means.mean("frames_since", (0.0, math.inf)),
     )
 
 
-def _discoveries(q: Float64) -> int:
-    with np.errstate(invalid="ignore"):
-        return int(np.count_nonzero(q <= FALSE_DISCOVERIES))
+def _geometry(whole: Whole, second: SecondSums, voxel_size: float) -> Losses | None:
+    if second.losses is None or whole.loss_edge is None:
+        return None
+    return losses_of([second.losses], whole.loss_edge * voxel_size, seed=whole.seed)
 
 
-def _correctness(
-    table: VoxelTable, truth: Truth, means: _Means, maps: Maps, edges: Sequence[int]
-) -> CorrectnessStatistics:
-    maps |= {"true_label": truth.label, "stable_wrong": stable_wrong(table, truth)}
-    right = np.where(truth.known, dominant(table) == truth.label, np.nan)
-    counted = truth.known & (table.op >= 2)
-    everywhere = Places(table.index, table.voxel_size, means.sums.edge)
+def _correctness(whole: Whole, second: SecondSums, edges: Sequence[int]) -> CorrectnessStatistics | None:
+    truth = whole.first.truth
+    if truth is None or second.quadrants is None:
+        return None
     return CorrectnessStatistics(
-        accuracy=means.of(right),
-        strata=by_stratum(table, truth, edges),
-        reliability=reliability(table.evidence.take(counted), truth.label[counted]),
-        quadrants=quadrants(table, truth, everywhere),
+        accuracy=truth.right.estimate("right", ratio_of),
+        strata=strata_of(truth.strata, edges),
+        reliability=reliability_of(truth.reliability),
+        quadrants=quadrants_of(second.quadrants),
     )
-
-
-def _fusion_rules(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
-    """Means over the voxels with OP >= 2 under each rule."""
-    again = table.op >= 2
-    usual = fusion_rules.labels(table.evidence)
-    rows = []
-    for rule in fusion_rules.RULES:
-        fused = fusion_rules.fuse(events, rule)
-        relabelled = fusion_rules.labels(fused.evidence) != usual
-        rows.append(RuleOutcome(rule, rule_means(fused, again, truth), mean(relabelled[again])))
-    return tuple(rows)
 
 
 def _less(sums: Float64) -> Float64:

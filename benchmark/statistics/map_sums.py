@@ -5,18 +5,19 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.summary import STRATA, TableSums
+from semstab.model.evidence import stretches
 from semstab.model.measures import sbd, vss
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
 from semstab.statistics.order.drift import expected_sbd
-from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged, stretches
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]
@@ -44,14 +45,33 @@ class MapSums:
     influence: InfluenceSums
 
     @classmethod
-    def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> MapSums:
-        """Those of a table, some voxels after the others."""
-        parts = (cls._of_few(table.rows(some), edges) for some in stretches(len(table)))
-        return functools.reduce(lambda one, other: cls.merged([one, other]), parts)
+    def of(
+        cls,
+        table: VoxelTable,
+        edges: Sequence[int] = STRATA,
+        *,
+        events: Events | None = None,
+        true_label: npt.NDArray[np.int64] | None = None,
+        null: Float64 | None = None,
+    ) -> MapSums:
+        """Those of a table, some voxels after the others.
+
+        events      its log, with which null (n,) comes, the SBD of its voxels in random order
+        true_label  (n,) the true classes; how likely places are stable only the whole map tells: `StableLooks`
+        """
+        parts = (
+            cls._of_few(table.rows(some), None if null is None else null[some], edges) for some in stretches(len(table))
+        )
+        found = functools.reduce(lambda one, other: cls.merged([one, other]), parts)
+        if events is None and true_label is None:
+            return found
+        excess = sbd(table) - (expected_sbd(table) if null is None else null)
+        by_frame = influence_sums(table, events, true_label, sbd_excess=excess, edge=found.places.edge, likely=None)
+        return replace(found, classes=class_sums(table, events), influence=by_frame)
 
     @classmethod
-    def _of_few(cls, table: VoxelTable, edges: Sequence[int]) -> MapSums:
-        maps = maps_of(table, null=expected_sbd(table))
+    def _of_few(cls, table: VoxelTable, null: Float64 | None, edges: Sequence[int]) -> MapSums:
+        maps = maps_of(table, null=expected_sbd(table) if null is None else null)
         places = Places(table.index[table.op >= 2], table.voxel_size)
         return cls(
             TableSums.of(table, edges),
@@ -83,6 +103,7 @@ class MapSums:
             "strata": self.strata,
             "classes": self.classes,
             "about": np.array([self.places.edge, self.influence.edge, self.influence.step, self.influence.voxel_size]),
+            "truth": np.array(self.influence.truth),
         }
 
     @classmethod
@@ -97,7 +118,7 @@ class MapSums:
             PlaceSums(arrays["place cells"], edge, places),
             arrays["strata"],
             arrays["classes"],
-            InfluenceSums(cell, frame, columns, cube, int(step), voxel_size, K, classes),
+            InfluenceSums(cell, frame, columns, cube, int(step), voxel_size, K, classes, bool(arrays["truth"])),
         )
 
 

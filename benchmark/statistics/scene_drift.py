@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.order.drift import VoxelDrift, drift_tables, streams, trend_columns, variation, varying
+from semstab.statistics.order.drift import VoxelDrift, drawn, drift_tables, streams, trend_columns, varying
 from semstab.statistics.sampling.reach import arrangement
 
 Float64 = npt.NDArray[np.float64]
@@ -54,6 +54,16 @@ class SceneDrift:
     voxels: int
 
 
+@dataclass(frozen=True)
+class OrderTest:
+    """What of `SceneDrift` follows from a sample of the voxels."""
+
+    p_value: float
+    trend_p: float
+    stretches: int
+    voxels: int
+
+
 def scene_drift(
     table: VoxelTable, events: Events, drift: VoxelDrift, *, seed: int = 0, frame_orders: int = ORDERS
 ) -> SceneDrift:
@@ -62,22 +72,52 @@ def scene_drift(
     What neighbouring voxels have in common in a frame stays in common, and so does what frames of one stretch have.
     `drift` is what `voxel_drift` says of the same map.
     """
-    sampled = _sampled(table, events, seed)
-    tested, drifted, trended = sampled.orders(events, table.K, seed, frame_orders)
-    known = len(tested) > 0
-    total_drift, total_trend = _total(sbd(table)[tested]), _total((drift.trend * variation(table))[tested])
-    p_value = min(1.0, 2 * min(_tail(-drifted, -total_drift), _tail(drifted, total_drift)))
-    trend = trend_columns(table, drift).sum(axis=0)
+    test = order_test(*sampled(table, events, seed), seed=seed, frame_orders=frame_orders)
+    one_way, by_chance, all_of_it = trend_columns(table, drift).sum(axis=0)
     return SceneDrift(
         sbd=mean(sbd(table)),
         null=mean(drift.null),
-        p_value=p_value if known else math.nan,
-        trend=trend[0] / trend[2] if trend[2] else math.nan,
-        trend_null=trend[1] / trend[2] if trend[2] else math.nan,
-        trend_p=_tail(trended, total_trend) if known and total_trend > 0 else math.nan,
-        stretches=sampled.stretches,
-        voxels=len(tested),
+        p_value=test.p_value,
+        trend=one_way / all_of_it if all_of_it else math.nan,
+        trend_null=by_chance / all_of_it if all_of_it else math.nan,
+        trend_p=test.trend_p,
+        stretches=test.stretches,
+        voxels=test.voxels,
     )
+
+
+def sampled(table: VoxelTable, events: Events, seed: int = 0) -> tuple[VoxelTable, Events]:
+    """The voxels of a map from which it is told whether it drifts, with their observations: see `drawn`."""
+    rows = drawn(table, events, SAMPLE, seed)
+    return table.rows(rows), events.rows(rows)
+
+
+def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders: int = ORDERS) -> OrderTest:
+    """Put the stretches of time of what was `sampled`, of a map or of its parts, into random orders."""
+    of = _sampled(table, events, seed)
+    tested, drifted, trended = of.orders(events, table.K, seed, frame_orders)
+    known = len(tested) > 0
+    total_drift, total_trend = _total(sbd(table)[tested]), _total(_trends(table, events)[tested])
+    p_value = min(1.0, 2 * min(_tail(-drifted, -total_drift), _tail(drifted, total_drift)))
+    return OrderTest(
+        p_value if known else math.nan,
+        _tail(trended, total_trend) if known and total_trend > 0 else math.nan,
+        of.stretches,
+        len(tested),
+    )
+
+
+def _trends(table: VoxelTable, events: Events) -> Float64:
+    """(n,) how much of a voxel's disagreement goes one way in time; NaN where fewer than three frames saw it."""
+    T = table.op.astype(np.float64)
+    age = np.arange(len(events)) - events.starts[events.voxel] - 0.5 * (T[events.voxel] - 1)
+    evidence = events.evidence
+    of = np.repeat(np.arange(len(events)), np.diff(evidence.starts))
+    key, entry = np.unique(events.voxel[of] * table.K + evidence.label, return_inverse=True)
+    moment = np.bincount(entry, weights=age[of] * evidence.weight, minlength=len(key))
+    squares = np.bincount(key // table.K, weights=moment**2, minlength=len(table))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(T > 2, squares / (T * (T * T - 1) / 12), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +160,8 @@ class _Sampled:
 def _sampled(table: VoxelTable, events: Events, seed: int) -> _Sampled:
     """So many voxels that they have about SAMPLE observations, with the stretches that frames are cut into."""
     vary, first, T = varying(table, events)
-    drawn = np.argsort(streams(table.rows(vary).index, seed))
-    chosen = np.sort(drawn[: np.searchsorted(np.cumsum(T[drawn]), SAMPLE) + 1])
+    order = np.argsort(streams(table.rows(vary).index, seed))
+    chosen = np.sort(order[: np.searchsorted(np.cumsum(T[order]), SAMPLE) + 1])
     voxel, first, T = np.flatnonzero(vary)[chosen], first[chosen], T[chosen]
     of = np.repeat(np.arange(len(T)), T)
     rows = np.arange(len(of)) + (first - np.cumsum(T) + T)[of]

@@ -7,15 +7,19 @@ often than those that thirty saw. So a place borrows from what all places of its
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.model.evidence import stretches
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
 LIKELY = 0.5
 """A place is called stable from this probability on."""
@@ -29,33 +33,87 @@ def stable_share(agreement: float = STABLE) -> float:
     return (1 + math.sqrt(2 * agreement - 1)) / 2
 
 
-def steady(table: VoxelTable, *, stable: float = STABLE) -> Float64:
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """How many places of a map have which votes, of those with OP >= 2: what is the same for all parts adds up.
+
+    seen   (v,) frames that saw a place, most (v,) how many of them are for its dominant class; sorted
+    count  (v,) places
+    """
+
+    seen: Int64
+    most: Int64
+    count: Int64
+
+    @classmethod
+    def of(cls, table: VoxelTable) -> Votes:
+        """Those of a table."""
+        return cls.merged([_votes(table.rows(some))[0] for some in stretches(len(table))])
+
+    @classmethod
+    def merged(cls, parts: Sequence[Votes]) -> Votes:
+        """Those of a map from its parts."""
+        seen, most, count = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("seen", "most", "count")
+        )
+        (seen, most), of = np.unique(np.stack([seen, most]), axis=1, return_inverse=True)
+        total = np.bincount(of.ravel(), weights=count, minlength=len(seen)).astype(np.int64)
+        return cls(seen, most, total)
+
+    def shares(self) -> Float64:
+        """(STEPS,) how many of all places have which share of the dominant class."""
+        likelihood, share = _likelihood(self.seen, self.most), np.full(STEPS, 1 / STEPS)
+        if not len(self.seen):
+            return share
+        for _ in range(ROUNDS):
+            posterior = likelihood * share
+            posterior /= posterior.sum(axis=1, keepdims=True)
+            share = self.count @ posterior / self.count.sum()
+        return share
+
+    def stable(self, shares: Float64, *, stable: float = STABLE) -> Float64:
+        """(v,) the probability that a place with these votes is stable, in a map of these shares."""
+        posterior = _likelihood(self.seen, self.most) * shares
+        posterior /= posterior.sum(axis=1, keepdims=True)
+        likely: Float64 = posterior[:, stable_share(stable) <= STEPS_OF_P].sum(axis=1)
+        return likely
+
+
+STEPS_OF_P = 0.5 + 0.5 * (np.arange(STEPS) + 0.5) / STEPS
+
+
+def _likelihood(seen: Int64, most: Int64) -> Float64:
+    """(v, STEPS) of votes given each share, up to a factor of each row."""
+    from scipy.special import xlog1py, xlogy
+
+    m, t, p = most[:, None], seen[:, None], STEPS_OF_P
+    own, folded = xlogy(m, p) + xlog1py(t - m, -p), xlogy(t - m, p) + xlog1py(m, -p)
+    found: Float64 = np.logaddexp(own, folded)
+    likelihood: Float64 = np.exp(found - found.max(axis=1, keepdims=True))
+    return likelihood
+
+
+def _votes(table: VoxelTable) -> tuple[Votes, Int64]:
+    """Those of a table, and which each of its places with OP >= 2 has."""
+    again = table.op >= 2
+    T = table.op[again].astype(np.int64)
+    longest = int(T.max(initial=0)) + 1
+    votes = np.rint(vss(table)[again] * T).astype(np.int64)
+    pairs, of, count = np.unique(votes + T * longest, return_inverse=True, return_counts=True)
+    return Votes(pairs // longest, pairs % longest, count.astype(np.int64)), of.astype(np.int64)
+
+
+def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:
     """(n,) the probability that a place is stable, given its frames and what all places are like; NaN where OP < 2.
 
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
     share is p. How many places have which p is estimated from all of them without any form of its distribution (Kiefer
     and Wolfowitz 1956, Annals of Mathematical Statistics 27; by the EM algorithm), then Bayes' theorem is applied.
+    `shares` are those of all places, where the table has but some of them.
     """
-    from scipy.special import xlog1py, xlogy
-
-    again = table.op >= 2
-    T = table.op[again].astype(np.int64)
+    shares = Votes.of(table).shares() if shares is None else shares
     found = np.full(len(table), np.nan)
-    if not len(T):
-        return found
-    votes = np.rint(vss(table)[again] * T).astype(np.int64)
-    pairs, of, count = np.unique(votes + T * (T.max() + 1), return_inverse=True, return_counts=True)
-    seen, most = np.divmod(pairs, T.max() + 1)
-    p = 0.5 + 0.5 * (np.arange(STEPS) + 0.5) / STEPS
-    m, t = most[:, None], seen[:, None]
-    own, folded = xlogy(m, p) + xlog1py(t - m, -p), xlogy(t - m, p) + xlog1py(m, -p)
-    likelihood = np.exp(np.logaddexp(own, folded) - np.logaddexp(own, folded).max(axis=1, keepdims=True))
-    share = np.full(STEPS, 1 / STEPS)
-    for _ in range(ROUNDS):
-        posterior = likelihood * share
-        posterior /= posterior.sum(axis=1, keepdims=True)
-        share = count @ posterior / count.sum()
-    posterior = likelihood * share
-    posterior /= posterior.sum(axis=1, keepdims=True)
-    found[again] = posterior[:, p >= stable_share(stable)].sum(axis=1)[of]
+    for some in stretches(len(table)):
+        votes, of = _votes(table.rows(some))
+        found[some][table.op[some] >= 2] = votes.stable(shares, stable=stable)[of]
     return found

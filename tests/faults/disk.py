@@ -1,10 +1,12 @@
-"""Fill the disk at each write of runs, studies, predictions and conversions: at every page that they take.
+"""Fill the disk while runs, maps in tiles, studies, predictions and conversions are made: page by page, file by file.
 
-    python tests/faults/disk.py [STEP [KIND]]            make faults: every page, of 4 kB
+    python tests/faults/disk.py [COUNT [KIND]]           make faults: 24
 
-Each gets a file system in memory of one page more than the one before (every STEP-th), until all of it fits. It has to
-end in one line and exit code 2, and with a larger disk, started again, to keep what was finished and to leave what one
-without a full disk leaves. Mounting takes a name space of one's own (`unshare`), where the system lets users have it.
+Each kind gets COUNT file systems in memory from one page (4 kB) to all that it takes, and as many that have room for so
+many files, from one to all that it makes, at even steps; every page and every file where COUNT is larger. It has to
+end in one line and exit code 2, or to come to its end, and with a larger disk, started again, to keep what was finished
+(units, parts of maps in tiles) and to leave what one without a full disk leaves. Mounting takes a name space of one's
+own (`unshare`), where the system lets users have it. 24 take about 250 pairs of starts.
 """
 
 from __future__ import annotations
@@ -15,22 +17,27 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import kills
 
+from semstab.engine.tiling.portion import PORTIONS, Finished
+
 PAGE = 4096
 MARK = "SEMSTAB_OWN_MOUNTS"
-ENOUGH = 2**28
+ENOUGH = "size=1073741824,nr_inodes=100000"
+
+Left = Callable[[Path], Any]
 
 
 @contextmanager
-def disk(path: Path, size: int) -> Iterator[Path]:
-    """A file system of so many bytes."""
+def disk(path: Path, limit: str) -> Iterator[Path]:
+    """A file system with so much room: size=BYTES or nr_inodes=FILES."""
     path.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(path)], check=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", limit, "none", str(path)], check=True)
     try:
         yield path
     finally:
@@ -38,31 +45,51 @@ def disk(path: Path, size: int) -> Iterator[Path]:
 
 
 def enlarge(path: Path) -> None:
-    subprocess.run(["mount", "-o", f"remount,size={ENOUGH}", str(path)], check=True)
+    subprocess.run(["mount", "-o", f"remount,{ENOUGH}", str(path)], check=True)
 
 
-def taken(path: Path) -> int:
-    """Bytes of a file system that are in use."""
+def limits(path: Path, count: int) -> Iterator[str]:
+    """So many sizes, and so many numbers of files, up to what a file system holds."""
     found = os.statvfs(path)
-    return (found.f_blocks - found.f_bfree) * found.f_frsize
+    pages = (found.f_blocks - found.f_bfree) * found.f_frsize // PAGE
+    for name, most, unit in (("size", pages, PAGE), ("nr_inodes", found.f_files - found.f_ffree, 1)):
+        for number in sorted({1 + round(k * most / count) for k in range(count)}):
+            yield f"{name}={number * unit}"
 
 
-def finished_units(out: Path) -> dict[str, int]:
-    """What is kept of a run or study, by the time at which it was written."""
-    return {path.name: path.stat().st_mtime_ns for path in out.glob("units/*.json")}
+def finished(out: Path) -> dict[Path, int]:
+    """What is finished of a run or study, by the time at which it was written: units, and the files of parts."""
+    portions = [Finished.load(path) for path in out.glob(f"{PORTIONS}/*/*.npz")]
+    files = [out / name for portion in portions if portion is not None for name in portion.about.files]
+    return {path: path.stat().st_mtime_ns for path in (*out.glob("units/*.json"), *files)}
 
 
 def problem(code: int, said: str) -> str | None:
     """What is wrong with an end on a full disk; None where it is one line that names a file."""
     lines = [line for line in said.splitlines() if line.strip()]
-    if code != 2:
+    if code not in (0, 2):
         return f"exit code {code}: {said[-1000:]}"
-    if len(lines) != 1 or not re.match(r"(error|warning): ", lines[0]) or len(lines[0]) > 410:
+    if code == 2 and (len(lines) != 1 or not re.match(r"(error|warning): ", lines[0]) or len(lines[0]) > 410):
         return f"not one line: {said[-1000:]}"
+    if code == 0 and not all(re.match(r"warning: ", line) for line in lines):
+        return f"no warning: {said[-1000:]}"
     return None
 
 
-def main(step: int, wanted: str) -> int:
+def fault_of(words: kills.Words, left: Left, expected: Any, out: Path, log: Path) -> tuple[int, str | None]:
+    """Start it on a disk that is too small, and again on a larger one: the first exit code, and what went wrong."""
+    _, status = os.waitpid(kills.in_a_child(words, log), 0)
+    code = os.waitstatus_to_exitcode(status)
+    fault = problem(code, log.read_text(errors="replace"))
+    kept = finished(out)
+    enlarge(out.parent)
+    kills.finished(words, log)
+    if any(not path.exists() or path.stat().st_mtime_ns != when for path, when in kept.items()):
+        fault = f"of {len(kept)} finished files not all were kept"
+    return code, "differs, started again" if left(out) != expected else fault
+
+
+def main(count: int, wanted: str) -> int:
     told, wrong = collections.Counter[str](), []
     with tempfile.TemporaryDirectory() as temporary:
         base = Path(temporary)
@@ -71,26 +98,14 @@ def main(step: int, wanted: str) -> int:
                 continue
             with disk(base / "disk", ENOUGH) as whole:
                 kills.finished(words(whole / "out"), base / "log")
-                expected, size = left(whole / "out"), taken(whole)
-            for limit in range(PAGE, 2 * size, step * PAGE):
+                expected, tried = left(whole / "out"), list(limits(whole, count))
+            for limit in tried:
                 with disk(base / "disk", limit) as small:
-                    _, status = os.waitpid(kills.in_a_child(words(small / "out"), base / "log"), 0)
-                    code = os.waitstatus_to_exitcode(status)
-                    fault = problem(code, (base / "log").read_text(errors="replace")) if code else None
-                    kept = finished_units(small / "out")
-                    enlarge(small)
-                    kills.finished(words(small / "out"), base / "log")
-                    again = finished_units(small / "out")
-                    if any(again.get(name) != when for name, when in kept.items()):
-                        fault = f"{len(kept)} finished units, not all of them kept"
-                    if left(small / "out") != expected:
-                        fault = "differs, started again"
-                told[f"{kind}, {'ended' if code == 0 else 'full'}"] += 1
+                    code, fault = fault_of(words(small / "out"), left, expected, small / "out", base / "log")
+                told[f"{kind}, {limit.split('=')[0]}, {'full' if code else 'ended'}"] += 1
                 if fault:
-                    wrong.append(f"{kind}, {limit // 1024} kB: {fault}")
+                    wrong.append(f"{kind}, {limit}: {fault}")
                     print(wrong[-1], flush=True)
-                if code == 0:
-                    break
     for what, times in sorted(told.items()):
         print(f"{times:4} {what}")
     print(
@@ -104,4 +119,4 @@ if __name__ == "__main__":
         os.execvpe(
             "unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {MARK: "1", "RUST_LOG": "off"}
         )  # as `settle` has it
-    sys.exit(main(int((sys.argv[1:] or ["1"])[0]), (sys.argv[2:] or [""])[0]))
+    sys.exit(main(int((sys.argv[1:] or ["24"])[0]), (sys.argv[2:] or [""])[0]))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 
+import kills
 import pytest
 import tiny_scene
 from posed_config import configure
+from typer.testing import CliRunner
 
 import semstab
+from semstab.cli import app
 from semstab.convert import convert
 from semstab.errors import ConfigError
 from semstab.outputs.recording import Recording
@@ -86,3 +89,23 @@ def test_a_folder_of_a_conversion_or_of_predictions_belongs_to_one_process(root,
         list(convert(config, out))
     held.release()
     list(convert(config, out))
+
+
+@pytest.mark.parametrize(
+    ("kind", "owned"),
+    [("run", ""), ("tiles", ""), ("study", ""), ("predict", "labels/colour-clusters"), ("convert", "wall")],
+)
+def test_a_second_start_is_refused_in_one_line(started, tmp_path, kind, owned) -> None:
+    words, _ = started[kind]
+    held = FolderLock(tmp_path / "out" / owned)
+    done = CliRunner().invoke(app, words(tmp_path / "out"))
+    held.release()
+    assert done.exit_code == 2
+    (line,) = done.stderr.splitlines()
+    assert "another process works on it; wait for it, or choose another folder" in line
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory):
+    """The commands that `make faults` kills."""
+    return kills.kinds(tmp_path_factory.mktemp("started"))

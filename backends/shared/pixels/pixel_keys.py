@@ -62,7 +62,9 @@ def keys_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, t
         b = d * (ray_b[u] + b0) + tb
         c = d * (ray_c[u] + c0) + tc
         whole_a, whole_b, whole_c = np.floor(a), np.floor(b), np.floor(c)
-        doubt |= (abs(a - whole_a - 0.5) > inner) | (abs(b - whole_b - 0.5) > inner) | (abs(c - whole_c - 0.5) > inner)
+        doubt |= ok & (
+            (abs(a - whole_a - 0.5) > inner) | (abs(b - whole_b - 0.5) > inner) | (abs(c - whole_c - 0.5) > inner)
+        )
         i, j, k = np.int64(np.int32(whole_a)), np.int64(np.int32(whole_b)), np.int64(np.int32(whole_c))
         outside |= i | j | k
         out[u] = ((i << 42) | (j << 21) | k) if ok else -1
@@ -105,11 +107,11 @@ def columns_of(within, origin):
     return np.clip(edges, 0, 2 * HALF).astype(np.int64)
 
 
-def frame_terms(ray_x: Floats, T: Float64, size: float) -> tuple[Float64, float]:
+def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int = HALF) -> tuple[Float64, float]:
     """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of `keys_fused`.
 
     The margin bounds what rounding can move a point by, voxels. Of a point within reach no term is above
-    2^23 + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
+    8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
     """
     rays = T[:3, :1] * ray_x / size
-    return rays, 2.0**-49 * (8.0 * HALF + float(np.abs(T[:3, 3]).max()) / size)
+    return rays, 2.0**-49 * (8.0 * reach + float(np.abs(T[:3, 3]).max()) / size)

@@ -8,66 +8,89 @@ order in which they are made does not show.
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numba as nb
 import numpy as np
 
+from semstab.backends.shared.bits import bits_of
 from semstab.backends.shared.hashing import PARTITIONS, partition_of
 from semstab.backends.shared.pixels.keys import HALF
-from semstab.backends.shared.pixels.pixel_keys import BLOCK, exact_keys_of_row
+from semstab.backends.shared.pixels.pixel_keys import exact_keys_of_row
+from semstab.backends.shared.pixels.run_vectors import LANES, runs_of_eight
+from semstab.backends.shared.prefetch import touch
 from semstab.runtime.compiled import compiled, parallel, serial
 
 NEAR = 1 << 15
-"""Words reach that many voxels to either side of the camera."""
+REACH = 2 * NEAR
+"""Words reach `NEAR` voxels to either side of the camera."""
 
-ROWS, COLUMNS = 16, 128
+FRACTION = 36
+"""Bits of a coordinate's fraction in a number from `REACH` to twice that."""
+
+FROM = 0x40F0 << 48
+"""The bits of `REACH` as a number."""
+
+ROWS, COLUMNS = 32, 128
 """Pixels of a tile."""
 
 TABLE_BITS = 11
+DIGIT_BITS = 10
+
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
 
 
 @compiled(fastmath={"contract"})
-def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, out):
-    """The words of pixels; and any doubt, see `keys_fused`."""
-    inner = 0.5 - margin
+def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, face, out):
+    """The words of pixels; and any doubt, see `keys_fused`.
+
+    Coordinates are counted from -2^16, half the width of a face included (`face_terms`): the bits of such a number are
+    those of 2^16, with the coordinate and a binary fraction in their places, where it is within reach.
+    """
     doubt = outside = 0
     for u in range(depth.shape[0]):
         d = np.float64(depth[u])
         ok = (d > 0.0) & (d < np.inf) & (labels[u] != ignore)
         d = d if ok else 0.0
-        a = d * (ray_a[u] + a0) + ta
-        b = d * (ray_b[u] + b0) + tb
-        c = d * (ray_c[u] + c0) + tc
-        whole_a, whole_b, whole_c = np.floor(a), np.floor(b), np.floor(c)
-        doubt |= (abs(a - whole_a - 0.5) > inner) | (abs(b - whole_b - 0.5) > inner) | (abs(c - whole_c - 0.5) > inner)
-        i, j, k = np.int64(np.int32(whole_a)), np.int64(np.int32(whole_b)), np.int64(np.int32(whole_c))
-        outside |= i | j | k
-        out[u] = ((i << 48) | (j << 32) | (k << 16) | np.int64(labels[u])) if ok else -1
-    return doubt | (outside >> 16)
+        a: Any = bits_of(d * (ray_a[u] + a0) + ta)
+        b: Any = bits_of(d * (ray_b[u] + b0) + tb)
+        c: Any = bits_of(d * (ray_c[u] + c0) + tc)
+        doubt |= ok & (((a & face) == 0) | ((b & face) == 0) | ((c & face) == 0))
+        outside |= (a ^ FROM) | (b ^ FROM) | (c ^ FROM)
+        i, j, k = (a << 12) & (-1 << 48), (b >> 4) & (0xFFFF << 32), (c >> 20) & (0xFFFF << 16)
+        out[u] = (i | j | k | np.int64(labels[u])) if ok else -1
+    return doubt | ((outside >> 52) != 0)
+
+
+def face_terms(margin: float) -> tuple[float, int]:
+    """Half the width of a voxel's face, in whose bounds a pixel is in doubt, and which bits of a fraction are 0 there.
+
+    The margin is that of rounding (`frame_terms`); two more roundings are to 2^-36, and the width is a power of two.
+    """
+    width = min(FRACTION, math.ceil(math.log2(margin * 2.0**FRACTION + 2)))
+    return 2.0 ** (width - FRACTION), (1 << FRACTION) - (2 << width) if width < FRACTION - 1 else 0
 
 
 @serial
-def _words_of_row(depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, rays, margin, keys, out):
-    """The words of a row; returns whether a pixel is out of their reach, or out of that of the packed keys."""
-    a0 = (T[0, 1] * ray_y + T[0, 2]) / size
-    b0 = (T[1, 1] * ray_y + T[1, 2]) / size
-    c0 = (T[2, 1] * ray_y + T[2, 2]) / size
-    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
-    ta = T[0, 3] / size - ox + (HALF - corner[0])
-    tb = T[1, 3] / size - oy + (HALF - corner[1])
-    tc = T[2, 3] / size - oz + (HALF - corner[2])
+def _words_of_stretch(
+    depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, ray_a, ray_b, ray_c, down, start, face, keys, out
+):  # fmt: skip
+    """The words of a stretch of a row; returns whether a pixel is out of their reach, or out of that of packed keys.
+
+    ray_a, ray_b, ray_c (n,), down (3,), start (3,)  a pixel's coordinates are depth (ray + down) + start
+    """
     lost = 0
-    for first in range(0, depth.shape[0], BLOCK):
-        to = min(first + BLOCK, depth.shape[0])
-        d, lab, words = depth[first:to], labels[first:to], out[first:to]
-        ray_a, ray_b, ray_c = rays[0, first:to], rays[1, first:to], rays[2, first:to]
-        if _words_fused(d, lab, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, words):
-            lost |= exact_keys_of_row(d, lab, ray_x[first:to], ray_y, T, size, ox, oy, oz, ignore, keys)
-            for u in range(to - first):
-                i, j, k = _from_corner(keys[u], corner)
-                lost |= (keys[u] >= 0) & (((i | j | k) >> 16) != 0)
-                words[u] = ((i << 48) | (j << 32) | (k << 16) | np.int64(lab[u])) if keys[u] >= 0 else -1
+    if _words_fused(
+        depth, labels, ignore, ray_a, ray_b, ray_c, down[0], down[1], down[2], start[0], start[1], start[2], face, out
+    ):
+        ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+        lost = exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, keys)
+        for u in range(depth.shape[0]):
+            i, j, k = _from_corner(keys[u], corner)
+            lost |= (keys[u] >= 0) & (((i | j | k) >> 16) != 0)
+            out[u] = ((i << 48) | (j << 32) | (k << 16) | np.int64(labels[u])) if keys[u] >= 0 else -1
     return lost
 
 
@@ -97,36 +120,22 @@ def _key_of(a, b, c, corner):
 
 
 @serial
-def _runs_of_row(word, changes, run_word, run_end):
-    """Runs of equal words: the word of each and where it ends. Two loops without branches; the first is vectorised."""
-    last = word.shape[0] - 1
-    for u in range(last):
-        changes[u] = word[u] != word[u + 1]
-    changes[last] = 1
-    n = 0
-    for u in range(last + 1):
-        run_word[n] = word[u]
-        run_end[n] = u + 1
-        n += changes[u]
-
-
-@serial
-def _enter_tile(run_word, run_end, run, begin, rows, stop, table, table_count, word, count, n):
-    """Runs that begin before column `stop` into the table; what gives way is an entry. Returns how many there are."""
-    for v in range(rows):
-        i, u = run[v], begin[v]
-        while u < stop:
-            w, end = run_word[v, i], run_end[v, i]
-            at = np.int64((np.uint64(w) * GOLDEN) >> SHIFT)
-            there, so_far = table[at], table_count[at]
-            word[n], count[n] = there, so_far
-            same = there == w
-            n += not same
-            table[at] = w
-            table_count[at] = (so_far if same else 0) + (end - u)
-            u = end
-            i += 1
-        run[v], begin[v] = i, u
+def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
+    """The runs of a stretch of words into the table; what gives way is an entry. Returns how many there are."""
+    runs = 0
+    for u in range(0, word.shape[0] - LANES, LANES):
+        runs = runs_of_eight(word, u, run_word, run_end, runs)
+    begin = 0
+    for i in range(runs):
+        w, end = run_word[i], run_end[i]
+        at = np.int64((np.uint64(w) * GOLDEN) >> SHIFT)
+        there, so_far = table[at], table_count[at]
+        entry[n], count[n] = there, so_far
+        same = there == w
+        n += not same
+        table[at] = w
+        table_count[at] = (so_far if same else 0) + (end - begin)
+        begin = end
     return n
 
 
@@ -141,8 +150,8 @@ def _flush(table, table_count, word, count, n):
 
 @parallel
 def find_words(
-    depth, labels, ray_x, ray_y, T, size, origin, corner, columns, rays, margin, ignore, room, row_word, row_keys,
-    row_changes, run_word, run_end, run, tables, table_counts, word, count, partition, entries, lost, spread, low, high,
+    depth, labels, ray_x, ray_y, T, size, origin, corner, columns, rays, down, begin, face, ignore, room, stretches,
+    tables, table_counts, word, count, partition, entries, lost, spread, low, high,
 ):  # fmt: skip
     """Entries of each band of ROWS rows: words with counts, some of them twice; their extent and spread by partition.
 
@@ -153,29 +162,34 @@ def find_words(
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
         table, table_count = tables[thread], table_counts[thread]
-        of_run, begin = run[thread, 0], run[thread, 1]
-        rows = min(H, (band + 1) * ROWS) - band * ROWS
-        for v in range(rows):
-            y = band * ROWS + v
-            lost[band] |= _words_of_row(
-                depth[y], labels[y], ray_x, ray_y[y], T, size, origin, corner, ignore, rays, margin, row_keys[thread],
-                row_word[thread],
-            )  # fmt: skip
-            if columns.shape[0]:
-                _keep_columns(row_word[thread], columns, corner)
-            _runs_of_row(row_word[thread], row_changes[thread], run_word[thread, v], run_end[thread, v])
-            of_run[v] = begin[v] = 0
+        words, keys, run_word, run_end = (
+            stretches[thread, 0],
+            stretches[thread, 1],
+            stretches[thread, 2],
+            stretches[thread, 3],
+        )
         own_word = word[band * room : (band + 1) * room]
         own_count = count[band * room : (band + 1) * room]
         n = np.int64(0)
-        for stop in range(COLUMNS, W + COLUMNS, COLUMNS):
-            if n + (COLUMNS + 1) * ROWS + table.shape[0] > room:
+        for first in range(0, W, COLUMNS):
+            to = min(first + COLUMNS, W)
+            if n + COLUMNS * ROWS + table.shape[0] > room:
                 n = np.int64(-1)
                 break
-            n = _enter_tile(
-                run_word[thread], run_end[thread], of_run, begin, rows, min(stop, W), table, table_count,
-                own_word, own_count, n,
-            )  # fmt: skip
+            own = words[: -(-(to - first) // LANES) * LANES + 1]
+            for y in range(band * ROWS, min(H, (band + 1) * ROWS)):
+                for u in range(to, min(W, to + COLUMNS), 16):
+                    touch(depth[y], u)
+                touch(labels[y], min(W - 1, to))
+                touch(labels[y], min(W - 1, to + 64))
+                own[to - first :] = -1
+                lost[band] |= _words_of_stretch(
+                    depth[y, first:to], labels[y, first:to], ray_x[first:to], ray_y[y], T, size, origin, corner,
+                    ignore, rays[0, first:to], rays[1, first:to], rays[2, first:to], down[y], begin, face, keys, own,
+                )  # fmt: skip
+                if columns.shape[0]:
+                    _keep_columns(own, columns, corner)
+                n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
         if n < 0:
             table[:] = -1
             entries[band] = -1
@@ -225,21 +239,24 @@ def scatter_words(word, count, partition, room, entries, offset, low, shift, out
 
 @serial
 def _sort(word, count, word2, count2, bits, histogram):
-    """Sort by the lowest `bits` bits, 8 at a time; returns whether the result is in the second pair of arrays."""
+    """Sort by the lowest `bits` bits, as many at a time as the histogram has room for; whether into the second pair."""
     flipped = False
-    for shift in range(0, bits, 8):
+    passes = -(-bits // DIGIT_BITS)
+    width = -(-bits // passes)
+    digits = 1 << width
+    for shift in range(0, bits, width):
         if flipped:
             source, source_count, target, target_count = word2, count2, word, count
         else:
             source, source_count, target, target_count = word, count, word2, count2
-        histogram[:] = 0
+        histogram[:digits] = 0
         for i in range(source.shape[0]):
-            histogram[(source[i] >> shift) & 255] += 1
+            histogram[(source[i] >> shift) & (digits - 1)] += 1
         total = 0
-        for digit in range(256):
+        for digit in range(digits):
             total, histogram[digit] = total + histogram[digit], total
         for i in range(source.shape[0]):
-            digit = (source[i] >> shift) & 255
+            digit = (source[i] >> shift) & (digits - 1)
             at = histogram[digit]
             histogram[digit] = at + 1
             target[at], target_count[at] = source[i], source_count[i]
@@ -253,7 +270,12 @@ def merge_words(word, count, word2, count2, edges, bits, label_bits, flipped, vo
     for p in nb.prange(PARTITIONS):
         low, high = edges[p], edges[p + 1]
         flipped[p] = _sort(
-            word[low:high], count[low:high], word2[low:high], count2[low:high], bits, np.empty(256, np.int64)
+            word[low:high],
+            count[low:high],
+            word2[low:high],
+            count2[low:high],
+            bits,
+            np.empty(1 << DIGIT_BITS, np.int32),
         )
         w, c = (word2[low:high], count2[low:high]) if flipped[p] else (word[low:high], count[low:high])
         n = v = 0

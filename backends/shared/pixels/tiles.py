@@ -11,13 +11,16 @@ import numpy.typing as npt
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.observed import Observed, WorkSpace
 from semstab.backends.shared.pixels.keys import HALF
-from semstab.backends.shared.pixels.pixel_keys import BLOCK, columns_of, frame_terms
+from semstab.backends.shared.pixels.pixel_keys import columns_of, frame_terms
+from semstab.backends.shared.pixels.run_vectors import LANES
 from semstab.backends.shared.pixels.tile_loops import (
     COLUMNS,
     NEAR,
+    REACH,
     ROWS,
     TABLE_BITS,
     emit_voxels,
+    face_terms,
     find_words,
     merge_words,
     scatter_words,
@@ -28,7 +31,7 @@ from semstab.model.voxels.extent import Extent
 
 Int64 = npt.NDArray[np.int64]
 
-FIRST_ROOM = 1 << 14
+FIRST_ROOM = 1 << 15
 """Entries that a band has room for at first: more than a quarter of its pixels in an image of 3840x2160."""
 
 TABLE = 1 << TABLE_BITS
@@ -67,10 +70,14 @@ class Tiles:
         space, (H, W), camera = self._space, frame.shape, frame.intrinsics
         ray_x = (np.arange(W) - camera.cx) / camera.fx
         ray_y = (np.arange(H) - camera.cy) / camera.fy
-        rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
         corner = np.floor(frame.T_wc[:3, 3] / self.voxel_size).astype(np.int64) - origin + (HALF - NEAR)
         if corner.min() < 0 or corner.max() > 2 * (HALF - NEAR):
             return None
+        rays = space.room("rays", 3, W, dtype=np.float64)
+        rays[:], margin = frame_terms(ray_x, frame.T_wc, self.voxel_size, REACH)
+        down = (frame.T_wc[:3, 1] * ray_y[:, None] + frame.T_wc[:3, 2]) / self.voxel_size
+        half, face = face_terms(margin)
+        begin = frame.T_wc[:3, 3] / self.voxel_size - origin + (REACH + half + HALF - corner)
         bands, threads = -(-H // ROWS), nb.get_num_threads()
         tables = space.room("table", threads, TABLE)
         tables[:] = -1
@@ -83,12 +90,9 @@ class Tiles:
             low, high = np.zeros((bands, 4), dtype=np.int64), np.full((bands, 4), -1)
             find_words(
                 fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-                corner, columns_of(self.within, origin), rays, margin, frame.ignore_id, room,
-                space.room("row_word", threads, W), space.room("row_keys", threads, BLOCK),
-                space.room("row_changes", threads, W, dtype=np.uint8),
-                space.room("run_word", threads, ROWS, W + 1),
-                space.room("run_end", threads, ROWS, W + 1, dtype=np.int32),
-                space.room("run", threads, 2, ROWS), tables, space.room("table_count", threads, TABLE, dtype=np.int32),
+                corner, columns_of(self.within, origin), rays, down, begin, face, frame.ignore_id, room,
+                space.room("stretches", threads, 4, COLUMNS + 2 * LANES), tables,
+                space.room("table_count", threads, TABLE, dtype=np.int32),
                 word, count, partition, entries, lost, spread, low, high,
             )  # fmt: skip
             if lost.any() or high[:, 3].max() >= self.num_classes:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
-
+from semstab.backends.shared.bits import bits_of, number_of
 from semstab.runtime.compiled import serial
 
 MANTISSA_BITS = 52
@@ -15,18 +12,6 @@ ROOT_HALF = 0x3FE6A09E667F3BCD
 """The bits of 1 / sqrt(2)."""
 
 TWO_OVER_LN2 = 2.8853900817779268
-
-
-@intrinsic
-def bits_of(_typing: Any, _value: Any) -> Any:
-    """The bits of a double, as int64; those of numbers from 0 on sort like the numbers."""
-    return types.int64(types.float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))
-
-
-@intrinsic
-def number_of(_typing: Any, _bits: Any) -> Any:
-    """The double of these bits."""
-    return types.float64(types.int64), lambda _, builder, __, given: builder.bitcast(given[0], ir.DoubleType())
 
 
 @serial

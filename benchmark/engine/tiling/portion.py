@@ -24,6 +24,9 @@ from semstab.runtime.json_form import from_json, to_json
 PORTIONS = "parts"
 """Folder of what is finished of units in tiles, unit by unit, until they are whole."""
 
+TRUE_LOOKS = ".truth.parquet"
+"""What the file of looks at the ground truth ends in."""
+
 PART, STRETCH, SIZES = "part", "stretch", "sizes"
 """Kinds of portions; the last one tells how the map hangs on the voxel size."""
 
@@ -70,6 +73,16 @@ class Portion:
         """Of what was sampled of a stretch, in the folder, until the unit is whole."""
         return f"{PORTIONS}/{self.key}/{self.name}.parquet"
 
+    @property
+    def true_looks_file(self) -> str:
+        """The same of its ground truth."""
+        return f"{PORTIONS}/{self.key}/{self.name}{TRUE_LOOKS}"
+
+    @property
+    def folder(self) -> str:
+        """Of what is left of the unit until it is whole, in that of the run."""
+        return f"{PORTIONS}/{self.key}"
+
 
 @dataclass(frozen=True)
 class About:
@@ -93,7 +106,7 @@ class Finished:
     """What is left of a portion.
 
     series   (F, C) a row a frame: REPORT, then ROW
-    sums     over the voxels, by name: those of `TableSums`, or of `MapSums` where its map is judged
+    sums     over the voxels, by name: those of `TableSums`, or of `FirstSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     poses    (F, 4, 4) of the frames, where it is of these
     image    (F, C) what each of them tells in image coordinates, see `ImageSpaceMeter`

@@ -20,10 +20,10 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
-from semstab.engine.tiling.portion import PORTIONS, About, Finished, Portion, series_array
+from semstab.engine.tiling.portion import About, Finished, Portion, series_array
 from semstab.engine.work.image_space import COLUMNS
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
-from semstab.engine.work.stream import Stream, UnitMap
+from semstab.engine.work.stream import NoMap, Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import compare, macro_mean, summarise
@@ -43,13 +43,16 @@ from semstab.model.results import (
     slug,
 )
 from semstab.model.statistics import MapStatistics
-from semstab.model.voxels import VoxelTable
-from semstab.model.voxels.parquet import Tile
+from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.parquet import Tile, names_in
 from semstab.runtime.files import atomic_path, write_text
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
-from semstab.statistics.map_sums import MapSums
+from semstab.statistics.correctness import join_truth
+from semstab.statistics.map_sums import maps_of
+from semstab.statistics.order.drift import expected_sbd
+from semstab.statistics.sums import first_look
 from semstab.task import Task, read
 
 WORST = 3
@@ -63,9 +66,13 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     """Measure a finished map and write its files. Raises DataError where no pixel was valid."""
     task, config, unit = one.task, one.request.config, one.task.units[0]
     kept = one.request.kept
-    with watch("measure"):
+    with watch("table"):
         table = _table(one.backend, task)
         _require_voxels(task, config, table)
+        if not (config.statistics or config.events):
+            one.backend = NoMap()  # what comes next has its memory
+    with watch("voxel sizes"):
+        sizes = () if one.sizes is None else one.sizes.alphas()
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_fused(unit, table))
@@ -74,7 +81,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         events = one.backend.events() if config.statistics else None
         found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
     with watch("measure"):
-        summary = _summary(one, table, found)
+        summary = _summary(one, table, found, sizes)
     with watch("write"):
         saved, returned = written(job, _savers(stream, one, table, truth, found))
     with watch("reference"):
@@ -98,7 +105,7 @@ def _quality(stream: Stream) -> FrameQuality | None:
     return stream.judge.result(made.model, made.filters, made.milliseconds)
 
 
-def _table(backend: FusionBackend, task: Task) -> VoxelTable:
+def _table(backend: FusionBackend | NoMap, task: Task) -> VoxelTable:
     return dataclasses.replace(backend.table(), classes=task.mapping.target.classes)
 
 
@@ -134,14 +141,14 @@ def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
     return dataclasses.replace(compare(drawn, found, units, tolerance=one.request.config.tolerance), one_in=ONE_IN)
 
 
-def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None) -> UnitSummary:
+def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None, sizes: tuple[SizeAlpha, ...]) -> UnitSummary:
     return unit_summary(
         one.task,
         one.rows,
         summarise(table, one.request.config.strata),
         None if found is None else found.summary,
         None if one.hard is None else reduced_of(reduced_sums(one.hard.table())),
-        () if one.sizes is None else one.sizes.alphas(),
+        sizes,
     )
 
 
@@ -198,54 +205,101 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     """Write what is left of a portion of a unit in tiles: of the map its voxels, tile by tile, and sums."""
     portion = one.request.portion
     assert portion is not None
-    with watch("measure"):
+    with watch("table"):
         table = _table(one.backend, one.task) if one.request.fuses else None
-        sums = {} if table is None else _sums_of(table, one.request.config.strata, judged=portion.judged)
+    with watch("statistics"):
+        found = None if table is None else _looked_at(one, table, judged=portion.judged)
     with watch("reference"):
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
     with watch("write"):
-        saved, returned = written(job, _portion_savers(stream, one, portion, table))
+        saved, returned = written(job, _portion_savers(stream, one, portion, found))
         rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
         finished = Finished(
             About(portion.kind, saved, checked, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
             series_array(one.rows),
-            sums,
+            {} if found is None else found.sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
             np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),
             np.array(rows).reshape(-1, len(COLUMNS)),
         )
-        _, left = written(job, {f"{PORTIONS}/{portion.key}/{portion.name}.npz": finished.save})
+        _, left = written(job, {f"{portion.folder}/{portion.name}.npz": finished.save})
     return Outcome(one.request.identity, portion=portion.name, files=returned | left)
 
 
-def _sums_of(table: VoxelTable, edges: Sequence[int], *, judged: bool) -> dict[str, npt.NDArray[Any]]:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Part:
+    """The voxels of a part, its sums, and what statistics know of each voxel; its log, and the truth, where wanted."""
+
+    table: VoxelTable
+    sums: Mapping[str, npt.NDArray[Any]]
+    maps: Mapping[str, npt.NDArray[Any]] = dataclasses.field(default_factory=dict)
+    events: Events | None = None
+    truth: VoxelTable | None = None
+
+
+def _looked_at(one: UnitMap, table: VoxelTable, *, judged: bool) -> _Part:
+    config = one.request.config
+    log = one.backend.events() if config.statistics or config.events else None
+    events = None if log is None else dataclasses.replace(log, classes=table.classes)
+    one.backend = NoMap()  # what comes next has its memory
     if not judged:
-        return TableSums.of(table, edges).arrays()
-    return MapSums.of(table, edges).arrays()
+        return _Part(table, TableSums.of(table, config.strata).arrays(), events=events)
+    if not config.statistics:
+        return _Part(table, first_look(table, edges=config.strata)[0].arrays(), events=events)
+    truth = None if one.truth is None else _table(one.truth, one.task)
+    known = None if truth is None else join_truth(table, truth)
+    sums, further, null = first_look(table, events, known, truth, edges=config.strata)
+    return _Part(
+        table, sums.arrays(), further | maps_of(table, expected_sbd(table) if null is None else null), events, truth
+    )
 
 
-def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, table: VoxelTable | None) -> Savers:
-    unit = one.task.units[0]
+def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part | None) -> Savers:
+    """Where the whole map has still to be waited for, voxels are written so that they are looked at again."""
+    unit, config = one.task.units[0], one.request.config
     savers: Savers = {}
     if stream.overview:
         savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_arrays, stream.overview)
-    if one.sampler is not None:
-        savers[portion.looks_file] = one.sampler.looks(one.task.mapping.target.classes).save
-    if table is not None and portion.part is not None and portion.kept:
-        for tile, rows in tiles_of(table, portion.part.size, portion.key):
-            savers[f"{VOXELS}/{unit.slug}/{tile.name}"] = partial(save_voxels, rows, tile=tile)
+    for sampler, file in ((one.sampler, portion.looks_file), (one.truth_sampler, portion.true_looks_file)):
+        if sampler is not None:
+            savers[file] = sampler.looks(one.task.mapping.target.classes).save
+    if found is None or portion.part is None:
+        return savers
+    again = portion.judged and (config.statistics or not portion.kept)
+    voxels = f"{portion.folder}/voxels" if again else f"{VOXELS}/{unit.slug}"
+    for tile, rows in tiles_of(found.table, portion.part.size, portion.key):
+        if portion.kept or again:
+            savers[f"{voxels}/{tile.name}"] = partial(_save_tile, found, rows, tile)
+        if found.events is not None and config.events and portion.kept:
+            savers[f"{EVENTS}/{unit.slug}/{tile.name}"] = partial(_save_events, found.events, rows, tile)
+    if found.truth is not None:
+        for tile, rows in tiles_of(found.truth, portion.part.size, portion.key):
+            savers[f"{portion.folder}/truth/{tile.name}"] = partial(_save_truth, found.truth, rows, tile)
     return savers
 
 
-def tiles_of(table: VoxelTable, size: int, key: str) -> Iterator[tuple[Tile, VoxelTable]]:
-    """The voxels of a table by tile of that edge, of the map of that key."""
+def _save_tile(found: _Part, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+    columns = {name: values[voxels] for name, values in found.maps.items()}
+    save_voxels(found.table.rows(voxels), path, columns, tile)
+
+
+def _save_truth(truth: VoxelTable, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+    truth.rows(voxels).save(path, tile=tile)
+
+
+def _save_events(events: Events, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+    events.rows(voxels).save(path, tile)
+
+
+def tiles_of(table: VoxelTable, size: int, key: str) -> Iterator[tuple[Tile, npt.NDArray[np.int64]]]:
+    """The rows of a table by tile of that edge, of the map of that key."""
     shift = size.bit_length() - 1
-    place = np.stack([table.ix >> shift, table.iy >> shift], axis=1)
-    tiles, of = np.unique(place, axis=0, return_inverse=True)
-    order = np.argsort(of.ravel(), kind="stable")
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(of.ravel(), minlength=len(tiles)))])
-    for (x, y), first, last in zip(tiles.tolist(), bounds, bounds[1:], strict=False):
-        yield Tile(x, y, size, key), table.rows(order[first:last])
+    place = (table.ix >> shift).astype(np.int64) << 32
+    place += table.iy >> shift
+    order = np.argsort(place, kind="stable")
+    first = np.flatnonzero(np.diff(place[order], prepend=-(2**63)))
+    for rows in np.split(order, first[1:]):
+        yield Tile(int(table.ix[rows[0]]) >> shift, int(table.iy[rows[0]]) >> shift, size, key), rows
 
 
 def _savers(
@@ -297,6 +351,12 @@ def save_voxels(
     """Write a voxel table together with its measures, and further columns (n,) by name."""
     own = {measure.key: measure.of for measure in measures()}
     table.save(path, columns, {**own, "label": dominant}, tile)
+
+
+def further_columns(path: Path) -> list[str]:
+    """The columns of a file that `save_voxels` wrote that neither belong to the table nor are computed from it."""
+    own = {field.name for field in dataclasses.fields(VoxelTable)} | {measure.key for measure in measures()} | {"label"}
+    return [name for name in names_in(path) if name not in own]
 
 
 def _save_text(text: str, path: Path) -> None:

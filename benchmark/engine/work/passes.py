@@ -139,8 +139,9 @@ class Pass:
         with self._failing([request]):
             (task,) = tasks_of(self._scene, request.config)
             task = dataclasses.replace(task, left_out=request.left_out)
-            truth = _truth_map(request.config, task) if request.config.statistics else None
-            sampler, of_truth = (_sampler(request, task) if wanted else None for wanted in (request.judged, truth))
+            truth = _truth_map(request, task) if request.config.statistics else None
+            sampler = _sampler(request, task) if request.judged else None
+            of_truth = None if sampler is None or truth is None else _sampler(request, task)
             fused = _new_map(request.config, task, request.within) if request.fuses else NoMap()
             made = UnitMap(request, task, fused, truth, sampler, of_truth)
             if request.sampled:
@@ -284,9 +285,11 @@ def _new_map(config: Config, task: Task, within: Extent | None = None) -> Fusion
     return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=within, **options)
 
 
-def _truth_map(config: Config, task: Task) -> FusionBackend | None:
+def _truth_map(request: Request, task: Task) -> FusionBackend | NoMap | None:
     """An empty map for the ground truth, where there is any; its history is not wanted."""
-    return _map_without_log(config, task) if truth_task(task) else None
+    if truth_task(task) is None or not (request.fuses or request.judged):
+        return None
+    return _map_without_log(request.config, task, request.within) if request.fuses else NoMap()
 
 
 def _map_without_log(config: Config, task: Task, within: Extent | None = None) -> FusionBackend:

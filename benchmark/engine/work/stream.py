@@ -58,7 +58,7 @@ class UnitMap:
     request: Request
     task: Task
     backend: FusionBackend
-    truth: FusionBackend | None = None
+    truth: FusionBackend | NoMap | None = None
     sampler: Sampler | None = None
     truth_sampler: Sampler | None = None
     reference: NumpySample | None = None

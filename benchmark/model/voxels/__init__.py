@@ -245,23 +245,35 @@ class Events:
 
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
+        parts = [log._columns() for log in self._few_at_a_time()]
+        columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in _SUMS}
+        evidence = Evidence.joined([part["evidence"] for part in parts])
+        index = {name: getattr(self, name) for name in _INDEX_TYPES}
+        return VoxelTable(**index, **columns, evidence=evidence, voxel_size=self.voxel_size, classes=self.classes)
+
+    def _columns(self) -> dict[str, Any]:
         starts, s_bar = self.starts, self.evidence[:]
-        op = np.diff(np.append(starts, len(self)))
-        return VoxelTable(
-            self.ix,
-            self.iy,
-            self.iz,
-            op=op.astype(np.int32),
-            evidence=Evidence.of(_sum_by_voxel(s_bar, starts)),
-            drift_sum=_sum_by_voxel(self.drift(), starts),
-            pixels=_sum_by_voxel(self.pixels, starts),
-            first_frame=np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
-            last_frame=np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
-            self_sum=_sum_by_voxel((s_bar**2).sum(axis=1), starts),
-            frame_entropy_sum=_sum_by_voxel(entropy_bits(s_bar), starts),
-            voxel_size=self.voxel_size,
-            classes=self.classes,
-        )
+        return {
+            "op": np.diff(np.append(starts, len(self))).astype(np.int32),
+            "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
+            "drift_sum": _sum_by_voxel(self.drift(), starts),
+            "pixels": _sum_by_voxel(self.pixels, starts),
+            "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
+            "last_frame": np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
+            "self_sum": _sum_by_voxel((s_bar**2).sum(axis=1), starts),
+            "frame_entropy_sum": _sum_by_voxel(entropy_bits(s_bar), starts),
+        }
+
+    def _few_at_a_time(self) -> Iterator[Events]:
+        """The logs of voxels one after the other, of as many as have little evidence when it is dense."""
+        edges = np.array([some.start for some in self.evidence.chunks()])
+        cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
+        bounds = np.append(self.starts, len(self)).tolist()
+        for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
+            own, of = slice(bounds[first], bounds[last]), slice(first, last)
+            columns: dict[str, Any] = {name: getattr(self, name)[of] for name in _INDEX_TYPES}
+            columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
+            yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
 
     def beliefs(self) -> Float64:
         """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
@@ -304,7 +316,17 @@ class Events:
             classes=self.classes,
         )
 
-    def save(self, path: str | Path) -> None:
+    def rows(self, voxels: Int64) -> Events:
+        """The log of these of its voxels (r,), ascending."""
+        chosen = np.zeros(len(self.ix), np.bool_)
+        chosen[voxels] = True
+        rows = np.flatnonzero(chosen[self.voxel])
+        own: dict[str, Any] = {name: getattr(self, name)[chosen] for name in _INDEX_TYPES}
+        own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
+        number = np.cumsum(chosen) - 1
+        return replace(self, **own, voxel=number[self.voxel[rows]], evidence=self.evidence.take(rows))
+
+    def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
 
         def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
@@ -312,11 +334,42 @@ class Events:
             return own | {name: getattr(self, name)[self.voxel[some]] for name in _INDEX_TYPES}
 
         parts = map(columns, self.evidence.chunks())
-        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes)
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Events]) -> Events:
+        """One log of the voxels of several that share none."""
+        if len(parts) == 1:
+            return parts[0]
+        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _INDEX_TYPES}
+        order = _sorted(index)
+        count = np.concatenate([np.diff(np.append(part.starts, len(part))) for part in parts])
+        first = np.cumsum(count) - count
+        number = np.repeat(np.arange(len(order)), count[order])
+        rows = np.arange(len(number)) + (first[order] - np.cumsum(count[order]) + count[order])[number]
+        return cls(
+            **{name: values[order] for name, values in index.items()},
+            voxel=number,
+            frame=np.concatenate([part.frame for part in parts])[rows],
+            evidence=Evidence.joined([part.evidence for part in parts]).take(rows),
+            pixels=np.concatenate([part.pixels for part in parts])[rows],
+            voxel_size=parts[0].voxel_size,
+            classes=parts[0].classes,
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Events:
-        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        """Read what `save` wrote, a file or a folder of tiles, all of it.
+
+        Raises DataError where a file is missing, damaged or of another kind, or a log in tiles is larger than memory.
+        """
+        files = parquet.files_of(path)
+        if len(files) > 1:
+            _require_memory(Path(path), files)
+        return cls.joined([cls._read(file) for file in files])
+
+    @classmethod
+    def _read(cls, path: Path) -> Events:
         with parquet.reading(path):
             content = parquet.read(path, _EVENT_TYPES | _INDEX_TYPES)
             first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
@@ -328,6 +381,7 @@ _VOXEL_TYPES: Types = _INDEX_TYPES | {
     "op": np.int32, "evidence": np.float64, "drift_sum": np.float64, "pixels": np.int64, "first_frame": np.int32,
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
+_SUMS = [name for name in _VOXEL_TYPES if name not in (*_INDEX_TYPES, "evidence")]
 _EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
 
 

@@ -90,6 +90,21 @@ def files_of(path: str | Path) -> list[Path]:
     return files
 
 
+def tile_of(path: Path) -> Tile:
+    """Which tile a file is. Raises DataError where it is none."""
+    about = _about(path)
+    with reading(path):
+        x, y = about["tile"]
+        return Tile(x, y, about["tile_size"], about["map"])
+
+
+def voxel_size_of(path: Path) -> float:
+    """The edge of a table's voxels, metres."""
+    about = _about(path)
+    with reading(path):
+        return float(about["voxel_size"])
+
+
 def _about(path: Path) -> dict[str, Any]:
     import pyarrow.parquet as pq
 

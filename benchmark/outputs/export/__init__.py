@@ -13,7 +13,7 @@ from semstab.errors import ConfigError
 from semstab.outputs.export import las, mesh, ply, raster, tabular
 from semstab.outputs.export.onto import MEASURES as ONTO_MEASURES
 from semstab.outputs.export.onto import classify
-from semstab.outputs.export.voxels import Voxels, crs_name, iter_voxels, voxels_of
+from semstab.outputs.export.voxels import Chosen, Voxels, crs_name
 from semstab.statistics.judging.commit import Commit
 
 __all__ = ["SUFFIXES", "Exported", "export"]
@@ -36,26 +36,20 @@ class Settings:
     asprs: Path | None = None
 
 
-Writer = Callable[[Voxels, Path, Settings], None]
+Writer = Callable[[Chosen, Path, Settings], int]
 
 WRITERS: Mapping[str, Writer] = {
-    ".tif": lambda voxels, path, settings: raster.write(voxels, path, settings.cell),
-    ".glb": lambda voxels, path, settings: mesh.write(voxels, path),
+    ".ply": lambda chosen, path, settings: ply.write(chosen, path, sum(len(part.table) for part in chosen)),
+    ".las": lambda chosen, path, settings: las.write(chosen, path, settings.asprs),
+    ".laz": lambda chosen, path, settings: las.write(chosen, path, settings.asprs),
+    ".tif": lambda chosen, path, settings: raster.write(chosen, path, settings.cell),
+    ".glb": lambda chosen, path, settings: mesh.write(chosen, path),
+    ".parquet": lambda chosen, path, settings: tabular.write_parquet(chosen, path),
+    ".csv": lambda chosen, path, settings: tabular.write_csv(chosen, path),
 }
-"""Of formats that are made of a whole map."""
+"""By suffix; each takes a map tile by tile and says how many voxels it wrote."""
 
-Parts = Callable[[], Iterator[Voxels]]
-
-STREAMS: Mapping[str, Callable[[Parts, Path, Settings], int]] = {
-    ".ply": lambda parts, path, settings: ply.write(parts(), path, sum(len(part.table) for part in parts())),
-    ".las": lambda parts, path, settings: las.write(parts(), path, settings.asprs),
-    ".laz": lambda parts, path, settings: las.write(parts(), path, settings.asprs),
-    ".parquet": lambda parts, path, settings: tabular.write_parquet(parts(), path),
-    ".csv": lambda parts, path, settings: tabular.write_csv(parts(), path),
-}
-"""Of formats that take a map tile by tile; each says how many voxels it wrote."""
-
-SUFFIXES = (".ply", ".las", ".laz", ".tif", ".glb", ".parquet", ".csv")
+SUFFIXES = tuple(WRITERS)
 
 
 def export(
@@ -100,51 +94,34 @@ def export(
     further = None if beside is None else Path(beside)
 
     @functools.cache
-    def chosen(usual: tuple[str, ...] | None) -> Voxels:
-        return voxels_of(
+    def chosen(usual: tuple[str, ...] | None) -> Chosen:
+        return Chosen(
             result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds,
             beside=further,
         )  # fmt: skip
 
     if onto is not None:
         return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]
-
-    def parts() -> Iterator[Voxels]:
-        if record.in_tiles:
-            return iter_voxels(
-                result, record, columns=measures, min_op=min_op, classes=classes, commit=thresholds, beside=further
-            )
-        return iter([chosen(None)])
-
-    return [
-        _streamed(parts, file, settings)
-        if file.suffix.lower() in STREAMS
-        else _written(chosen(raster.MEASURES if file.suffix.lower() == ".tif" else None), file, settings)
-        for file in files
-    ]
+    return [_written(chosen(USUAL.get(file.suffix.lower())), file, settings) for file in files]
 
 
-def _streamed(parts: Parts, file: Path, settings: Settings) -> Exported:
-    written = STREAMS[file.suffix.lower()](parts, file, settings)
-    return _exported(next(parts()), written, file, settings)
+USUAL = {".tif": raster.MEASURES}
+"""The columns of some formats, where none is chosen."""
 
 
-def _written(voxels: Voxels, file: Path, settings: Settings) -> Exported:
-    WRITERS[file.suffix.lower()](voxels, file, settings)
-    return _exported(voxels, len(voxels.table), file, settings)
-
-
-def _exported(some: Voxels, voxels: int, file: Path, settings: Settings) -> Exported:
+def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
+    voxels, some = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
     where = "coordinates of the scene, which has no georeference"
     where = where if some.georeference is None else crs_name(some.georeference)
     return Exported(file, f"{voxels:,} voxels, {where}", tuple(_remarks(some, file.suffix.lower(), settings)))
 
 
-def _classified(voxels: Voxels, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:
-    tally = classify(voxels, cloud, file, voxels.table.voxel_size if radius is None else radius, settings.asprs)
+def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:
+    some = chosen.first
+    tally = classify(chosen, cloud, file, some.table.voxel_size if radius is None else radius, settings.asprs)
     share = tally.classified / tally.points
     content = f"{tally.points:,} points, {share:.1%} of them classified"
-    return Exported(file, content, tuple(_remarks(voxels, file.suffix.lower(), settings)))
+    return Exported(file, content, tuple(_remarks(some, file.suffix.lower(), settings)))
 
 
 def _remarks(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -22,51 +22,50 @@ NONE = -1
 
 
 class VoxelLookup:
-    """Finds voxels of a map by coordinates, those of the scene and an offset; a radius of 0 takes no neighbours."""
+    """Finds voxels of a table by coordinates, those of the scene and an offset; a radius of 0 takes no neighbours."""
 
     def __init__(self, table: VoxelTable, offset: npt.ArrayLike = (0.0, 0.0, 0.0), radius: float = 0.0) -> None:
-        self._table, self._offset, self._radius = table, np.asarray(offset, dtype=np.float64), radius
-        index = self._table.index.astype(np.int64)
+        self.table, self._offset, self._radius = table, np.asarray(offset, dtype=np.float64), radius
+        index = self.table.index.astype(np.int64)
         self._low, self._high = index.min(axis=0), index.max(axis=0)
         (self._keys,) = voxel_keys(index)
 
     @property
     def bounds(self) -> tuple[Float64, Float64]:
         """(3,) the lowest and the highest coordinates that may belong to a voxel, metres."""
-        r = self._table.voxel_size
+        r = self.table.voxel_size
         return self._low * r + self._offset - self._radius, (self._high + 1) * r + self._offset + self._radius
 
     def rows(self, points: Float64) -> Int64:
         """(n,) the voxel of each point (n, 3), a row of the table, or NONE."""
+        return self.nearest(points)[0]
+
+    def nearest(self, points: Float64) -> tuple[Int64, Float64]:
+        """The same, with the distance of its centre, 0 for the voxel that a point lies in."""
         points = points - self._offset
-        index = np.floor(points / self._table.voxel_size).astype(np.int64)
+        index = np.floor(points / self.table.voxel_size).astype(np.int64)
         inside = np.flatnonzero(((index >= self._low) & (index <= self._high)).all(axis=1))
-        rows = np.full(len(points), NONE)
+        rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
         keys = np.ravel_multi_index(tuple((index[inside] - self._low).T), tuple(self._high - self._low + 1))
         at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        met = self._keys[at] == keys
-        rows[inside[met]] = at[met]
+        met = inside[self._keys[at] == keys]
+        rows[met], apart[met] = at[self._keys[at] == keys], 0.0
         if self._radius > 0:
             lost = np.flatnonzero(rows == NONE)
-            rows[lost] = self._nearest(points[lost])
-        return rows
+            rows[lost], apart[lost] = self._around(points[lost])
+        return rows, apart
 
-    def _nearest(self, points: Float64) -> Int64:
-        """(n,) the voxel whose centre is nearest to each point of the scene, within the radius."""
+    def _around(self, points: Float64) -> tuple[Int64, Float64]:
+        """(n,) the voxel whose centre is nearest to each point of the scene, within the radius, and how near."""
         low, high = (edge - self._offset for edge in self.bounds)
         near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-        rows = np.full(len(points), NONE)
-        _, found = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
-        rows[near] = np.where(found < len(self._table), found, NONE)
-        return rows
+        rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
+        apart[near], found = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
+        rows[near] = np.where(found < len(self.table), found, NONE)
+        return rows, apart
 
     @cached_property
     def _tree(self) -> cKDTree:
         from scipy.spatial import cKDTree
 
-        return cKDTree(self._table.centers)
-
-
-def for_points(values: npt.NDArray[Any], rows: Int64) -> npt.NDArray[Any]:
-    """Values (n,) of the voxels for points (m,) by their rows; 0 where a point has none."""
-    return np.append(values, np.zeros(1, values.dtype))[rows]
+        return cKDTree(self.table.centers)

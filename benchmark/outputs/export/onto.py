@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,13 +15,17 @@ import numpy.typing as npt
 
 from semstab.datasets.formats.las_files import opened, points_at_once
 from semstab.errors import ConfigError, DataError
+from semstab.model.voxels.tiles import AT_HAND, Place
 from semstab.outputs.export import las, ply
-from semstab.outputs.export.lookup import NONE, VoxelLookup, for_points
-from semstab.outputs.export.voxels import Voxels
+from semstab.outputs.export.lookup import VoxelLookup
+from semstab.outputs.export.voxels import Chosen, Column, Voxels
+from semstab.runtime.at_hand import AtHand
 from semstab.runtime.files import atomic_path
 
 if TYPE_CHECKING:
     import laspy
+
+Float64 = npt.NDArray[np.float64]
 
 CHUNK = 1_000_000
 """Points at a time."""
@@ -34,9 +39,6 @@ BEFORE = "classification_before"
 OLD_CODES = 31
 """The largest code that the point formats before LAS 1.4 have room for."""
 
-Finder = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.int64]]
-Writer = Callable[[Voxels, Path, Path, Finder], None]
-
 
 @dataclass
 class Tally:
@@ -47,15 +49,27 @@ class Tally:
     low: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
     high: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
 
-    def add(self, points: npt.NDArray[np.float64], rows: npt.NDArray[np.int64]) -> None:
-        """A chunk of points (n, 3) with the rows (n,) of their voxels."""
+    def add(self, points: Float64, classified: int) -> None:
+        """A chunk of points (n, 3), of which so many have a voxel."""
         self.points += len(points)
-        self.classified += int(np.count_nonzero(rows != NONE))
+        self.classified += classified
         self.low = np.minimum(self.low, points.min(axis=0, initial=np.inf))
         self.high = np.maximum(self.high, points.max(axis=0, initial=-np.inf))
 
 
-def classify(voxels: Voxels, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> Tally:
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """What points take of their voxels, (n,) each: the class from 1 on, and the columns; 0 where they have none."""
+
+    label: npt.NDArray[Any]
+    columns: Mapping[str, npt.NDArray[Any]]
+
+
+Finder = Callable[[Float64], Taken]
+Writer = Callable[[Voxels, Path, Path, Finder], None]
+
+
+def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> Tally:
     """Write the cloud with all its fields, and class, classification (LAS) and the voxels' columns.
 
     A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else all
@@ -71,29 +85,75 @@ def classify(voxels: Voxels, cloud: Path, out: Path, radius: float, asprs: Path 
         raise ConfigError(f"{out}: {cloud.name} stays what it is; write {out.with_suffix(cloud.suffix)}")
     if out.exists() and out.samefile(cloud):
         raise ConfigError(f"{out}: is the cloud itself; choose another file")
-    lookup, tally = VoxelLookup(voxels.table, voxels.offset, radius), Tally()
+    finder = _Finder(chosen, radius)
     with atomic_path(out) as temporary:
-        write(voxels, cloud, temporary, _finder(lookup, tally))
-        if not tally.classified:
-            raise _beside(cloud, tally, lookup, georeferenced=voxels.georeference is not None)
-    return tally
+        write(chosen.first, cloud, temporary, finder)
+        if not finder.tally.classified:
+            raise _beside(cloud, finder)
+    return finder.tally
 
 
-def _finder(lookup: VoxelLookup, tally: Tally) -> Finder:
-    def find(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        rows = lookup.rows(points)
-        tally.add(points, rows)
-        return rows
+class _Finder:
+    """Finds what points take, tile by tile; the last few tiles are at hand."""
 
-    return find
+    def __init__(self, chosen: Chosen, radius: float) -> None:
+        self.chosen, self.tally, self._radius = chosen, Tally(), radius
+        self._lookups = AtHand(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
+
+    def lookup(self, place: Place) -> VoxelLookup:
+        """Of a tile that has voxels."""
+        voxels = self.chosen[place]
+        return VoxelLookup(voxels.table, voxels.offset, self._radius)
+
+    def __call__(self, points: Float64) -> Taken:
+        some, apart = self.chosen.first, np.full(len(points), np.inf)
+        label = np.zeros(len(points), some.classified.dtype)
+        columns = {name: np.zeros(len(points), as_taken(own).dtype) for name, own in some.columns.items()}
+        for place, rows in self._near(points - some.offset):
+            voxels = self.chosen[place]
+            if not len(voxels.table):
+                continue
+            found, distance = self._lookups[place].nearest(points[rows])
+            nearer = distance < apart[rows]
+            to, of = rows[nearer], found[nearer]
+            apart[to], label[to] = distance[nearer], voxels.classified[of]
+            for name, own in columns.items():
+                own[to] = as_taken(voxels.columns[name])[of]
+        self.tally.add(points, int(np.isfinite(apart).sum()))
+        return Taken(label, columns)
+
+    def _near(self, points: Float64) -> Iterator[tuple[Place, npt.NDArray[np.int64]]]:
+        """The tiles that may hold the nearest voxels of points (n, 3) of the scene, with the rows (m,) of these."""
+        size, r = self.chosen.size, self.chosen.first.table.voxel_size
+        if size is None:
+            yield (0, 0), np.arange(len(points))
+            return
+        steps = np.linspace(-self._radius, self._radius, 2 + int(2 * self._radius / (size * r)))
+        pairs = [
+            np.column_stack([np.floor((points[:, :2] + shift) / (size * r)).astype(np.int64), np.arange(len(points))])
+            for shift in itertools.product(steps, steps)
+        ]
+        found = np.unique(np.concatenate(pairs), axis=0)
+        places, first = np.unique(found[:, :2], axis=0, return_index=True)
+        for (x, y), rows in zip(places.tolist(), np.split(found[:, 2], first[1:]), strict=True):
+            if (x, y) in self.chosen:
+                yield (x, y), rows
 
 
-def _beside(cloud: Path, tally: Tally, lookup: VoxelLookup, *, georeferenced: bool) -> DataError:
+def as_taken(column: Column) -> npt.NDArray[Any]:
+    """A column in the type that files have it in."""
+    return ply.as_stored(column.values)
+
+
+def _beside(cloud: Path, finder: _Finder) -> DataError:
     """What to raise where no point of a cloud has a voxel."""
+    boxes = [finder.lookup(place).bounds for place in finder.chosen.places()]
+    map_box = np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
     there, here = (
         " to ".join("(" + ", ".join(f"{value:.1f}" for value in corner) + ")" for corner in box)
-        for box in ((tally.low, tally.high), lookup.bounds)
+        for box in ((finder.tally.low, finder.tally.high), map_box)
     )
+    georeferenced = finder.chosen.first.georeference is not None
     mend = "mend the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
     return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; {mend}")
 
@@ -135,19 +195,18 @@ def _classified_points(
     points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, voxels: Voxels, find: Finder, asprs: Path | None
 ) -> laspy.ScaleAwarePointRecord:
     """A chunk with what its points take."""
-    rows = find(np.stack([points.x, points.y, points.z], axis=1))
+    found = find(np.stack([points.x, points.y, points.z], axis=1))
     taken = type(points).zeros(len(points), header=header)
     taken.copy_fields_from(points)
     if BEFORE not in points.point_format.dimension_names:
         taken[BEFORE] = points.classification
-    label = for_points(voxels.classified, rows)
     codes = las.codes(voxels, asprs)
     if header.point_format.id < las.FIRST_OF_1_4:
         codes[codes > OLD_CODES] = las.UNCLASSIFIED
-    taken.classification = codes[label]
-    taken["class"] = label
-    for name, column in voxels.columns.items():
-        taken[name] = for_points(ply.as_stored(column.values), rows)
+    taken.classification = codes[found.label]
+    taken["class"] = found.label
+    for name, values in found.columns.items():
+        taken[name] = values
     return taken
 
 
@@ -171,18 +230,18 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
     with cloud.open("rb") as source, out.open("wb") as target:
         header = ply.Header.read(source, cloud)
         own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
-        stored = {name: ply.as_stored(column.values) for name, column in voxels.columns.items()}
-        taken = {"class": voxels.classified, **stored}
-        dtype = np.dtype([*(own | {name: values.dtype for name, values in taken.items()}).items()])
+        kinds = {"class": voxels.classified.dtype, **{k: as_taken(own).dtype for k, own in voxels.columns.items()}}
+        dtype = np.dtype([*(own | kinds).items()])
         comments = dict.fromkeys((*header.comments, *ply.legend(voxels)))
         target.write(ply.Header(dtype, header.count, 0, tuple(comments)).text())
         for points in _ply_chunks(source, header, cloud):
-            rows = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
+            found = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
             chunk = np.empty(len(points), dtype)
             for name in own:
                 chunk[name] = points[name]
-            for name, values in taken.items():
-                chunk[name] = for_points(values, rows)
+            chunk["class"] = found.label
+            for name, values in found.columns.items():
+                chunk[name] = values
             target.write(chunk.tobytes())
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,10 @@ from semstab.model.measures import dominant, measures
 from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
 from semstab.model.voxels import VoxelTable, parquet
+from semstab.model.voxels.parquet import files_of
+from semstab.model.voxels.tiles import AT_HAND, Place
 from semstab.outputs.plots.maps import Overview
+from semstab.runtime.at_hand import AtHand
 from semstab.statistics import psa
 from semstab.statistics.judging.commit import Commit
 
@@ -77,57 +81,81 @@ class Voxels:
         return (dominant(self.table) + 1).astype(np.min_scalar_type(self.table.K))
 
 
-def voxels_of(
-    result: Result,
-    record: Record,
-    *,
-    columns: Sequence[str] | None = None,
-    min_op: int = 1,
-    classes: Sequence[str] = (),
-    beside: Path | None = None,
-    commit: Commit | None = None,
-) -> Voxels:
-    """Those of a unit with OP >= min_op and one of these dominant classes, all where none is named.
+class Chosen:
+    """The voxels of a unit that are to leave it, by the tile that holds them; the last few tiles are at hand.
 
-    With thresholds, of those the ones whose label has enough evidence.
-
-    `columns` names measures, op, category, psa, columns of the unit's Parquet file, or of one `beside` it, which has
-    some of the same voxels; where not given, see `usual`.
+    Those with OP >= min_op and one of these dominant classes, all where none is named; with thresholds (commit), of
+    those the ones whose label has enough evidence. `columns` names measures, op, category, psa, columns of the unit's
+    Parquet file, or of one `beside` it, which has some of the same voxels; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
+
+    size  edge of a tile in voxels, None for the one tile of a map in a single file
     """
-    if record.voxels_file is None:
-        raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
-    table = record.table()
-    found = _chosen(result, record, table, record.voxels_file, columns, min_op, classes, commit, beside)
-    if not len(found.table):
-        raise _none_left(record, min_op, classes, commit, int(table.op.max(initial=0)))
-    return found
 
+    def __init__(
+        self,
+        result: Result,
+        record: Record,
+        *,
+        columns: Sequence[str] | None = None,
+        min_op: int = 1,
+        classes: Sequence[str] = (),
+        beside: Path | None = None,
+        commit: Commit | None = None,
+    ) -> None:
+        if record.voxels_file is None:
+            raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
+        self._record, self._limits = record, (min_op, classes, commit)
+        self._load = partial(_chosen, result, record, columns, min_op, classes, commit, beside)
+        tiles = {file: parquet.tile_of(file) if record.in_tiles else None for file in files_of(record.voxels_file)}
+        self._files = {(0, 0) if tile is None else (tile.x, tile.y): file for file, tile in tiles.items()}
+        self.size = next(None if tile is None else tile.size for tile in tiles.values())
+        self._highest = 0
+        self._at_hand = AtHand(self._read, lambda voxels: len(voxels.table), AT_HAND)
 
-def iter_voxels(
-    result: Result,
-    record: Record,
-    *,
-    columns: Sequence[str] | None = None,
-    min_op: int = 1,
-    classes: Sequence[str] = (),
-    commit: Commit | None = None,
-    beside: Path | None = None,
-) -> Iterator[Voxels]:
-    """Those of `voxels_of` tile by tile, where the map is in tiles; a tile without any is left out."""
-    if not record.in_tiles or record.voxels_file is None:
-        yield voxels_of(result, record, columns=columns, min_op=min_op, classes=classes, commit=commit, beside=beside)
-        return
-    left, highest = False, 0
-    for file in parquet.files_of(record.voxels_file):
+    def __contains__(self, place: Place) -> bool:
+        return place in self._files
+
+    def __getitem__(self, place: Place) -> Voxels:
+        """Those of a tile, which may be none."""
+        return self._at_hand[place]
+
+    def __iter__(self) -> Iterator[Voxels]:
+        """Tile by tile, but for those without any."""
+        return (self[place] for place in self.places())
+
+    def places(self) -> Iterator[Place]:
+        """The tiles that have some."""
+        left = False
+        for place in self._files:
+            if len(self[place].table):
+                left = True
+                yield place
+        if not left:
+            raise _none_left(self._record, *self._limits, self._highest)
+
+    @cached_property
+    def first(self) -> Voxels:
+        """Some of them, for what all have in common."""
+        return next(iter(self))
+
+    def _read(self, place: Place) -> Voxels:
+        file = self._files[place]
         table = VoxelTable.load(file)
-        highest = max(highest, int(table.op.max(initial=0)))
-        found = _chosen(result, record, table, file, columns, min_op, classes, commit, beside)
-        left = left or len(found.table) > 0
-        if len(found.table):
-            yield found
-    if not left:
-        raise _none_left(record, min_op, classes, commit, highest)
+        self._highest = max(self._highest, int(table.op.max(initial=0)))
+        return self._load(table, file)
+
+
+def together(parts: Sequence[Voxels]) -> Voxels:
+    """Voxels of several tiles as those of one."""
+    if len(parts) == 1:
+        return parts[0]
+    order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
+    columns = {
+        name: replace(column, values=np.concatenate([part.columns[name].values for part in parts])[order])
+        for name, column in parts[0].columns.items()
+    }
+    return replace(parts[0], table=VoxelTable.joined([part.table for part in parts]), columns=columns)
 
 
 def _none_left(record: Record, min_op: int, classes: Sequence[str], commit: Commit | None, highest: int) -> ConfigError:
@@ -139,13 +167,13 @@ def _none_left(record: Record, min_op: int, classes: Sequence[str], commit: Comm
 def _chosen(
     result: Result,
     record: Record,
-    table: VoxelTable,
-    file: Path,
     columns: Sequence[str] | None,
     min_op: int,
     classes: Sequence[str],
     commit: Commit | None,
     beside: Path | None,
+    table: VoxelTable,
+    file: Path,
 ) -> Voxels:
     """Of a table, which is in a file."""
     assert record.voxels_file is not None

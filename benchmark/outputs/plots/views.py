@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,11 +64,11 @@ class Views:
 
     def _parts(self, record: Record) -> Iterator[Sums]:
         """Of the unit, or of each of its tiles."""
-        if record.in_tiles:
-            yield from (Sums.of(tile, expected_sbd(tile)) for tile in record.tiles())
-            return
-        table, null = self._tables.of(record), column(record, "sbd_null")
-        yield Sums.of(table, expected_sbd(table) if null is None else null)
+        assert record.voxels_file is not None
+        for file in parquet.files_of(record.voxels_file):
+            table = VoxelTable.load(file) if record.in_tiles else self._tables.of(record)
+            null = _column(file, "sbd_null")
+            yield Sums.of(table, expected_sbd(table) if null is None else null)
 
     def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
         """The unit's voxels that are seen from above."""
@@ -83,6 +84,8 @@ class Views:
 
 def column(record: Record, name: str) -> npt.NDArray[Any] | None:
     """A column that was written beside the voxels; None where it was not."""
-    if record.voxels_file is None or name not in parquet.names_in(record.voxels_file):
-        return None
-    return VoxelTable.columns(record.voxels_file, [name])[name]
+    return None if record.voxels_file is None else _column(record.voxels_file, name)
+
+
+def _column(file: Path, name: str) -> npt.NDArray[Any] | None:
+    return VoxelTable.columns(file, [name])[name] if name in parquet.names_in(file) else None

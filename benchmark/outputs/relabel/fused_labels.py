@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.association import back_project, observe
+from semstab.backends.shared.association import Observations, back_project, observe
 from semstab.config import nearest
 from semstab.errors import ConfigError
 from semstab.metrics import CATEGORIES, categories
@@ -19,10 +19,13 @@ from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
+from semstab.model.voxels.tiles import AT_HAND, Place, Tiles
 from semstab.outputs.export.lookup import NONE, VoxelLookup
+from semstab.runtime.at_hand import AtHand
 from semstab.statistics import psa
 from semstab.statistics.judging.commit import Commit
 
+Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 UNSEEN, UNSTABLE = -1, -2
@@ -78,11 +81,13 @@ class Belief:
 
 
 class FusedLabels:
-    """A map, to be asked for the classes that a frame sees."""
+    """A map, to be asked for the classes that a frame sees; of its tiles those are at hand that frames saw last."""
 
-    def __init__(self, table: VoxelTable, belief: Belief) -> None:
-        self._table, self._belief = table, belief
-        self._lookup = VoxelLookup(table)
+    def __init__(self, tiles: Tiles, belief: Belief, num_classes: int) -> None:
+        self._tiles, self._belief, self._K = tiles, belief, num_classes
+        self._lookups: AtHand[Place, VoxelLookup] = AtHand(
+            lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND
+        )
 
     def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
         """(H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
@@ -90,28 +95,40 @@ class FusedLabels:
         The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.
         """
         everywhere = dataclasses.replace(frame, labels=np.zeros(frame.shape, np.uint8), scores=None)
-        found = self._lookup.rows(back_project(everywhere).T)
-        met = found != NONE
-        rows, inverse = np.unique(found[met], return_inverse=True)
-        seen = rows_of(self._table, rows)
-        if self._belief.leave_own_out:
-            seen = self._without(frame.every(pixel_stride), seen, rows)
-        label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
-        found[met], found[~met] = label[inverse], UNSEEN
-        fused = np.full(frame.shape, UNSEEN)
+        points = back_project(everywhere).T
+        found, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
+        own = (
+            observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_own_out else None
+        )
+        for place, pixels in self._tiles.holding(points):
+            found[pixels] = self._labels(self._lookups[place], points[pixels], own)
         fused[everywhere.valid] = found
         return fused
 
-    def _without(self, frame: Frame, seen: VoxelTable, rows: Int64) -> VoxelTable:
-        """The voxels that a frame sees, those rows of the map, without its own vote."""
-        own = observe(frame, self._table.voxel_size, self._table.K)
-        centers = np.add(own.index, 0.5, dtype=np.float64) * self._table.voxel_size
-        at = np.searchsorted(rows, self._lookup.rows(centers))
-        evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
-        evidence[at] = np.abs(np.round(evidence[at] - own.s_bar, DECIMALS))
-        op[at] -= 1
-        self_sum[at] -= (own.s_bar**2).sum(axis=1)
-        return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
+    def _labels(self, lookup: VoxelLookup, points: Float64, own: Observations | None) -> Int64:
+        """(n,) what points see of a tile."""
+        found = lookup.rows(points)
+        met = found != NONE
+        rows, inverse = np.unique(found[met], return_inverse=True)
+        seen = rows_of(lookup.table, rows)
+        if own is not None:
+            seen = _without(own, lookup, seen, rows)
+        label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
+        found[met], found[~met] = label[inverse], UNSEEN
+        return found
+
+
+def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
+    """The voxels of a tile that a frame sees, those rows of it, without the frame's own vote."""
+    centers = np.add(own.index, 0.5, dtype=np.float64) * seen.voxel_size
+    found = lookup.rows(centers)
+    here = found != NONE
+    at = np.searchsorted(rows, found[here])
+    evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
+    evidence[at] = np.abs(np.round(evidence[at] - own.s_bar[here], DECIMALS))
+    op[at] -= 1
+    self_sum[at] -= (own.s_bar[here] ** 2).sum(axis=1)
+    return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
 
 
 def labels_of(fused: Int64, ids: Sequence[int]) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:

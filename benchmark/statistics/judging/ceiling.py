@@ -7,7 +7,7 @@ fall into the wrong voxel, voxels that hold more than one thing. The rest of the
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.model.statistics import Estimate, Losses
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import BlockBootstrap, spatial_blocks
+from semstab.statistics.blocks import BlockBootstrap, Blocks, Occupied, interval
 
 Float64 = npt.NDArray[np.float64]
 
@@ -70,21 +70,45 @@ def losses(table: VoxelTable, limit: VoxelTable, *, seed: int = 0) -> Losses:
 
     Raises DataError where the maps differ in K or voxel size.
     """
+    edge = Occupied.of(table.index[repeated(table, limit)[0]]).edge()
+    return losses_of([loss_sums(table, limit, edge)], edge * table.voxel_size, seed=seed)
+
+
+def repeated(table: VoxelTable, limit: VoxelTable) -> list[npt.NDArray[np.int64]]:
+    """The rows of either map of the voxels that both saw twice or more."""
     rows, limit_rows = shared_rows(table, limit)
     both = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
-    rows, limit_rows = rows[both], limit_rows[both]
-    total, geometry = 1 - psa(table)[rows], 1 - psa(limit)[limit_rows]
-    ones = np.ones(len(rows))
-    bootstrap = BlockBootstrap(spatial_blocks(table.index[rows], table.voxel_size), seed=seed)
+    return [rows[both], limit_rows[both]]
 
-    def mean(values: Float64, weights: Float64, bounds: tuple[float, float] = (-1.0, 1.0)) -> Estimate:
-        return bootstrap.estimate(np.stack([values, weights], axis=1), ratio_of, bounds)
+
+def loss_sums(table: VoxelTable, limit: VoxelTable, edge: int) -> Float64:
+    """(B, 3 + 4) over blocks of an edge in voxels: which block, the loss, geometry's and the model's, and places."""
+    rows, limit_rows = repeated(table, limit)
+    total, geometry = 1 - psa(table)[rows], 1 - psa(limit)[limit_rows]
+    blocks, of = np.unique(table.index[rows] // edge, axis=0, return_inverse=True)
+    sums = [
+        np.bincount(of.ravel(), weights=values, minlength=len(blocks))
+        for values in (total, geometry, total - geometry, np.ones(len(rows)))
+    ]
+    return np.column_stack([blocks, *sums]).astype(np.float64)
+
+
+def losses_of(parts: Sequence[Float64], size: float, *, seed: int = 0) -> Losses:
+    """The split, from the `loss_sums` of the parts of a map over blocks of that size in metres."""
+    rows = np.concatenate(parts)
+    at, of = np.unique(rows[:, :3], axis=0, return_inverse=True)
+    blocks = Blocks(of.ravel(), len(at), size)
+    sums, weights = blocks.sums(rows[:, 3:]), BlockBootstrap(blocks, seed=seed).weights
+    total, geometry, model, places = range(4)
+
+    def mean(of: int, by: int, bounds: tuple[float, float] = (-1.0, 1.0)) -> Estimate:
+        return interval(sums[:, [of, by]], ratio_of, weights, bounds)
 
     return Losses(
-        voxels=len(rows),
-        total=mean(total, ones, (0.0, 1.0)),
-        geometry=mean(geometry, ones, (0.0, 1.0)),
-        model=mean(total - geometry, ones),
+        voxels=int(sums[:, places].sum()),
+        total=mean(total, places, (0.0, 1.0)),
+        geometry=mean(geometry, places, (0.0, 1.0)),
+        model=mean(model, places),
         share=mean(geometry, total, (0.0, np.inf)),
     )
 

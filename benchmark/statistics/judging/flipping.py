@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import row_chunks
+from semstab.model.evidence import row_chunks, stretches
 from semstab.model.statistics import Flipping
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.sampling import Places
+from semstab.statistics.sampling import Places, PlaceSums
 
 Float64 = npt.NDArray[np.float64]
 
@@ -17,26 +20,53 @@ ENOUGH = 4
 """Looks from which on places that flip can be told from places that err now and then."""
 
 
-def flipping(table: VoxelTable, stable: Float64, places: Places) -> Flipping:
-    """The share of the places with OP >= 2 that are not stable, by the probability (n,) of `steady`.
+@dataclass(frozen=True, eq=False)
+class FlippingSums:
+    """What is known of the places of a map that flip, as sums over its places with OP >= 2.
 
-    places  the cubes of these voxels
+    share     over the cubes: how likely places are not stable, and how many there are
+    often     how many were seen ENOUGH times
+    together  (K, K), above the diagonal: how often two looks at one place are of two classes, where it is not stable
     """
-    rows = np.flatnonzero(~np.isnan(stable))
-    unsteady = 1 - stable[rows]
-    share = places.estimate(np.stack([unsteady, np.ones(len(rows))], axis=1), ratio_of)
-    seen = float(np.mean(table.op[rows] >= ENOUGH)) if len(rows) else float("nan")
-    together = _together(table, rows, unsteady)
-    total = float(together.sum())
-    if not total > 0:
-        return Flipping(share, seen)
-    a, b = np.unravel_index(together.argmax(), together.shape)
-    names = table.classes or tuple(str(k) for k in range(table.K))
-    return Flipping(share, seen, names[int(a)], names[int(b)], float(together[a, b]) / total)
+
+    share: PlaceSums
+    often: int
+    together: Float64
+
+    @classmethod
+    def of(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
+        """Of a table, by the probability (n,) of `steady`, over cubes of that edge in metres."""
+        return cls.merged([cls._of_few(table.rows(some), stable[some], edge) for some in stretches(len(table))])
+
+    @classmethod
+    def _of_few(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
+        rows = np.flatnonzero(~np.isnan(stable))
+        unsteady = 1 - stable[rows]
+        places = Places(table.index[rows], table.voxel_size, edge)
+        share = PlaceSums(places.cell, edge, {"": places.sums(np.stack([unsteady, np.ones(len(rows))], axis=1))})
+        return cls(share, int(np.count_nonzero(table.op[rows] >= ENOUGH)), _together(table, rows, unsteady))
+
+    @classmethod
+    def merged(cls, parts: Sequence[FlippingSums]) -> FlippingSums:
+        """Those of a map from its parts."""
+        share = PlaceSums.added([part.share for part in parts])
+        return cls(share, sum(part.often for part in parts), np.sum([part.together for part in parts], axis=0))
+
+    def flipping(self, classes: Sequence[str] = ()) -> Flipping:
+        """The share of the places that are not stable, and the two classes that stand together most often there."""
+        share = self.share.estimate("", ratio_of)
+        places = self.share[""][1]
+        seen = float(self.often / places) if places else float("nan")
+        total = float(self.together.sum())
+        if not total > 0:
+            return Flipping(share, seen)
+        a, b = np.unravel_index(self.together.argmax(), self.together.shape)
+        names = classes or tuple(str(k) for k in range(len(self.together)))
+        return Flipping(share, seen, names[int(a)], names[int(b)], float(self.together[a, b]) / total)
 
 
 def _together(table: VoxelTable, rows: npt.NDArray[np.int64], unsteady: Float64) -> Float64:
-    """(K, K), above the diagonal: how often two looks at one place are of two classes, where it is not stable."""
+    """(K, K) of these rows (m,), which are unsteady with that probability (m,)."""
     together = np.zeros((table.K, table.K))
     for some in row_chunks(len(rows), table.K):
         belief = table.evidence[rows[some]] / table.op[rows[some], None]

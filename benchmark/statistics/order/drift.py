@@ -6,6 +6,7 @@ less. So it is compared with what a random order of the very same observations g
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,9 @@ from random orders; a lower one becomes the lowest that these could give."""
 DRIFT_SAMPLE = 5_000
 """At most so many voxels are tested for an unusual SBD."""
 
+ROUNDED = 12
+"""Bits of p-values that are kept: so few different ones are told apart that they can be counted."""
+
 TESTABLE = 6
 """Lowest OP of the voxels that are tested one by one: of fewer one-hot labels no order is rare enough."""
 
@@ -60,6 +64,53 @@ class VoxelDrift:
     trend: Float64
     trend_null: Float64
     trend_p: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class PValues:
+    """P-values of many voxels, which add up over the parts of a map: rounded up to ROUNDED bits, and how often each.
+
+    value  (v,) ascending; count (v,)
+    """
+
+    value: Float64
+    count: Int64
+
+    @classmethod
+    def of(cls, p: Float64) -> PValues:
+        """Those that are no NaN, which is not a test."""
+        value, count = np.unique(_rounded_up(p[~np.isnan(p)]), return_counts=True)
+        return cls(value, count.astype(np.int64))
+
+    @classmethod
+    def merged(cls, parts: Sequence[PValues]) -> PValues:
+        """Those of a map from its parts."""
+        value, of = np.unique(np.concatenate([part.value for part in parts]), return_inverse=True)
+        count = np.bincount(of, weights=np.concatenate([part.count for part in parts]), minlength=len(value))
+        return cls(value, count.astype(np.int64))
+
+    def adjusted(self, p: Float64) -> Float64:
+        """What `benjamini_hochberg` makes of some of them (n,); NaN stays."""
+        q = self._adjusted()
+        found = np.full(len(p), np.nan)
+        tested = ~np.isnan(p)
+        found[tested] = q[np.searchsorted(self.value, _rounded_up(p[tested]))]
+        return found
+
+    def found(self, rate: float) -> int:
+        """How many are below that rate when they are adjusted."""
+        return int(self.count[self._adjusted() <= rate].sum())
+
+    def _adjusted(self) -> Float64:
+        raised = self.value * self.count.sum() / np.cumsum(self.count)
+        lowest: Float64 = np.minimum.accumulate(raised[::-1])[::-1]
+        return np.minimum(lowest, 1.0)
+
+
+def _rounded_up(p: Float64) -> Float64:
+    part, exponent = np.frexp(p)
+    rounded: Float64 = np.ldexp(np.ceil(np.ldexp(part, ROUNDED)), exponent - ROUNDED)
+    return rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +241,22 @@ class _Orders:
     def _shared(self) -> tuple[Any, ...]:
         entries = self.log[0][self.first + self.T] - self.log[0][self.first]
         return self.first, self.T, self.log, self.K, int(entries.max(initial=0)), *drift_tables(self.T), self.seeds
+
+
+def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -> Int64:
+    """The rows (r,) of the voxels whose orders stand for all: those of the lowest hashes whose observations differ.
+
+    They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
+    what is drawn of a map is drawn of any part of it that holds it.
+    """
+    from semstab.statistics.loops import kernels
+
+    vary, _, T = varying(table, events)
+    order = np.argsort(streams(table.rows(vary).index, seed))
+    enough = order[: np.searchsorted(np.cumsum(T[order]), observations) + 1]
+    tested = order[T[order] > kernels.ENUMERATED][:DRIFT_SAMPLE]
+    rows: Int64 = np.flatnonzero(vary)[np.union1d(enough, tested)]
+    return rows
 
 
 def _beta_tail(trend: Float64, variance: Float64, T: Int64) -> Float64:

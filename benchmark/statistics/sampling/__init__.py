@@ -1,6 +1,6 @@
 """What a map's numbers would be elsewhere, or in the next flight: sums by frame and cube of space, and intervals."""
 
-from semstab.statistics.sampling.collect import influence_sums, stretches, with_sample
+from semstab.statistics.sampling.collect import influence_sums, with_sample
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
 from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
@@ -38,7 +38,6 @@ __all__ = [
     "question_of",
     "same_flight",
     "standard_error",
-    "stretches",
     "unpaired",
     "value",
     "with_sample",

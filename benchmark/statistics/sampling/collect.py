@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import voxel_keys
-from semstab.model.evidence import row_chunks
+from semstab.model.evidence import row_chunks, stretches
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
@@ -19,9 +18,6 @@ from semstab.statistics.agreement import ONE_HOT, psa
 from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
-
-STRETCH = 1 << 17
-"""So many voxels are looked at together, where sums over all of them are wanted."""
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -35,6 +31,7 @@ def influence_sums(
     sample: tuple[Events, Events] | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
+    likely: Literal["known"] | None = "known",
 ) -> InfluenceSums:
     """The sums of a map.
 
@@ -46,11 +43,12 @@ def influence_sums(
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
+    likely      None leaves open how likely places are stable: of a part of a map, see `StableLooks`
     """
     index = table.index[table.op >= 2]
     edge = cell_edge(index, table.voxel_size) if edge is None else edge
-    likely = np.nan_to_num(steady(table)) if true_label is not None else np.zeros(len(table))
-    whole = _of_table(table, true_label, edge, likely) if events is None else _of_log(events, true_label, edge, likely)
+    stable = np.nan_to_num(steady(table)) if true_label is not None and likely else np.zeros(len(table))
+    whole = _of_table(table, true_label, edge, stable) if events is None else _of_log(events, true_label, edge, stable)
     whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)
     return whole if sample is None else with_sample(whole, sample, logged=events is not None)
 
@@ -149,11 +147,6 @@ def _with_places(
         frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
         columns=np.concatenate([sums.columns, columns[some]]),
     )
-
-
-def stretches(rows: int) -> Iterator[slice]:
-    """Consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
-    return (slice(first, min(first + STRETCH, rows)) for first in range(0, max(rows, 1), STRETCH))
 
 
 def cells_of(

@@ -94,11 +94,22 @@ class PlaceSums:
         """Those of a map from its parts, by the cubes that the whole map has."""
         edge = max(part.edge for part in parts)
         cells = np.concatenate([part.cell // round(edge / part.edge) for part in parts])
-        while len(distinct := np.unique(cells, axis=0)) > MOST_CELLS:
+        while len(np.unique(cells, axis=0)) > MOST_CELLS:
             cells, edge = cells // 2, 2 * edge
-        _, of = np.unique(cells, axis=0, return_inverse=True)
         joined = {name: np.concatenate([part.sums[name] for part in parts]) for name in parts[0].sums}
-        sums = {name: np.zeros((len(distinct), own.shape[1])) for name, own in joined.items()}
-        for name, own in joined.items():
+        return cls._summed(cells, edge, joined)
+
+    @classmethod
+    def added(cls, parts: Sequence[PlaceSums]) -> PlaceSums:
+        """Those of a map from its parts, whose cubes are of one edge, and stay so however many there are."""
+        cells = np.concatenate([part.cell for part in parts])
+        joined = {name: np.concatenate([part.sums[name] for part in parts]) for name in parts[0].sums}
+        return cls._summed(cells, parts[0].edge, joined)
+
+    @classmethod
+    def _summed(cls, cells: npt.NDArray[np.int32], edge: float, rows: Mapping[str, Float64]) -> PlaceSums:
+        distinct, of = np.unique(cells, axis=0, return_inverse=True)
+        sums = {name: np.zeros((len(distinct), own.shape[1])) for name, own in rows.items()}
+        for name, own in rows.items():
             np.add.at(sums[name], of.ravel(), own)
         return cls(distinct.astype(np.int32), edge, sums)

@@ -1,0 +1,119 @@
+"""What of a map's statistics needs the log of its observations, as sums over its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.statistics import RuleOutcome
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.agreement import ratio_of
+from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
+from semstab.statistics.map_sums import Maps, mean_columns
+from semstab.statistics.order import fusion_rules
+from semstab.statistics.order.drift import TESTABLE, Flips, PValues, VoxelDrift, trend_columns, voxel_drift
+from semstab.statistics.sampling import Places, PlaceSums
+from semstab.statistics.scene_drift import OrderTest, order_test, sampled
+
+Float64 = npt.NDArray[np.float64]
+FALSE_DISCOVERIES = 0.05
+"""Rate at which voxels are named that trend, or drift unusually."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogSums:
+    """Those of a map.
+
+    places  over the cubes of its voxels with OP >= 2: flips, and the trend beyond that in random order
+    trend   (3,) see `trend_columns`
+    p       of the trends of the voxels that are tested one by one
+    rules   (R, 2 + C) for each rule of fusion the voxels that it relabels, all of them, and `rule_sums`
+    table, events  the voxels whose orders stand for all, with their observations: see `drawn`
+    """
+
+    places: PlaceSums
+    trend: Float64
+    p: PValues
+    rules: Float64
+    table: VoxelTable
+    events: Events
+
+    @classmethod
+    def of(
+        cls,
+        table: VoxelTable,
+        events: Events,
+        drift: VoxelDrift,
+        changes: Flips,
+        truth: Truth | None,
+        seed: int,
+        edge: float,
+    ) -> LogSums:
+        """Of a table, with cubes of that edge in metres."""
+        again = table.op >= 2
+        places = Places(table.index[again], table.voxel_size, edge)
+        trend = trend_columns(table, drift)
+        means = {
+            "flip_rate": changes.rate,
+            "flip_null": changes.null,
+            "flip_excess": changes.rate - changes.null,
+            "frames_since": changes.since,
+        }
+        columns = {name: mean_columns(values) for name, values in means.items()}
+        columns["trend_excess"] = np.stack([trend[:, 0] - trend[:, 1], trend[:, 2]], axis=1)
+        return cls(
+            PlaceSums(places.cell, places.edge, {name: places.sums(own[again]) for name, own in columns.items()}),
+            trend.sum(axis=0),
+            PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
+            _rules(table, events, truth),
+            *sampled(table, events, seed),
+        )
+
+    @classmethod
+    def merged(cls, parts: Sequence[LogSums], seed: int) -> LogSums:
+        """Those of a map from its parts."""
+        table, events = (
+            VoxelTable.joined([part.table for part in parts]),
+            Events.joined([part.events for part in parts]),
+        )
+        return cls(
+            PlaceSums.merged([part.places for part in parts]),
+            np.sum([part.trend for part in parts], axis=0),
+            PValues.merged([part.p for part in parts]),
+            np.sum([part.rules for part in parts], axis=0),
+            *(sampled(table, events, seed) if len(parts) > 1 else (table, events)),
+        )
+
+    def rule_outcomes(self) -> tuple[RuleOutcome, ...]:
+        """Means over the voxels with OP >= 2 under each rule."""
+        return tuple(
+            RuleOutcome(rule, rule_means_of(own[2:]), float(ratio_of(own[:2])))
+            for rule, own in zip(fusion_rules.RULES, self.rules, strict=True)
+        )
+
+    def tested(self, seed: int) -> tuple[OrderTest, VoxelDrift]:
+        """What the orders of the sampled voxels say of all, and of each of them."""
+        return order_test(self.table, self.events, seed=seed), voxel_drift(self.table, self.events, seed=seed)
+
+
+def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
+    """What a part's log says of each voxel; drift_p of those that are not sampled."""
+    return {
+        "drift_p": drift.p_value,
+        "trend": drift.trend,
+        "trend_p": drift.trend_p,
+        "flip_rate": changes.rate,
+        "frames_since_flip": changes.since,
+    }
+
+
+def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
+    again, usual, rows = table.op >= 2, fusion_rules.labels(table.evidence), []
+    for rule in fusion_rules.RULES:
+        fused = fusion_rules.fuse(events, rule)
+        relabelled = (fusion_rules.labels(fused.evidence) != usual)[again]
+        rows.append(np.concatenate([[relabelled.sum(), len(relabelled)], rule_sums(fused, again, truth)]))
+    return np.stack(rows)

@@ -1,0 +1,142 @@
+"""The first look at a part of a map: all sums that need nothing but it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.metrics.summary import STRATA
+from semstab.model.measures import dominant
+from semstab.model.voxels import Events, VoxelTable
+from semstab.runtime.array_form import from_arrays, to_arrays
+from semstab.statistics.blocks import Occupied
+from semstab.statistics.correctness import Judged, Truth, judged_sums, stratum_sums
+from semstab.statistics.judging.ceiling import repeated
+from semstab.statistics.map_sums import Maps, MapSums, mean_columns
+from semstab.statistics.order.drift import flips, voxel_drift
+from semstab.statistics.sampling import Places, PlaceSums
+from semstab.statistics.sampling.stable_looks import StableLooks
+from semstab.statistics.steady import Votes
+from semstab.statistics.sums.by_log import LogSums, log_maps
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TruthSums:
+    """What needs ground truth.
+
+    right        over the cubes of the voxels with OP >= 2: how many are right, of those with a true class
+    strata       `stratum_sums`
+    reliability  `judged_sums` of the voxels with OP >= 2 and a true class
+    stable       what the whole map makes sums of what is stable of
+    """
+
+    right: PlaceSums
+    strata: Float64
+    reliability: Float64
+    stable: StableLooks
+
+    @classmethod
+    def of(
+        cls, table: VoxelTable, events: Events | None, truth: Truth, edges: Sequence[int], sums: MapSums
+    ) -> TruthSums:
+        """Of a table whose other sums these are."""
+        again, counted = table.op >= 2, truth.known & (table.op >= 2)
+        places = Places(table.index[again], table.voxel_size, sums.places.edge)
+        right = mean_columns(np.where(truth.known, dominant(table) == truth.label, np.nan))
+        return cls(
+            PlaceSums(places.cell, places.edge, {"right": places.sums(right[again])}),
+            stratum_sums(table, truth, edges),
+            judged_sums(Judged.of(table.evidence.take(counted), truth.label[counted])),
+            StableLooks.of(table, events, truth.label, sums.influence.edge, sums.influence.step),
+        )
+
+    @classmethod
+    def merged(cls, parts: Sequence[TruthSums], sums: MapSums) -> TruthSums:
+        """Those of a map whose other sums these are, from its parts."""
+        return cls(
+            PlaceSums.merged([part.right for part in parts]),
+            np.sum([part.strata for part in parts], axis=0),
+            np.sum([part.reliability for part in parts], axis=0),
+            StableLooks.merged([part.stable for part in parts], sums.influence.edge, sums.influence.step),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FirstSums:
+    """Those of a map; log, truth and limited (where a ceiling saw voxels twice) where that is known."""
+
+    own: MapSums
+    votes: Votes
+    log: LogSums | None = None
+    truth: TruthSums | None = None
+    limited: Occupied | None = None
+
+    @classmethod
+    def merged(cls, parts: Sequence[FirstSums], seed: int = 0) -> FirstSums:
+        """Those of a map from its parts."""
+        own = MapSums.merged([part.own for part in parts])
+        logs, truths, limits = ([getattr(part, name) for part in parts] for name in ("log", "truth", "limited"))
+        return cls(
+            own,
+            Votes.merged([part.votes for part in parts]),
+            None if logs[0] is None else LogSums.merged(logs, seed),
+            None if truths[0] is None else TruthSums.merged(truths, own),
+            None if limits[0] is None else Occupied.merged(limits),
+        )
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """All of it by name, as `read` takes it."""
+        return {**self.own.arrays(), **to_arrays(replace(self, own=None), "first")}  # type: ignore[arg-type]
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, npt.NDArray[Any]], classes: tuple[str, ...]) -> FirstSums:
+        """From its arrays, among others, and the names of the classes."""
+        return cls(MapSums.read(arrays, classes), *vars(from_arrays(_Further, arrays, "first")).values())
+
+
+@dataclass(frozen=True, eq=False)
+class _Further:
+    """What `FirstSums` are beside their own."""
+
+    votes: Votes
+    log: LogSums | None
+    truth: TruthSums | None
+    limited: Occupied | None
+
+
+def first_look(
+    table: VoxelTable,
+    events: Events | None = None,
+    truth: Truth | None = None,
+    limit: VoxelTable | None = None,
+    *,
+    edges: Sequence[int] = STRATA,
+    seed: int = 0,
+) -> tuple[FirstSums, Maps, Float64 | None]:
+    """The sums of a table, what is known of each of its voxels, and with a log its SBD in random order (n,).
+
+    See `analyse` for what it takes.
+    """
+    drift = None if events is None else voxel_drift(table, events, seed=seed, sample=0)
+    label = None if truth is None else truth.label
+    null = None if drift is None else drift.null
+    own = MapSums.of(table, edges, events=events, true_label=label, null=null)
+    log, more = None, {}
+    if events is not None and drift is not None:
+        changes = flips(events)
+        log = LogSums.of(table, events, drift, changes, truth, seed, own.places.edge)
+        more = log_maps(drift, changes)
+    found = FirstSums(
+        own,
+        Votes.of(table),
+        log,
+        None if truth is None else TruthSums.of(table, events, truth, edges, own),
+        None if limit is None else Occupied.of(table.index[repeated(table, limit)[0]]),
+    )
+    return found, more | ({} if truth is None else {"true_label": truth.label}), null

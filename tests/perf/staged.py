@@ -1,0 +1,66 @@
+"""The command, which also says what each stage took: `python tests/perf/staged.py FILE.json run --data ...`.
+
+CPU seconds (of the main thread, and of all threads) and peak resident memory by stage of the stopwatch, as JSON. Where
+numba has one thread, what the main thread takes in the stages of a frame is theirs; images are decoded in others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from semstab.cli import main
+from semstab.runtime.memory import resident_bytes
+from semstab.runtime.stopwatch import Stopwatch
+
+EVERY = 0.005
+"""Seconds from one look at the memory to the next."""
+
+found: dict[str, dict[str, float]] = {}
+inside = ["beside"]
+
+
+def of(stage: str) -> dict[str, float]:
+    """What is known of a stage."""
+    return found.setdefault(stage, {"own_s": 0.0, "all_s": 0.0, "peak_gb": 0.0})
+
+
+@contextlib.contextmanager
+def watched(self: Stopwatch, stage: str) -> Iterator[Any]:
+    """A stage of the stopwatch, of which CPU time is noted as well."""
+    own, everything = time.thread_time(), time.process_time()
+    inside.append(stage)
+    try:
+        with plain(self, stage) as lap:
+            yield lap
+    finally:
+        inside.pop()
+        now = of(stage)
+        now["own_s"] += time.thread_time() - own
+        now["all_s"] += time.process_time() - everything
+
+
+def look() -> None:
+    """Note the largest memory of each stage."""
+    while True:
+        now = of(inside[-1])
+        now["peak_gb"] = max(now["peak_gb"], resident_bytes() / 1e9)
+        time.sleep(EVERY)
+
+
+plain = Stopwatch.__call__
+Stopwatch.__call__ = watched  # type: ignore[method-assign]
+
+if __name__ == "__main__":
+    file, sys.argv[1:] = Path(sys.argv[1]), sys.argv[2:]
+    threading.Thread(target=look, daemon=True).start()
+    try:
+        main()
+    finally:
+        file.write_text(json.dumps(found))
