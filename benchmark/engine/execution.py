@@ -20,6 +20,7 @@ from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.sizing import Sizing, sized
+from semstab.engine.survey import Survey
 from semstab.engine.tiled_unit import TiledUnit
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan, must_agree
@@ -109,6 +110,7 @@ def _execute(
         told.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()
+        executor.close()
     told.raise_first()
     return result, found.causes
 
@@ -159,7 +161,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
             found.geometry, found.advice = _checked(plan.config, missing, told)
     with folder.started() as start, lend(start, plan.scenes):
         with watch("sizing"):
-            sizing = sized(plan.config, missing, folder.path, executor.width)
+            sizing = sized(plan.config, missing, Survey(executor, folder, start))
         for line in sizing.remarks:
             told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         _refuse(sizing, missing, found, executor, told)
@@ -198,7 +200,7 @@ def _work_off(
     factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
     requests = [request for tiled in in_tiles.values() for request in tiled.missing()]
     jobs = split(_jobs(plan.config, folder.path, start, whole, factories), executor.width)
-    jobs += _portion_jobs(plan.config, folder.path, start, requests, units)
+    jobs += _portion_jobs(plan.config, folder.path, start, requests, units, factories)
     kept = (tiled.take(None) for tiled in in_tiles.values())
     with contextlib.closing(executor.run(jobs, told)) as finished:
         done = (outcome for _, outcomes in finished for outcome in outcomes)
@@ -209,7 +211,8 @@ def _work_off(
                 found.watch.seconds[stage] += seconds
             if tiled is not None and outcome.portion is not None:
                 told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
-                ended = tiled.take(outcome)
+                with found.watch("assemble"):
+                    ended = tiled.take(outcome)
             if ended is not None and ended.identity not in found.errors:
                 _keep(folder, found, each, ended)
                 if tiled is not None and ended.content is not None:
@@ -293,14 +296,23 @@ def _jobs(
 
 
 def _portion_jobs(
-    config: Config, folder: Path, start: str, requests: Sequence[Request], units: Mapping[str, Planned]
+    config: Config,
+    folder: Path,
+    start: str,
+    requests: Sequence[Request],
+    units: Mapping[str, Planned],
+    observers: Sequence[Factory],
 ) -> list[Job]:
-    """A job each, so that no two maps are in memory at once."""
+    """A job each, so that no two maps are in memory at once; a frame is shown to observers of one of them."""
     memory = None if config.memory_gb is None else config.memory_gb * GB
-    named = [(units[request.identity].unit, request) for request in requests]
-    return [
-        Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory) for unit, request in named
-    ]
+    jobs, shown = [], set()
+    for request in requests:
+        unit = units[request.identity].unit
+        frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
+        own = tuple(observers) if request.shown and frames not in shown else ()
+        shown.add(frames)
+        jobs.append(Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own))
+    return jobs
 
 
 def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
