@@ -80,3 +80,52 @@ def test_where_nothing_can_be_kept_it_is_compiled_anew(installed, tmp_path) -> N
     done = run(installed / "program.py", (), tmp_path, TMPDIR=str(temporary))
     assert done.returncode == 0, done.stderr
     assert not list(theirs.iterdir())
+
+
+HELPERS = """
+from semstab.runtime.compiled import serial
+
+OFFSET = 1
+
+@serial
+def helper(x):
+    return x + OFFSET
+"""
+CALLER = """
+from helpers import OFFSET, helper
+from semstab.runtime.compiled import serial
+
+@serial
+def caller(x):
+    return 10 * helper(x) + OFFSET
+
+print(caller(1), sum(caller.stats.cache_hits.values()))
+"""
+
+
+def test_code_is_compiled_again_where_what_it_takes_in_has_changed_or_is_damaged(tmp_path) -> None:
+    """numba looks at a function's own file alone, and would go on with the code of a helper that is no more."""
+
+    def called() -> str:
+        path = f"{tmp_path}{os.pathsep}{Path(semstab.__file__).parents[1]}"
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "PYTHON"))}
+        done = subprocess.run(
+            [sys.executable, tmp_path / "caller.py"],
+            env=kept | {"PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.stdout.strip() or done.stderr
+
+    (tmp_path / "helpers.py").write_text(HELPERS)
+    (tmp_path / "caller.py").write_text(CALLER)
+    assert called() == "21 0"
+    changed = HELPERS.replace("OFFSET = 1", "OFFSET = 2").replace("x + OFFSET", "x + OFFSET + 3")
+    (tmp_path / "more.py").write_text(changed)
+    (tmp_path / "helpers.py").write_text("from more import OFFSET, helper")  # moved, too, as between versions
+    assert called() == "62 0"
+    for file in (tmp_path / "__pycache__").glob("caller*.nb*"):
+        file.write_bytes(file.read_bytes()[:40])
+    assert called() == "62 0"
+    assert called() == "62 1"

@@ -322,6 +322,17 @@ def test_backends_are_held_against_each_other_tile_by_tile(wall, tmp_path) -> No
     assert all(row["agrees"] for row in other)
 
 
+def test_backbones_are_compared_tile_by_tile(tmp_path) -> None:
+    """Coverage, means at a common OP, common looks, other rules of fusion: with logs and ground truth."""
+    root, found = tiny_scene.write(tmp_path / "wall", frames=12), []
+    for size in (None, 8):
+        settings = {"check": None, "backends": ["numba"], "statistics": True, "events": True, "tile_size": size}
+        semstab.engine.run(configure(root, **settings), out=tmp_path / str(size))
+        found.append(summary_of(tmp_path / str(size))["comparisons"])
+    assert found[0][0]["fusion_rules"]["values"]
+    assert differences(*found, tolerance=1e-12) == []
+
+
 def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
     """Parts that are whole are not computed again; a damaged one is."""
     config, out = configure(wall, backends=["numba"], check=None, tile_size=8), tmp_path / "run"

@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,11 @@ from semstab.metrics.agreement import together
 from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
 from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.voxels import Events, VoxelTable
-from semstab.model.voxels.tiles import side_by_side
+from semstab.model.voxels.tiles import Tiles, side_by_side
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 from semstab.statistics import BackboneComparison, Looks, claimed_together
+from semstab.statistics.versus.backbones import Region
 
 GB = 1e9
 
@@ -368,10 +370,11 @@ def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iter
 
 def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     """How far two units agree, voxel by voxel; tile by tile where one is in tiles."""
-    units, files = (a.unit, b.unit), [record.voxels_file for record in (a, b) if record.voxels_file is not None]
+    units = a.unit, b.unit
+    maps = [Tiles.open(file, VoxelTable) for record in (a, b) if (file := record.voxels_file) is not None]
     if not (a.in_tiles or b.in_tiles):
         return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
-    return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(files)])
+    return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
 
 
 def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
@@ -388,16 +391,30 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
     base = [record for record in records if record.variation.sweep == BASE]
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
-        truths = [record.truth_file for record in there if record.truth_file is not None]
-        truth = VoxelTable.load(truths[0]) if truths and len(there) > 1 else None
-        files = {record.unit.backbone: record.events_file for record in there if config.events}
-        logs = {name: Events.load(file) for name, file in files.items() if file is not None and file.exists()}
-        maps = {record.unit.backbone: tables.of(record) for record in there}
-        kept = {record.unit.backbone: record.looks_file for record in there}
-        looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
-        found = comparison(scene, maps, truth, logs if len(logs) == len(there) > 1 else None, looks)
-        if found is not None:
-            yield found
+        if len(there) > 1:
+            regions = partial(_regions_of, there, config, tables)
+            kept = {record.unit.backbone: record.looks_file for record in there}
+            looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
+            found = comparison(scene, regions, looks if len(looks) == len(there) else None)
+            if found is not None:
+                yield found
+
+
+def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Iterator[Region]:
+    """The maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
+    names = [record.unit.backbone for record in there]
+    truths = [record.truth_file for record in there if record.truth_file is not None][:1]
+    files = [record.events_file for record in there if config.events]
+    logs = [file for file in files if file is not None and file.exists()]
+    logs = logs if len(logs) == len(there) else []
+    maps = [Tiles.open(file, VoxelTable) for record in there if (file := record.voxels_file) is not None]
+    if not any(record.in_tiles for record in there):
+        maps = [Tiles.of(tables.of(record)) for record in there]
+    further = [Tiles.open(file, VoxelTable) for file in truths], [Tiles.open(file, Events) for file in logs]
+    for own in side_by_side([*maps, *further[0], *further[1]]):
+        found, true, events = own[: len(maps)], own[len(maps) : len(own) - len(logs)], own[len(own) - len(logs) :]
+        log = dict(zip(names, events, strict=True)) if logs else None
+        yield Region(dict(zip(names, found, strict=True)), log, true[0] if truths else None)
 
 
 def _regions(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[RegionFlicker]:

@@ -7,11 +7,15 @@ import os
 import stat
 import sys
 import tempfile
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba as nb
+import numpy as np
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
 
 settings: Any = nb.config
 """numba's, whose names come with it."""
@@ -30,15 +34,62 @@ def compiled(**options: Any) -> Callable[[Any], Any]:
     def decorate(function: Any) -> Any:
         dispatcher = nb.njit(error_model="numpy", nogil=True, **options)(function)
         try:
-            dispatcher.enable_caching()
+            dispatcher._cache = _Kept(function)
         except RuntimeError:  # there is no place for its cache
             if folder := _own_temporary_folder():
                 settings.CACHE_DIR = folder
                 with contextlib.suppress(RuntimeError):
-                    dispatcher.enable_caching()
+                    dispatcher._cache = _Kept(function)
         return dispatcher
 
     return decorate
+
+
+class _Kept(FunctionCache):
+    """What numba keeps of a function, taken only where all that it was compiled from is as it was.
+
+    numba alone looks at the function's own file, not at those of the functions and constants that it takes in.
+    """
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        stamp = _stamp(function, frozenset())
+        self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Compiled code, None where there is none; what is damaged is compiled again."""
+        try:
+            return super().load_overload(signature, context)  # type: ignore[no-untyped-call]
+        except Exception:  # noqa: BLE001  whatever unpickling raises
+            return None
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """Keep compiled code; without it another process compiles anew."""
+        try:
+            super().save_overload(signature, data)  # type: ignore[no-untyped-call]
+        except Exception:  # noqa: BLE001  the index is damaged, or the disk is full
+            with contextlib.suppress(Exception):
+                self._cache_file.flush()  # type: ignore[no-untyped-call]
+                super().save_overload(signature, data)  # type: ignore[no-untyped-call]
+
+
+def _stamp(function: Any, seen: frozenset[Any]) -> tuple[Any, ...]:
+    """The file of a function, by time and size, and the same of what it names: compiled functions, numbers, arrays."""
+    file = Path(function.__code__.co_filename)
+    stamp: list[Any] = [(file.name, file.stat().st_mtime, file.stat().st_size) if file.exists() else file.name]
+    for name in sorted(_names(function.__code__)):
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher) and value.py_func not in seen:
+            stamp.append(_stamp(value.py_func, seen | {function}))
+        elif isinstance(value, bool | int | float | str | tuple | np.ndarray | np.generic):
+            stamp.append((name, value.tobytes() if isinstance(value, np.ndarray) else repr(value)))
+    return tuple(stamp)
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """What a function and those in it name."""
+    inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
+    return set(code.co_names).union(*map(_names, inner))
 
 
 serial = compiled()

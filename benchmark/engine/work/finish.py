@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -29,6 +30,7 @@ from semstab.errors import DataError
 from semstab.metrics import compare, macro_mean, summarise
 from semstab.metrics.matching import rows_of
 from semstab.metrics.summary import TableSums
+from semstab.model.frames import LeftOut
 from semstab.model.measures import dominant, measures, vss
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
@@ -173,11 +175,20 @@ def unit_summary(
         left_out=sum(row.left_out for row in rows),
         frames_left_out=task.left_out,
         frames_empty=sum(row.report.points == 0 for row in rows),
+        scores_left_out=_scores_left_out(rows),
         statistics=statistics,
         reduced=reduced,
         worst_frames=tuple(_worst(rows)),
         sizes=sizes,
     )
+
+
+def _scores_left_out(rows: Sequence[FrameRow]) -> LeftOut | None:
+    """Over all frames that were cut to their largest scores; None where none was."""
+    cut = [row for row in rows if not math.isnan(row.scores_left_out)]
+    if not cut:
+        return None
+    return LeftOut(macro_mean([row.scores_left_out for row in cut]), max(row.most_scores_left_out for row in cut))
 
 
 def reduced_sums(table: VoxelTable) -> npt.NDArray[np.float64]:

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.backends import FusionBackend, create, takes_option
@@ -210,9 +211,12 @@ class Pass:
             one.truth.integrate(now.truth)
             if one.truth_sampler is not None:
                 one.truth_sampler.add(now.truth)
+        cut = frame.scores_left_out
         return FrameRow(
             report, frame.timestamp, now.flicker, fetched.seconds, fetched.waited, now.seconds,
             left_out=frame.left_out_pixels,
+            scores_left_out=math.nan if cut is None else cut.mean,
+            most_scores_left_out=math.nan if cut is None else cut.most,
         )  # fmt: skip
 
     def _told(self, one: UnitMap, frame: Frame, row: FrameRow) -> FrameRow:
