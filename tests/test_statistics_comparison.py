@@ -17,8 +17,8 @@ from semstab.model.measures import VSS
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
 from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
-from semstab.statistics.versus.comparison import EDGES, standard_weights
 from semstab.statistics.versus.differences import holm
+from semstab.statistics.versus.standard import EDGES, Observed
 
 SIDE = 24
 
@@ -92,7 +92,7 @@ def test_standardised_value_by_hand():
     index = np.stack([np.zeros(3), np.zeros(3), np.arange(3)], axis=1)
     a = log_of([[0, 0, -1, -1], [0, 1, -1, -1], [0, 0, 0, 0]], index=index).table()
     b = log_of([[0, 0, -1, -1], [1, 1, -1, -1], [0, 0, 0, 1]], index=index).table()
-    np.testing.assert_allclose(standard_weights({"a": a, "b": b})[[0, 2]], [2 / 3, 1 / 3])
+    np.testing.assert_allclose(Observed.of({"a": a, "b": b}).weights()[[0, 2]], [2 / 3, 1 / 3])
     values = standardised({"a": a, "b": b}, PSA)
     assert values["a"].value == pytest.approx(2 / 3 * 1 / 2 + 1 / 3)
     assert values["b"].value == pytest.approx(2 / 3 + 1 / 3 * 1 / 2)
@@ -102,7 +102,7 @@ def test_a_stratum_that_one_map_lacks_counts_for_none():
     index = np.stack([np.zeros(2), np.zeros(2), np.arange(2)], axis=1)
     a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index).table()
     b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index).table()
-    assert standard_weights({"a": a, "b": b}).tolist() == [1.0] + [0.0] * len(EDGES)
+    assert Observed.of({"a": a, "b": b}).weights().tolist() == [1.0] + [0.0] * len(EDGES)
     assert standardised({"a": a, "b": b}, PSA)["a"].value == 1
     never = log_of([[0, -1]], index=index[:1]).table()
     assert math.isnan(standardised({"a": a, "b": never}, PSA)["a"].value)

@@ -16,7 +16,7 @@ from semstab.model.statistics.comparison import CommonLooks
 from semstab.outputs.terminal.statistics import comparison_lines
 from semstab.statistics import Looks, compare_backbones, psa
 from semstab.statistics.looks.common import common, psa_bounds
-from semstab.statistics.versus.comparison import thin
+from semstab.statistics.versus.standard import Observed
 
 SIZE = 0.2
 
@@ -116,7 +116,7 @@ def test_strata_of_op_that_hardly_overlap_are_said():
     assert found.standardised.thin == 1
     assert any("hardly overlap" in line for line in comparison_lines(found))
     same = {"a": tables["often"], "b": tables["often"]}
-    assert thin(same, np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
+    assert Observed.of(same).thin(np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
 
 
 def test_looks_come_back_from_their_file(tmp_path):

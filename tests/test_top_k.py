@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
+from command_line import bench
+from posed_scene import frame as posed_frame
+from posed_scene import write_scene
 
 import semstab
 from semstab import backends
@@ -38,6 +42,13 @@ def test_the_largest_are_kept_and_of_equal_ones_the_lowest(dtype, k) -> None:
     np.put_along_axis(expected, order, np.take_along_axis(whole.scores, order, 2), 2)
     np.testing.assert_array_equal(kept.scores[whole.valid], expected[whole.valid])
     assert kept.scores.dtype == whole.scores.dtype
+    if k >= K:
+        assert kept.scores_left_out is None
+        return
+    some = np.isfinite(whole.scores).all(axis=2) & (whole.scores.sum(axis=2) > 0)
+    lost = 1 - expected[some].sum(axis=1, dtype=float) / whole.scores[some].sum(axis=1, dtype=float)
+    assert kept.scores_left_out.mean == pytest.approx(lost.mean(), rel=1e-6)
+    assert kept.scores_left_out.most == pytest.approx(lost.max(), rel=1e-6)
 
 
 @pytest.mark.parametrize("k", [1, 2, 5])
@@ -70,3 +81,15 @@ def test_less_than_half_of_the_classes_are_kept_as_entries() -> None:
         backend.integrate(cut)
         tables.append(backend.table())
     np.testing.assert_allclose(tables[0].evidence[:], tables[1].evidence[:], atol=1e-12)
+
+
+def test_a_run_tells_what_its_flag_left_out(tmp_path) -> None:
+    """Of random scores much: the summary has the mean and the bound, the terminal says them; of all of them nothing."""
+    scene = write_scene(tmp_path / "scene")
+    words = ("--data", scene, "--backbone", "net-scores", "--top-k", 1, "--check", "none", "--rerun", "off")
+    told = bench(*words, "--out", tmp_path / "cut", cwd=tmp_path).stdout
+    (run,) = json.loads((tmp_path / "cut/summary.json").read_text())["runs"]
+    frames = [posed_frame(k, "net-scores").scores.astype(float) for k in range(3)]
+    lost = np.array([1 - scores.max(axis=2) / scores.sum(axis=2) for scores in frames])
+    assert run["scores_left_out"] == pytest.approx({"mean": lost.mean(), "most": lost.max()}, rel=1e-3)
+    assert f"top_k leaves out {lost.mean():.2%} of a pixel's scores on average, {lost.max():.2%} at most" in told

@@ -83,6 +83,10 @@ def run(
     pixel_stride: Annotated[
         int | None, typer.Option(help="Use every n-th pixel of each axis.", show_default="1")
     ] = None,
+    top_k: Annotated[
+        int | None,
+        typer.Option("--top-k", help="Fuse the so many largest soft scores of each pixel.", show_default="all"),
+    ] = None,
     frames: Frames = None,
     device: Annotated[
         str | None,
@@ -127,6 +131,7 @@ def run(
         "taxonomy": taxonomy,
         "voxel_size": voxel_size,
         "pixel_stride": pixel_stride,
+        "top_k": top_k,
         "check": check,
         "events": events,
         "statistics": statistics,

@@ -48,8 +48,8 @@ from semstab.statistics.sampling import (
     value,
 )
 from semstab.statistics.sampling.influence import functional
-from semstab.statistics.versus.comparison import LEAST_VOXELS
 from semstab.statistics.versus.differences import holm
+from semstab.statistics.versus.standard import LEAST_VOXELS
 
 FORGIVING, DECIDED = (REACHED, ALPHA_BETWEEN), (ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that forgive what a score leaves open, and those of the fused labels alone."""

@@ -9,7 +9,8 @@ from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics import Analysis, BackboneComparison, Looks, Sample, analyse, compare_backbones
+from semstab.statistics import Analysis, BackboneComparison, Looks, Sample, analyse
+from semstab.statistics.versus.backbones import Regions, compare_regions
 from semstab.task import Task
 
 
@@ -39,20 +40,15 @@ def analyse_map(
     )
 
 
-def comparison(
-    scene: str,
-    maps: Mapping[str, VoxelTable],
-    truth: VoxelTable | None = None,
-    logs: Mapping[str, Events] | None = None,
-    looks: Mapping[str, Looks] | None = None,
-) -> BackboneComparison | None:
+def comparison(scene: str, regions: Regions, looks: Mapping[str, Looks] | None = None) -> BackboneComparison | None:
     """Maps of a scene beside each other; None where there are not two or more of them in one label space.
 
     With the logs of all of them, also under other rules of fusion; with the sampled looks of all, on common ones.
     """
-    if len(maps) < 2 or len({table.classes for table in maps.values()}) > 1:
+    first = next(iter(regions()))
+    classes = {table.classes for table in first.tables.values()}
+    if len(first.tables) < 2 or len(classes) > 1:
         return None
-    if truth is not None and truth.classes != next(iter(maps.values())).classes:
-        truth = None
-    sampled = looks if looks is not None and looks.keys() == maps.keys() else None
-    return compare_backbones(maps, logs, truth, looks=sampled, scene=scene)
+    if first.truth is not None and first.truth.classes not in classes:
+        return comparison(scene, lambda: (dataclasses.replace(own, truth=None) for own in regions()), looks)
+    return compare_regions(regions, looks=looks, scene=scene)

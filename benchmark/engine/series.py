@@ -23,8 +23,9 @@ FRAME_COLUMNS = (
 class FrameRow:
     """One row of a unit's time series: the backend's report, what the frame itself tells, and seconds by stage.
 
-    left_out counts the pixels that were left out of fusion because what they show moves. logging_seconds is known once
-    the observers have seen the row.
+    left_out counts the pixels that were left out of fusion because what they show moves; scores_left_out and
+    most_scores_left_out are the mean and the largest share of a pixel's scores that `top_k` left out. logging_seconds
+    is known once the observers have seen the row.
     """
 
     report: FrameReport
@@ -35,6 +36,8 @@ class FrameRow:
     flicker_seconds: float = math.nan
     logging_seconds: float = math.nan
     left_out: int = 0
+    scores_left_out: float = math.nan
+    most_scores_left_out: float = math.nan
 
     def stage_ms(self) -> dict[str, float]:
         """Milliseconds of each of `STAGES`; NaN where it is not known."""

@@ -60,6 +60,17 @@ class Intrinsics:
         return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """The share of a pixel's scores that `top_k` left out: the mean over pixels, and the most of any.
+
+    No voxel's belief (in total variation) or VSS changes by more than the most: see `semstab.pixels.top_k`.
+    """
+
+    mean: float
+    most: float
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One observation of the scene, validated where it is made; its arrays are read-only views.
@@ -73,6 +84,7 @@ class Frame:
     color       (H, W, 3) uint8 RGB, optional
     mask        (H, W) bool, True where a thing moves that is not to be fused, optional; see `semstab.pixels.exclusion`
     left_out    (H, W) bool, the pixels that were left out of fusion for what they show, optional
+    scores_left_out  what was left out of the scores, where only the largest are kept
     timestamp   seconds, optional
     files       which file each field came from ('depth', 'pose', 'labels', ...); error messages name it
 
@@ -88,6 +100,7 @@ class Frame:
     color: npt.NDArray[np.uint8] | None = None
     mask: npt.NDArray[np.bool_] | None = None
     left_out: npt.NDArray[np.bool_] | None = None
+    scores_left_out: LeftOut | None = None
     timestamp: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
 

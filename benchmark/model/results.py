@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from semstab.model.frames import LeftOut
 from semstab.model.measures import Measure, MeasureMeans
 from semstab.model.statistics import MapStatistics
 from semstab.runtime.json_form import INLINE
@@ -151,9 +152,10 @@ class UnitSummary:
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
     fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
-    the fused ones of which no pixel was valid; statistics is what `semstab.statistics.describe` says of the map, None
-    where nothing was asked for; sizes tells whether half or twice the voxel size would say something else;
-    worst_frames are those that moved the map most, the worst first; reduced is there for soft scores.
+    the fused ones of which no pixel was valid; scores_left_out is there with `top_k`; statistics is what
+    `semstab.statistics.describe` says of the map, None where nothing was asked for; sizes tells whether half or twice
+    the voxel size would say something else; worst_frames are those that moved the map most, the worst first; reduced is
+    there for soft scores.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -166,6 +168,7 @@ class UnitSummary:
     left_out: int = 0
     frames_left_out: int = 0
     frames_empty: int = 0
+    scores_left_out: LeftOut | None = None
     statistics: MapStatistics | None = None
     sizes: tuple[SizeAlpha, ...] = ()
     worst_frames: tuple[FrameDrift, ...] = ()

@@ -12,15 +12,19 @@ import dataclasses
 
 import numpy as np
 
-from semstab.model.frames import Frame
+from semstab.model.frames import Frame, LeftOut
 from semstab.model.labels import flat
-from semstab.pixels.top_k_kernel import cut
+from semstab.pixels.top_k_kernel import CHUNKS, cut
+
+BITS = {2: np.uint16, 4: np.uint32, 8: np.uint64}
+AS_DOUBLE = {2: (42, 2.0**1008), 4: (29, 2.0**896), 8: (0, 1.0)}
+"""By how much the bits of a number are moved up to be those of a double, and the unit that it then counts."""
 
 
 def keep_largest(frame: Frame, k: int) -> Frame:
     """The frame with the k largest scores of each pixel, of equal ones those of the lowest classes; the rest are 0.
 
-    A pixel without a prediction stays without.
+    A pixel without a prediction stays without. `scores_left_out` of the frame says what share of them was left out.
     """
     assert frame.scores is not None
     scores = frame.scores
@@ -28,7 +32,11 @@ def keep_largest(frame: Frame, k: int) -> Frame:
         return frame
     known = scores.dtype in (np.float16, np.float32)
     scores = np.abs(scores if known else scores.astype(np.float64))  # no -0, whose bits are large
-    bits = {2: np.uint16, 4: np.uint32, 8: np.uint64}[scores.dtype.itemsize]
-    kept = np.zeros(scores.shape, dtype=bits)
-    cut(flat(scores).view(bits), k, kept.reshape(-1, scores.shape[2]))
-    return dataclasses.replace(frame, scores=kept.view(scores.dtype))
+    bits = BITS[scores.dtype.itemsize]
+    kept, shares = np.zeros(scores.shape, dtype=bits), np.zeros((CHUNKS, 3))
+    infinite = int(np.array(np.inf, dtype=scores.dtype).view(bits))
+    shift, unit = AS_DOUBLE[scores.dtype.itemsize]
+    cut(flat(scores).view(bits), k, kept.reshape(-1, scores.shape[2]), shift, unit, infinite, shares)
+    pixels, total = shares[:, :2].sum(axis=0)
+    left_out = LeftOut(float(total / max(pixels, 1)), float(shares[:, 2].max()))
+    return dataclasses.replace(frame, scores=kept.view(scores.dtype), scores_left_out=left_out)

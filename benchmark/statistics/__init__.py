@@ -48,8 +48,9 @@ from semstab.statistics.order.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.scene_drift import SceneDrift, scene_drift
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.versus.backbones import compare_backbones
-from semstab.statistics.versus.comparison import coverage, paired, standardised
+from semstab.statistics.versus.comparison import coverage, paired
 from semstab.statistics.versus.differences import claimed_together
+from semstab.statistics.versus.standard import standardised
 
 __all__ = [
     "RULES",

@@ -151,7 +151,7 @@ def _pairs(flight: Flight, count: int, seed: int, question: Question = NEXT_FLIG
         rng = np.random.default_rng([seed, trial])
         over = world(flight, rng)
         other = dataclasses.replace(over, hard=world(flight, rng).hard)
-        pair = [sums_of(fly(flight, scene, rng), over, flight) for scene in (over, other)]
+        pair = [sums_of(fly(flight, scene, rng), scene, flight) for scene in (over, other)]
         found["same frames"].append(difference(*pair, key, question=question, same_frames=True))
         found["two flights"].append(difference(*pair, key, question=question, same_frames=False))
     seen = "all see all" if flight.looks == flight.frames else "strips"

@@ -32,7 +32,8 @@ PART, STRETCH, SIZES = "part", "stretch", "sizes"
 
 REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
           "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
-ROW = ("timestamp", "flicker_percent", "decode_seconds", "wait_seconds", "flicker_seconds", "left_out")
+ROW = ("timestamp", "flicker_percent", "decode_seconds", "wait_seconds", "flicker_seconds", "left_out",
+       "scores_left_out", "most_scores_left_out")  # fmt: skip
 MEANS = ("map_vss", "map_entropy", "map_recurrent")
 INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
 

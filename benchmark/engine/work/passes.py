@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.backends import FusionBackend, create, takes_option
@@ -18,6 +19,7 @@ from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow
 from semstab.engine.work.finish import finish, finish_portion
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
+from semstab.engine.work.looking import look
 from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
@@ -50,7 +52,8 @@ def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]
         scene = _scene(job)
         regions = [request for request in requests if request.regions]
         outcomes += [measure_regions(job, scene, request) for request in regions]
-        requests = tuple(request for request in requests if not request.regions)
+        outcomes += [look(job, scene, request) for request in requests if request.looking is not None]
+        requests = tuple(request for request in requests if not request.regions and request.looking is None)
         while requests:
             fused = Pass(job, scene, requests, told)
             outcomes += fused.run()
@@ -210,9 +213,12 @@ class Pass:
             one.truth.integrate(now.truth)
             if one.truth_sampler is not None:
                 one.truth_sampler.add(now.truth)
+        cut = frame.scores_left_out
         return FrameRow(
             report, frame.timestamp, now.flicker, fetched.seconds, fetched.waited, now.seconds,
             left_out=frame.left_out_pixels,
+            scores_left_out=math.nan if cut is None else cut.mean,
+            most_scores_left_out=math.nan if cut is None else cut.most,
         )  # fmt: skip
 
     def _told(self, one: UnitMap, frame: Frame, row: FrameRow) -> FrameRow:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.voxels import VoxelTable, parquet
+from semstab.model.voxels import Events, VoxelTable, parquet
 from semstab.runtime.at_hand import AtHand
 
 AT_HAND = 1 << 22
@@ -19,37 +20,41 @@ Int64 = npt.NDArray[np.int64]
 Place = tuple[int, int]
 
 
-class Tiles:
-    """The tiles of a map by place; a map in a single file has one, which holds all.
+T = TypeVar("T", VoxelTable, Events)
+
+
+class Tiles(Generic[T]):
+    """The tiles of a map, or of its log, by place; one in a single file has one, which holds all.
 
     size        edge of a tile in voxels, None for that one
     voxel_size  metres
     """
 
-    def __init__(self, load: Mapping[Place, Callable[[], VoxelTable]], size: int | None, voxel_size: float) -> None:
-        self._load, self.size, self.voxel_size = load, size, voxel_size
-        self._tables: AtHand[Place, VoxelTable] = AtHand(lambda place: self._load[place](), len, AT_HAND)
+    def __init__(self, load: Mapping[Place, Callable[[], T]], size: int | None, voxel_size: float) -> None:
+        self.size, self.voxel_size = size, voxel_size
+        self._load: Mapping[Place, Callable[[], T]] = load
+        self._tables: AtHand[Place, T] = AtHand(lambda place: self._load[place](), len, AT_HAND)
 
     @classmethod
-    def open(cls, path: str | Path) -> Tiles:
+    def open(cls, path: str | Path, kind: type[T]) -> Tiles[T]:
         """Those of a file, or of a folder of tiles. Raises DataError where it is damaged."""
         files = parquet.files_of(path)
         voxel_size = parquet.voxel_size_of(files[0])
         if not Path(path).is_dir():
-            return cls({(0, 0): partial(VoxelTable.load, files[0])}, None, voxel_size)
+            return cls({(0, 0): partial(kind.load, files[0])}, None, voxel_size)
         tiles = {file: parquet.tile_of(file) for file in files}
-        load = {(tile.x, tile.y): partial(VoxelTable.load, file) for file, tile in tiles.items()}
+        load = {(tile.x, tile.y): partial(kind.load, file) for file, tile in tiles.items()}
         return cls(load, tiles[files[0]].size, voxel_size)
 
     @classmethod
-    def of(cls, table: VoxelTable) -> Tiles:
+    def of(cls, table: T) -> Tiles[T]:
         """A table as the one tile of its map."""
         return cls({(0, 0): lambda: table}, None, table.voxel_size)
 
     def __iter__(self) -> Iterator[Place]:
         return iter(self._load)
 
-    def __getitem__(self, place: Place) -> VoxelTable:
+    def __getitem__(self, place: Place) -> T:
         return self._tables[place]
 
     def holding(self, points: npt.NDArray[np.float64]) -> Iterator[tuple[Place, Int64]]:
@@ -65,15 +70,14 @@ class Tiles:
             if (x, y) in self._load:
                 yield (x, y), own
 
-    def region(self, place: Place, size: int) -> VoxelTable:
+    def region(self, place: Place, size: int) -> T:
         """The voxels of a wider tile of that size, a multiple of the own one."""
         if self.size is None:
             table = self[0, 0]
-            return table.rows((table.ix // size == place[0]) & (table.iy // size == place[1]))
+            return table.rows(np.flatnonzero((table.ix // size == place[0]) & (table.iy // size == place[1])))
         inside = [own for own in self if self._in_wider(own, size) == place]
-        if not inside:
-            return self[next(iter(self))].rows(slice(0, 0))
-        return VoxelTable.joined([self[own] for own in inside])
+        first = self[next(iter(self))] if not inside else self[inside[0]]
+        return type(first).joined([self[own] for own in inside]) if inside else first.rows(np.zeros(0, np.int64))
 
     def wider(self, size: int) -> set[Place]:
         """The wider tiles of that size that hold a voxel."""
@@ -88,9 +92,8 @@ class Tiles:
         return place[0] * self.size // size, place[1] * self.size // size
 
 
-def side_by_side(paths: Sequence[str | Path]) -> Iterator[tuple[VoxelTable, ...]]:
+def side_by_side(maps: Sequence[Tiles[Any]]) -> Iterator[tuple[Any, ...]]:
     """The voxels of several maps region by region, by the widest of their tiles; of maps in single files at once."""
-    maps = [Tiles.open(path) for path in paths]
     sizes = [own.size for own in maps if own.size is not None]
     if not sizes:
         yield tuple(own[0, 0] for own in maps)

@@ -17,6 +17,7 @@ from semstab.engine.units import make_plan
 from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.records import Record
+from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.tiles import Tiles
 from semstab.outputs.relabel.fused_labels import Belief, FusedLabels, labels_of
 from semstab.outputs.relabel.report import Relabelled, Tally
@@ -65,7 +66,7 @@ def relabel(
     if record.voxels_file is None:
         raise DataError(f"{run}: kept no voxels of {record.unit.slug}; run it again")
     tally, truth = Tally(len(space)), truth_task(task)
-    fused = FusedLabels(Tiles.open(record.voxels_file), chosen, len(space))
+    fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), chosen, len(space))
 
     def work(index: int) -> _Work:
         frame = read(task, index)

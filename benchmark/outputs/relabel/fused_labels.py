@@ -83,7 +83,7 @@ class Belief:
 class FusedLabels:
     """A map, to be asked for the classes that a frame sees; of its tiles those are at hand that frames saw last."""
 
-    def __init__(self, tiles: Tiles, belief: Belief, num_classes: int) -> None:
+    def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
         self._lookups: AtHand[Place, VoxelLookup] = AtHand(
             lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND

@@ -59,6 +59,10 @@ def print_summary(result: Result, console: Console) -> None:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
             text += f" {run.frames + run.frames_left_out} selected frames were left out: they lack a file or a pose"
             console.print(text, soft_wrap=True, markup=False)
+        if (cut := run.scores_left_out) is not None:
+            text = f"{run.unit.scene}, {run.unit.backbone}: top_k leaves out {cut.mean:.2%} of a pixel's scores on"
+            text += f" average, {cut.most:.2%} at most: no voxel's belief or VSS changes by more than that"
+            console.print(text, soft_wrap=True, markup=False, highlight=False)
         if run.frames_empty:
             text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_empty} of {run.frames} frames hold no pixel"
             console.print(f"{text} with both depth and a label", soft_wrap=True, markup=False)

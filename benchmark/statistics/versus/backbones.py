@@ -3,34 +3,49 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.metrics.matching import require_same_map
+from semstab.metrics.matching import require_same_grid, require_same_map, shared_rows
 from semstab.model.measures import Measure, Quantity, measures
-from semstab.model.statistics import RuleMeans
+from semstab.model.statistics import Estimate, RuleMeans
 from semstab.model.statistics.comparison import BackboneComparison, Paired, RuleComparison, Standardised
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means
+from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means_of, rule_sums
 from semstab.statistics.looks import Looks
 from semstab.statistics.looks.common import decided
 from semstab.statistics.looks.ignored import Shared, common_looks
 from semstab.statistics.order import fusion_rules
-from semstab.statistics.versus.comparison import (
+from semstab.statistics.versus.comparison import coverage_of, held, paired, repeated_rows
+from semstab.statistics.versus.standard import (
     EDGES,
+    Observed,
     Tables,
-    coverage,
-    paired,
-    repeated_rows,
-    standard_weights,
-    standardised,
-    thin,
+    standardised_of,
+    stratum_sums,
     voxelwise,
 )
 
+Float64 = npt.NDArray[np.float64]
+
 SCHEMA = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Several backbones' maps of a scene, or what each has in one place, their logs, and the ground truth there."""
+
+    tables: Tables
+    events: Mapping[str, Events] | None = None
+    truth: VoxelTable | None = None
+
+
+Regions = Callable[[], Iterable[Region]]
+"""Those that make up a scene, as often as they are asked for: none is kept."""
 
 
 def compare_backbones(
@@ -55,40 +70,68 @@ def compare_backbones(
     """
     if len(tables) < 2:
         raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
-    weights = standard_weights(tables)
-    shared = None if looks is None else common_looks({name: looks[name] for name in tables})
+    whole = Region(tables, events, truth)
+    return compare_regions(lambda: [whole], looks=looks, scene=scene, seed=seed, block_size=block_size)
+
+
+def compare_regions(
+    regions: Regions,
+    *,
+    looks: Mapping[str, Looks] | None = None,
+    scene: str = "",
+    seed: int = 0,
+    block_size: float | None = None,
+) -> BackboneComparison:
+    """What `compare_backbones` says of maps that are seen region by region; whole ones without samples of looks."""
+    first = next(iter(regions()))
+    names = tuple(first.tables)
+    require_same_grid(*first.tables.values())
+    shared = None if looks is None else common_looks({name: looks[name] for name in names})
     mixed = shared is not None and shared.found.decided
-    comparable = () if mixed else voxelwise()  # means of labels beside means of scores would say nothing
-    everywhere = {m.key: standardised(tables, m, seed=seed, weights=weights) for m in comparable}
-    if mixed and events is not None:
-        events = {name: decided(events[name]) for name in tables}
+    held_there, seen = zip(*((held(own.tables), Observed.of(own.tables)) for own in regions()), strict=True)
+    observed = Observed.merged(seen)
+    weights = observed.weights()
+    # means of labels beside means of scores would say nothing
+    everywhere = {} if mixed else _standardised(regions, observed, weights, seed)
     return BackboneComparison(
         scene=scene,
         schema=SCHEMA,
         seed=seed,
-        backbones=tuple(tables),
-        coverage=coverage(tables),
-        standardised=Standardised(EDGES, tuple(weights.tolist()), thin(tables, weights), everywhere),
-        paired=_paired(tables, events, truth, shared, seed, block_size),
+        backbones=names,
+        coverage=coverage_of(names, held_there),
+        standardised=Standardised(EDGES, tuple(weights.tolist()), observed.thin(weights), everywhere),
+        paired=_paired(regions, shared, seed, block_size),
         looks=None if shared is None else shared.found,
-        fusion_rules=None if events is None else _by_rule(tables, events, truth),
+        fusion_rules=None if first.events is None else _by_rule(regions, mixed=mixed),
     )
 
 
-def _paired(
-    tables: Tables,
-    events: Mapping[str, Events] | None,
-    truth: VoxelTable | None,
-    shared: Shared | None,
-    seed: int,
-    block_size: float | None,
-) -> Paired:
+def _standardised(regions: Regions, observed: Observed, weights: Float64, seed: int) -> dict[str, dict[str, Estimate]]:
+    edges, sums, voxel_size = [occupied.edge() for occupied in observed.occupied], dict[str, list[Float64]](), 0.0
+    for own in regions():
+        for (name, table), edge in zip(own.tables.items(), edges, strict=True):
+            sums.setdefault(name, []).append(stratum_sums(table, edge))
+            voxel_size = table.voxel_size
+    found = {
+        name: standardised_of(parts, edge * voxel_size, weights, seed=seed)
+        for (name, parts), edge in zip(sums.items(), edges, strict=True)
+    }
+    return {quantity.key: {name: own[quantity.key] for name, own in found.items()} for quantity in voxelwise()}
+
+
+def _paired(regions: Regions, shared: Shared | None, seed: int, block_size: float | None) -> Paired:
     """On common looks where there are some, else on the common voxels with all looks of each map."""
     if shared is None:
-        return paired(tables, truth, logs=events, seed=seed, block_size=block_size)
+        parts = list(regions())
+        tables = {name: VoxelTable.joined([own.tables[name] for own in parts]) for name in parts[0].tables}
+        truths = [own.truth for own in parts if own.truth is not None]
+        truth = VoxelTable.joined(truths) if truths else None
+        logs = _joined_logs(parts)
+        return paired(tables, truth, logs=logs, seed=seed, block_size=block_size)
+    tables = {name: log.table() for name, log in shared.logs.items()}
     return paired(
-        {name: log.table() for name, log in shared.logs.items()},
-        truth,
+        tables,
+        truth_at(regions, next(iter(tables.values()))),
         logs=shared.logs,
         whole={name: log.table() for name, log in shared.whole.items()},
         primary=shared.primary,
@@ -97,23 +140,40 @@ def _paired(
     )
 
 
-def _by_rule(tables: Tables, events: Mapping[str, Events], truth: VoxelTable | None) -> RuleComparison:
+def _joined_logs(parts: Sequence[Region]) -> dict[str, Events] | None:
+    logs = [own.events for own in parts if own.events is not None]
+    return {name: Events.joined([own[name] for own in logs]) for name in logs[0]} if logs else None
+
+
+def truth_at(regions: Regions, places: VoxelTable) -> VoxelTable | None:
+    """The ground truth's voxels that these are of; None without any."""
+    found = [own.truth.rows(shared_rows(own.truth, places)[0]) for own in regions() if own.truth is not None]
+    return VoxelTable.joined(found) if found else None
+
+
+def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:
     """Each rule's means on the common voxels with OP >= 2, and the order of the backbones that follows, best first."""
-    rows = repeated_rows(tables)
-    values: dict[str, dict[str, RuleMeans]] = {rule: {} for rule in fusion_rules.RULES}
-    for (name, table), own in zip(tables.items(), rows, strict=True):
-        require_same_map(table, events[name])
-        known = None if truth is None else join_truth(table, truth)
-        where = np.zeros(len(table), dtype=np.bool_)
-        where[own] = True
-        for rule in fusion_rules.RULES:
-            values[rule][name] = rule_means(fusion_rules.fuse(events[name], rule), where, known)
+    sums: dict[str, dict[str, Float64]] = {rule: {} for rule in fusion_rules.RULES}
+    voxels, known = 0, False
+    for region in regions():
+        assert region.events is not None
+        rows, known = repeated_rows(region.tables), region.truth is not None
+        voxels += len(rows[0])
+        for (name, table), own in zip(region.tables.items(), rows, strict=True):
+            log = decided(region.events[name]) if mixed else region.events[name]
+            require_same_map(table, log)
+            truth = None if region.truth is None else join_truth(table, region.truth)
+            where = np.zeros(len(table), dtype=np.bool_)
+            where[own] = True
+            for rule, found in sums.items():
+                found[name] = found.get(name, 0.0) + rule_sums(fusion_rules.fuse(log, rule), where, truth)
+    values = {rule: {name: rule_means_of(own) for name, own in found.items()} for rule, found in sums.items()}
     orders = {
         quantity.key: {rule: _order(quantity, take, found) for rule, found in values.items()}
-        for quantity, take in _judged_by(truth is not None).items()
+        for quantity, take in _judged_by(known).items()
     }
     changes = {key: len(set(by_rule.values())) > 1 for key, by_rule in orders.items()}
-    return RuleComparison(len(rows[0]), values, orders, changes)
+    return RuleComparison(voxels, values, orders, changes)
 
 
 def _judged_by(truth: bool) -> dict[Quantity, Callable[[RuleMeans], float]]:

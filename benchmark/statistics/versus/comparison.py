@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.errors import ConfigError
-from semstab.metrics.matching import require_same_grid, shared_rows
+from semstab.metrics.matching import shared_rows
 from semstab.model.measures import Quantity, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNDEFINED, Estimate
@@ -22,7 +21,6 @@ from semstab.statistics.agreement import (
     alpha_columns,
     alpha_of,
     between_of,
-    psa,
     ratio_of,
 )
 from semstab.statistics.blocks import (
@@ -34,110 +32,53 @@ from semstab.statistics.blocks import (
 )
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.versus.differences import OnCommonPlaces, differences
+from semstab.statistics.versus.standard import Tables, voxelwise
 
 Float64 = npt.NDArray[np.float64]
-Tables = Mapping[str, VoxelTable]
-
-EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
-"""Upper edges of the strata of OP that comparisons are standardised by; OP = 1 is left out."""
-
-LEAST_VOXELS, LEAST_OVERLAP = 50, 0.1
-"""A stratum overlaps hardly where some map has fewer voxels in it, or a smaller part of what another map has."""
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
     """Coverage of each backbone's map; common_share is the part of its voxels that all maps hold."""
+    return coverage_of(tuple(tables), [held(tables)])
+
+
+def held(tables: Tables) -> npt.NDArray[np.int64]:
+    """(M, 6) of each map, or of its part in one place: voxels, observations, repeated and recurrent voxels, common to
+    all, in no other."""
     common = len(shared_rows(*tables.values())[0])
     rows = []
     for name, table in tables.items():
         elsewhere = np.zeros(len(table), dtype=np.bool_)
         for other in (t for n, t in tables.items() if n != name):
             elsewhere[shared_rows(table, other)[0]] = True
-        n, observations = len(table), int(table.op.sum(dtype=np.int64))
-        rows.append(
-            MapCoverage(
-                backbone=name,
-                voxels=n,
-                observations=observations,
-                mean_op=observations / n if n else math.nan,
-                repeated=int(np.count_nonzero(table.op >= 2)),
-                recurrent=int(np.count_nonzero(table.op >= RECURRENT)),
-                common_share=common / n if n else math.nan,
-                alone=int(np.count_nonzero(~elsewhere)),
-            )
+        often = [np.count_nonzero(table.op >= least) for least in (2, RECURRENT)]
+        rows.append([len(table), table.op.sum(dtype=np.int64), *often, common, np.count_nonzero(~elsewhere)])
+    return np.array(rows, dtype=np.int64)
+
+
+def coverage_of(names: Sequence[str], parts: Sequence[npt.NDArray[np.int64]]) -> tuple[MapCoverage, ...]:
+    """Coverage of the maps by what their parts have, see `held`."""
+    return tuple(
+        MapCoverage(
+            backbone=name,
+            voxels=n,
+            observations=observations,
+            mean_op=observations / n if n else math.nan,
+            repeated=repeated,
+            recurrent=recurrent,
+            common_share=common / n if n else math.nan,
+            alone=alone,
         )
-    return tuple(rows)
-
-
-def voxelwise() -> dict[Quantity, Callable[[VoxelTable], Float64]]:
-    """What is compared and has one value a voxel (n,), NaN where undefined."""
-    return {PSA: psa, **{measure: measure.of for measure in measures()}}
+        for name, (n, observations, repeated, recurrent, common, alone) in zip(
+            names, np.sum(parts, axis=0).tolist(), strict=True
+        )
+    )
 
 
 def compared(*, truth: bool) -> tuple[Quantity, ...]:
     """All that is compared, in the order of the tables; what needs ground truth only where there is some."""
     quantities = (ALPHA_BETWEEN, PSA, ALPHA, *measures(), ACCURACY)
     return tuple(quantity for quantity in quantities if truth or quantity.needs != "truth")
-
-
-# --- At the same number of observations -------------------------------------------------------------------------------
-
-
-def standard_weights(tables: Tables, edges: Sequence[int] = EDGES) -> Float64:
-    """The common distribution of OP: shares (S,) of the strata among the voxels with OP >= 2 of all maps together.
-
-    A stratum that is empty in some map has weight 0: there is nothing to compare it with.
-    """
-    counts = np.stack([np.bincount(_stratum(table, edges), minlength=len(edges) + 2)[1:] for table in tables.values()])
-    pooled = np.where((counts > 0).all(axis=0), counts.sum(axis=0), 0)
-    total = pooled.sum()
-    return pooled / total if total else np.zeros(counts.shape[1])
-
-
-def thin(tables: Tables, weights: Float64, edges: Sequence[int] = EDGES) -> float:
-    """The part of the weights in strata of OP of which some map has few voxels, or a small part of what another has."""
-    counts = np.stack([np.bincount(_stratum(table, edges), minlength=len(edges) + 2)[1:] for table in tables.values()])
-    few = (counts < LEAST_VOXELS).any(axis=0) | (counts.min(axis=0) < LEAST_OVERLAP * counts.max(axis=0))
-    return float(weights[few].sum())
-
-
-def standardised(
-    tables: Tables, measure: Quantity, *, edges: Sequence[int] = EDGES, seed: int = 0, weights: Float64 | None = None
-) -> dict[str, Estimate]:
-    """A measure's mean in each map, as it would be if all had the common distribution of OP (direct standardisation).
-
-    sum_s w_s m_s with m_s the mean in stratum s; each map counts with all its voxels with OP >= 2.
-    """
-    require_same_grid(*tables.values())
-    w = standard_weights(tables, edges) if weights is None else weights
-    S = len(w)
-
-    def weighted(sums: Float64) -> Float64:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            means = sums[..., :S] / sums[..., S:]
-        used = (w > 0) & (sums[..., S:].real > 0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            value: Float64 = np.where(used, w * means, 0.0).sum(axis=-1) / np.where(used, w, 0.0).sum(axis=-1)
-        return value
-
-    estimates = {}
-    for name, table in tables.items():
-        columns = np.zeros((len(table), 2 * S))
-        stratum = _stratum(table, edges)
-        values = voxelwise()[measure](table)
-        again = np.flatnonzero((stratum > 0) & ~np.isnan(values))
-        columns[again, stratum[again] - 1] = values[again]
-        columns[again, S + stratum[again] - 1] = 1.0
-        bootstrap = BlockBootstrap(spatial_blocks(table.index, table.voxel_size), seed=seed)
-        estimates[name] = bootstrap.estimate(columns, weighted, (0.0, 1.0))
-    return estimates
-
-
-def _stratum(table: VoxelTable, edges: Sequence[int]) -> npt.NDArray[np.int64]:
-    """(n,) 0 for OP = 1, else 1 to len(edges) + 1."""
-    if list(edges) != sorted(set(edges)) or not edges or edges[0] < 2:
-        raise ConfigError(f"edges = {list(edges)}: upper bounds of OP must ascend from 2 or more")
-    return np.where(table.op >= 2, np.searchsorted(edges, table.op) + 1, 0)
 
 
 # --- On the same places -----------------------------------------------------------------------------------------------
