@@ -124,8 +124,8 @@ class Folder:
         with contextlib.suppress(OSError):
             (self.path / PORTIONS).rmdir()  # where nothing of other units is left
 
-    def save_portion(self, outcome: Outcome) -> None:
-        """Keep a finished portion of a unit in tiles; its own file comes last, and says that the others are there."""
+    def save_files(self, outcome: Outcome) -> None:
+        """Keep what a worker that does not see the folder sent; the last file says that the others are there."""
         for name, file in outcome.files.items():
             with atomic_path(self.path / name) as temporary:
                 temporary.write_bytes(file)
