@@ -12,7 +12,10 @@ from posed_config import configure
 import semstab
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
+from semstab.engine import InProcess
+from semstab.engine.folder import Folder
 from semstab.engine.sizing import sized
+from semstab.engine.survey import Survey
 from semstab.engine.tiling.sights import look_at
 from semstab.engine.units import Plan, make_plan
 from semstab.engine.work import memory
@@ -51,21 +54,28 @@ def test_what_does_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) ->
     assert not (tmp_path / "run" / "voxels").exists()
 
 
+def survey(config, tmp_path) -> Survey:
+    """By threads of this process."""
+    folder = Folder(tmp_path / "run", config)
+    folder.close()
+    return Survey(InProcess(), folder, "start")
+
+
 def test_what_does_not_fit_is_fused_in_tiles(root, tmp_path) -> None:
     """The limit is what is free, where none is set."""
     plan, config = planned(root)
-    assert not sized(config, plan.units, tmp_path).tilings
+    assert not sized(config, plan.units, survey(config, tmp_path)).tilings
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(memory, "available_bytes", lambda: 1000)
-        sizing = sized(config, plan.units, tmp_path)
+        sizing = sized(config, plan.units, survey(config, tmp_path))
     assert sizing.tilings.keys() == {each.identity for each in plan.units}
     assert "1e-06 GB are there: fused in" in sizing.remarks[0]
 
 
 def test_no_further_frame_is_read_where_there_is_ample_room(root, tmp_path, monkeypatch) -> None:
     plan, config = planned(root)
-    monkeypatch.setattr("semstab.engine.sizing.look_at", lambda *_: pytest.fail("frames were read"))
-    sizing = sized(config, plan.units, tmp_path)
+    monkeypatch.setattr("semstab.engine.survey.look_at", lambda *_: pytest.fail("frames were read"))
+    sizing = sized(config, plan.units, survey(config, tmp_path))
     assert not sizing.tilings
     assert not sizing.refused
 

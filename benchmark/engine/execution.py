@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.manifest import manifest
 from semstab.engine.observer import Factory, Observer, Observers
 from semstab.engine.sizing import Sizing, sized
+from semstab.engine.survey import Survey
 from semstab.engine.tiled_unit import TiledUnit
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan, must_agree
@@ -37,7 +37,7 @@ from semstab.model.voxels.tiles import Tiles, side_by_side
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 from semstab.statistics import BackboneComparison, Looks, claimed_together
-from semstab.statistics.versus.backbones import Region
+from semstab.statistics.versus.backbones import Region, Regions
 
 GB = 1e9
 
@@ -110,6 +110,7 @@ def _execute(
         told.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()
+        executor.close()
     told.raise_first()
     return result, found.causes
 
@@ -160,7 +161,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
             found.geometry, found.advice = _checked(plan.config, missing, told)
     with folder.started() as start, lend(start, plan.scenes):
         with watch("sizing"):
-            sizing = sized(plan.config, missing, folder.path, executor.width)
+            sizing = sized(plan.config, missing, Survey(executor, folder, start))
         for line in sizing.remarks:
             told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         _refuse(sizing, missing, found, executor, told)
@@ -199,7 +200,7 @@ def _work_off(
     factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
     requests = [request for tiled in in_tiles.values() for request in tiled.missing()]
     jobs = split(_jobs(plan.config, folder.path, start, whole, factories), executor.width)
-    jobs += _portion_jobs(plan.config, folder.path, start, requests, units)
+    jobs += _portion_jobs(plan.config, folder.path, start, requests, units, factories)
     kept = (tiled.take(None) for tiled in in_tiles.values())
     with contextlib.closing(executor.run(jobs, told)) as finished:
         done = (outcome for _, outcomes in finished for outcome in outcomes)
@@ -210,7 +211,8 @@ def _work_off(
                 found.watch.seconds[stage] += seconds
             if tiled is not None and outcome.portion is not None:
                 told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
-                ended = tiled.take(outcome)
+                with found.watch("assemble"):
+                    ended = tiled.take(outcome)
             if ended is not None and ended.identity not in found.errors:
                 _keep(folder, found, each, ended)
                 if tiled is not None and ended.content is not None:
@@ -294,14 +296,23 @@ def _jobs(
 
 
 def _portion_jobs(
-    config: Config, folder: Path, start: str, requests: Sequence[Request], units: Mapping[str, Planned]
+    config: Config,
+    folder: Path,
+    start: str,
+    requests: Sequence[Request],
+    units: Mapping[str, Planned],
+    observers: Sequence[Factory],
 ) -> list[Job]:
-    """A job each, so that no two maps are in memory at once."""
+    """A job each, so that no two maps are in memory at once; a frame is shown to observers of one of them."""
     memory = None if config.memory_gb is None else config.memory_gb * GB
-    named = [(units[request.identity].unit, request) for request in requests]
-    return [
-        Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory) for unit, request in named
-    ]
+    jobs, shown = [], set()
+    for request in requests:
+        unit = units[request.identity].unit
+        frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
+        own = tuple(observers) if request.shown and frames not in shown else ()
+        shown.add(frames)
+        jobs.append(Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own))
+    return jobs
 
 
 def _result(plan: Plan, folder: Folder, found: _Found) -> Result:
@@ -392,7 +403,7 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
         if len(there) > 1:
-            regions = partial(_regions_of, there, config, tables)
+            regions = _regions_of(there, config, tables)
             kept = {record.unit.backbone: record.looks_file for record in there}
             looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
             found = comparison(scene, regions, looks if len(looks) == len(there) else None)
@@ -400,21 +411,31 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
                 yield found
 
 
-def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Iterator[Region]:
+def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
     """The maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
     names = [record.unit.backbone for record in there]
-    truths = [record.truth_file for record in there if record.truth_file is not None][:1]
+    in_tiles = any(record.in_tiles for record in there)
     files = [record.events_file for record in there if config.events]
-    logs = [file for file in files if file is not None and file.exists()]
+    logs: list[Tiles[Any]] = [Tiles.open(file, Events) for file in files if file is not None and file.exists()]
     logs = logs if len(logs) == len(there) else []
-    maps = [Tiles.open(file, VoxelTable) for record in there if (file := record.voxels_file) is not None]
-    if not any(record.in_tiles for record in there):
-        maps = [Tiles.of(tables.of(record)) for record in there]
-    further = [Tiles.open(file, VoxelTable) for file in truths], [Tiles.open(file, Events) for file in logs]
-    for own in side_by_side([*maps, *further[0], *further[1]]):
-        found, true, events = own[: len(maps)], own[len(maps) : len(own) - len(logs)], own[len(own) - len(logs) :]
-        log = dict(zip(names, events, strict=True)) if logs else None
-        yield Region(dict(zip(names, found, strict=True)), log, true[0] if truths else None)
+    truths = [Tiles.open(file, VoxelTable) for record in there if (file := record.truth_file) is not None][:1]
+    maps = [
+        Tiles.open(file, VoxelTable) if in_tiles else Tiles.of(tables.of(record))
+        for record in there
+        if (file := record.voxels_file) is not None
+    ]
+
+    def regions() -> Iterator[Region]:
+        for own in side_by_side([*maps, *logs, *truths]):
+            found, events, truth = (
+                own[: len(maps)],
+                own[len(maps) : len(maps) + len(logs)],
+                own[len(maps) + len(logs) :],
+            )
+            log = dict(zip(names, events, strict=True)) if logs else None
+            yield Region(dict(zip(names, found, strict=True)), log, truth[0] if truth else None)
+
+    return regions
 
 
 def _regions(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[RegionFlicker]:

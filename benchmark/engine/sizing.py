@@ -7,12 +7,12 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from semstab.backends import restrictable
 from semstab.config import Config
+from semstab.engine.survey import Survey
 from semstab.engine.tiling.partition import Tiling, tiled
-from semstab.engine.tiling.sights import CELL, SIGHTS, Sights, look_at
+from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.memory import GB, Kind, limit, most_voxels, takes, too_large
 from semstab.errors import ConfigError, DataError
@@ -37,12 +37,12 @@ class Sizing:
     remarks: list[str] = field(default_factory=list)
 
 
-def sized(config: Config, missing: Sequence[Planned], folder: Path, width: int = 1) -> Sizing:
-    """Look at units that are to be fused by `width` tasks at once; what cannot be read is left to them to report."""
+def sized(config: Config, missing: Sequence[Planned], survey: Survey) -> Sizing:
+    """Look at units that are to be fused; what cannot be read is left to them to report."""
     found = Sizing()
     for group in _groups(missing):
         with contextlib.suppress(DataError):
-            _size(config, group, folder, width, found)
+            _size(config, group, survey, found)
     return found
 
 
@@ -58,13 +58,13 @@ def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
     yield from together.values()
 
 
-def _size(config: Config, group: Sequence[PlannedUnit], folder: Path, width: int, found: Sizing) -> None:
-    task, settings = group[0].task, group[0].config
+def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: Sizing) -> None:
+    task, settings, width = group[0].task, group[0].config, survey.executor.width
     forced = isinstance(config.tile_size, int)
     if not forced and _surely_fits(config, group):
         return
     size = config.tile_size if isinstance(config.tile_size, int) else None
-    sights = _sights(folder, task, settings, min(CELL, size or CELL))
+    sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
     kinds = _kinds(group, soft=_is_soft(task))
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
@@ -128,14 +128,10 @@ def _cannot_be_tiled(config: Config, group: Sequence[PlannedUnit]) -> str | None
     return f"backend '{other[0]}' cannot be restricted to tiles" if other else None
 
 
-def _sights(folder: Path, task: Task, settings: Config, cell: int) -> Sights:
+def _sights(survey: Survey, planned: PlannedUnit, settings: Config, cell: int) -> Sights:
     """What the frames see, kept from before or looked at now."""
+    task = planned.task
     noise = None if task.perturbation is None else task.perturbation.model_dump()
     content = [task.scene.name, task.digest, settings.voxel_size, settings.pixel_stride, noise, task.indices, cell]
     key = hashlib.blake2b(json.dumps(content).encode(), digest_size=12).hexdigest()
-    file = folder / SIGHTS / f"{key}.npz"
-    kept = Sights.load(file)
-    if kept is None:
-        kept = look_at(task, settings.voxel_size, settings.pixel_stride, cell, settings.threads)
-        kept.save(file)
-    return kept
+    return survey.sights(planned, settings, cell, key)

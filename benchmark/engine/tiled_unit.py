@@ -51,7 +51,7 @@ class TiledUnit:
         if outcome is not None and outcome.error is not None:
             return outcome
         if outcome is not None and outcome.portion is not None:
-            self._folder.save_portion(outcome)
+            self._folder.save_files(outcome)
             found = self._folder.portion(self._key, outcome.portion)
             if found is None:
                 return failed(

@@ -39,12 +39,15 @@ def prefetch(
     size: Callable[[T], int] = lambda item: 0,
     limit: int = LOOK_AHEAD_BYTES,
 ) -> Generator[Fetched[T], None, None]:
-    """Yield read(index) for each index in order; `threads` workers are at most `threads` + 1 items ahead.
+    """Yield read(index) for each index in order; `threads` workers are at most `threads` + 1 items ahead, 0 none.
 
     Where that many items, each of `size` bytes, exceed `limit` bytes, fewer are read ahead, but always one.
     What read raises for an index is raised in its place, after the items before it. Closing the iterator drops what
     was not begun and waits for what was: no thread outlives it.
     """
+    if threads == 0:
+        yield from (Fetched(item, seconds, seconds) for item, seconds in (_timed(read, index) for index in indices))
+        return
     threads = threads or default_threads()
     waiting = iter(indices)
     ahead: deque[Future[tuple[T, float]]] = deque()

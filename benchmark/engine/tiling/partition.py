@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -13,6 +14,9 @@ from semstab.model.voxels.extent import Extent
 
 ROOM = 4
 """A tile takes at most that part of what a task may take, where its size is not given."""
+
+UNEVEN = 0.2
+"""A rectangle is cut no further from where both sides weigh the same, as a share of it: strips have long edges."""
 
 Cost = Callable[[float, float], float]
 """Bytes of a map of so many voxels and observations."""
@@ -70,7 +74,7 @@ def tiled(sights: Sights, cost: Cost, budget: float, size: int | None = None, le
     tiles = sights.in_tiles(max(size, sights.size))
     total = cost(float(tiles.voxels.sum()), float(tiles.observations.sum()))
     budget = min(budget, 1.1 * total / least)
-    parts = [_part(tiles, rows) for rows in _split(tiles, cost, budget, np.arange(len(tiles.place)))]
+    parts = [_part(tiles, rows) for rows in _split(tiles, cost, budget)]
     x, y, z = tiles.origin.tolist()
     return Tiling(tiles.size, tuple(part for part in parts if part.frames), (x, y, z))
 
@@ -87,25 +91,53 @@ def tile_size(sights: Sights, cost: Cost, budget: float) -> int:
     return size
 
 
-def _split(tiles: Sights, cost: Cost, budget: float, rows: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
-    """Rows of tiles by rectangle: halves by what they cost, cut across the longer side, until each fits."""
-    weight = np.array([cost(*own) for own in zip(tiles.voxels[rows], tiles.observations[rows], strict=True)])
+def _split(tiles: Sights, cost: Cost, budget: float) -> Iterator[npt.NDArray[np.int64]]:
+    """Rows of tiles by rectangle, each within the budget as far as there is something to cut."""
+    weight = np.array([cost(*own) for own in zip(tiles.voxels, tiles.observations, strict=True)])
+    waiting = [np.arange(len(tiles.place))]
+    while waiting:
+        rows = waiting.pop()
+        if weight[rows].sum() <= budget or (cut := _best_cut(tiles, rows, weight[rows] / budget)) is None:
+            yield rows
+        else:
+            below = tiles.place[rows, cut.axis] < cut.at
+            waiting += [rows[~below], rows[below]]
+
+
+@dataclass(frozen=True, order=True)
+class _Cut:
+    """Of a rectangle of tiles across an axis, before the tiles at that coordinate; the least is the best.
+
+    parts  that the two sides will come to
+    twice  frames that see both sides, and will be decoded for either
+    """
+
+    parts: int
+    uneven: bool
+    twice: int
+    imbalance: float
+    axis: int
+    at: int
+
+
+def _best_cut(tiles: Sights, rows: npt.NDArray[np.int64], weight: npt.NDArray[np.float64]) -> _Cut | None:
+    """Where the rectangle of these tiles, whose weight is in parts, is cut; None where it is one tile."""
     place = tiles.place[rows]
-    length = np.ptp(place, axis=0) + 1
-    if weight.sum() <= budget or length.max() == 1:
-        yield rows
-        return
-    axis = int(np.argmax(length))
-    low = _middle(place[:, axis], weight)
-    for half in (place[:, axis] < low, place[:, axis] >= low):
-        yield from _split(tiles, cost, budget, rows[half])
-
-
-def _middle(at: npt.NDArray[np.int32], weight: npt.NDArray[np.float64]) -> int:
-    """Where to cut: the coordinate at which the two sides' weights are closest, with something on either side."""
-    values, of = np.unique(at, return_inverse=True)
-    below = np.cumsum(np.bincount(of, weights=weight))[:-1]
-    return int(values[1 + np.argmin(np.abs(below - weight.sum() / 2))])
+    inside = ((tiles.cell >= place.min(axis=0)) & (tiles.cell <= place.max(axis=0))).all(axis=1)
+    frame, cell = tiles.frame[inside], tiles.cell[inside]  # sorted by frame
+    first = np.flatnonzero(np.diff(frame, prepend=-1))
+    total, found = weight.sum(), []
+    for axis in (0, 1):
+        low = np.minimum.reduceat(cell[:, axis], first) if len(first) else first
+        high = np.maximum.reduceat(cell[:, axis], first) if len(first) else first
+        values, of = np.unique(place[:, axis], return_inverse=True)
+        below = np.cumsum(np.bincount(of, weights=weight))[:-1]
+        for at, part in zip(values[1:].tolist(), below.tolist(), strict=True):
+            twice = int(np.count_nonzero((low < at) & (high >= at)))
+            parts = math.ceil(part) + math.ceil(total - part)
+            imbalance = abs(part / total - 0.5)
+            found.append(_Cut(parts, imbalance > UNEVEN, twice, imbalance, axis, at))
+    return min(found, default=None)
 
 
 def _part(tiles: Sights, rows: npt.NDArray[np.int64]) -> Part:

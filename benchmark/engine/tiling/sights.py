@@ -14,6 +14,7 @@ import numpy.typing as npt
 from semstab.backends.shared.association import check_depth
 from semstab.backends.shared.pixels.keys import index_of_keys, out_of_reach
 from semstab.backends.shared.pixels.pixel_keys import frame_terms
+from semstab.engine.tiling.collected import SHARE, Collected, Seen
 from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
@@ -27,12 +28,6 @@ SIGHTS = "sights"
 
 CELL = 64
 """Voxels along an edge of the cells that are told apart at first."""
-
-MOST_ROWS = 1 << 22
-"""Pairs of frame and cell that are kept; where there are more, cells become twice as wide."""
-
-BUDGET, SHARE = 1 << 20, 1 << 29
-"""Sampled voxels that are kept: one in eight at first, and half of them go whenever there are too many."""
 
 ALL = 1 << 32
 
@@ -85,6 +80,18 @@ class Sights:
         return cls(**own)
 
 
+@dataclass(frozen=True)
+class Looking:
+    """A look at some frames of a map whose first camera is in the voxel `origin`, by cells of that edge.
+
+    file  of what is seen, in the folder
+    """
+
+    file: str
+    origin: tuple[int, int, int]
+    cell: int
+
+
 def look_at(
     task: Task, voxel_size: float, pixel_stride: int = 1, cell: int = CELL, threads: int | None = None
 ) -> Sights:
@@ -92,15 +99,49 @@ def look_at(
 
     Raises DataError where a frame cannot be read, has no finite depth, or reaches too far for a map.
     """
-    origin = np.floor(_geometry(task, task.indices[0], pixel_stride).T_wc[:3, 3] / voxel_size).astype(np.int64)
+    origin = origin_of(task, voxel_size, pixel_stride)
+    return sights_of([seen_by(task, voxel_size, pixel_stride, origin, cell, threads)], origin, cell)
 
-    def seen(index: int) -> _Seen:
-        return _look(_geometry(task, index, pixel_stride), voxel_size, origin, cell)
 
-    collected = _Collected(origin, cell)
+def origin_of(task: Task, voxel_size: float, pixel_stride: int = 1) -> tuple[int, int, int]:
+    """The voxel of the first camera. Raises DataError where the first frame cannot be read."""
+    x, y, z = np.floor(_geometry(task, task.indices[0], pixel_stride).T_wc[:3, 3] / voxel_size).astype(int).tolist()
+    return x, y, z
+
+
+def seen_by(
+    task: Task,
+    voxel_size: float,
+    pixel_stride: int,
+    origin: tuple[int, int, int],
+    cell: int = CELL,
+    threads: int | None = None,
+) -> Seen:
+    """What the frames of a task see of a map whose first camera is in that voxel; raises what `look_at` raises."""
+    first = np.array(origin, dtype=np.int64)
+
+    def seen(index: int) -> Seen:
+        return seen_in(_geometry(task, index, pixel_stride), voxel_size, first, cell)
+
+    collected = Collected(cell)
     for fetched in prefetch(seen, task.indices, threads=threads):
         collected.add(fetched.item)
-    return collected.sights()
+    return collected.seen()
+
+
+def sights_of(stretches: Iterable[Seen], origin: tuple[int, int, int], cell: int = CELL) -> Sights:
+    """What all frames see, from what stretches of them do, in order: the same, however they are cut."""
+    collected = Collected(cell)
+    for each in stretches:
+        collected.add(each)
+    seen, first = collected.seen(), np.array(origin, dtype=np.int64)
+    index = index_of_keys(seen.key, first)[:, :2] >> (seen.size.bit_length() - 1)
+    places = np.concatenate([index.astype(np.int32), seen.rows[:, 1:]])
+    place, of = np.unique(places, axis=0, return_inverse=True)
+    of, scale = of.ravel()[: len(index)], ALL / seen.share
+    voxels = (scale * np.bincount(of, minlength=len(place))).astype(np.float64)
+    observations = (scale * np.bincount(of, weights=seen.looks, minlength=len(place))).astype(np.float64)
+    return Sights(seen.size, seen.rows[:, 0], seen.rows[:, 1:], place, voxels, observations, seen.frames, first)
 
 
 def _geometry(task: Task, index: int, pixel_stride: int) -> Frame:
@@ -111,17 +152,8 @@ def _geometry(task: Task, index: int, pixel_stride: int) -> Frame:
     return frame.every(pixel_stride)
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Of one frame: its cells (t, 2), and the sampled voxels among those that it sees, (n,) keys with their hashes."""
-
-    frame: int
-    cell: Int32
-    key: Int64
-    drawn: Int64
-
-
-def _look(frame: Frame, voxel_size: float, origin: Int64, size: int) -> _Seen:
+def seen_in(frame: Frame, voxel_size: float, origin: Int64, size: int = CELL) -> Seen:
+    """What one frame sees, by cells of that edge in voxels; raises what `look_at` raises."""
     check_depth(frame)
     H, W = frame.shape
     camera = frame.intrinsics
@@ -142,70 +174,5 @@ def _look(frame: Frame, voxel_size: float, origin: Int64, size: int) -> _Seen:
         room = min(H * W, 8 * room)
     packed = np.unique(cells[:n])
     key, first = np.unique(keys[:m], return_index=True)
-    cell = np.column_stack([packed >> 32, packed.astype(np.int32)]).astype(np.int32)
-    return _Seen(frame.index, cell, key, drawn[:m][first])
-
-
-class _Collected:
-    """What is seen by frame after frame, in bounded memory."""
-
-    def __init__(self, origin: Int64, cell: int) -> None:
-        self._origin, self._cell = origin, cell
-        self._size, self._share, self._frames = cell, SHARE, 0
-        self._rows: list[npt.NDArray[np.int32]] = []
-        self._count = 0
-        self._keys = np.zeros(0, np.int64)
-        self._drawn = np.zeros(0, np.int64)
-        self._looks = np.zeros(0, np.int64)
-        self._parts: list[_Seen] = []
-        self._waiting = 0
-
-    def add(self, seen: _Seen) -> None:
-        """One more frame."""
-        self._frames += 1
-        shift = (self._size // self._cell).bit_length() - 1
-        cell = seen.cell if not shift else np.unique(seen.cell >> shift, axis=0)
-        self._rows.append(np.column_stack([np.full(len(cell), seen.frame, np.int32), cell]))
-        self._count += len(cell)
-        while self._count > MOST_ROWS:
-            self._widen()
-        self._parts.append(seen)
-        self._waiting += len(seen.key)
-        if self._waiting > BUDGET:
-            self._settle()
-
-    def sights(self) -> Sights:
-        """What there is so far."""
-        self._settle()
-        rows = _joined(self._rows)
-        index = index_of_keys(self._keys, self._origin)[:, :2] >> (self._size.bit_length() - 1)
-        places = np.concatenate([index.astype(np.int32), rows[:, 1:]])
-        place, of = np.unique(places, axis=0, return_inverse=True)
-        of, scale = of.ravel()[: len(index)], ALL / self._share
-        voxels = (scale * np.bincount(of, minlength=len(place))).astype(np.float64)
-        observations = (scale * np.bincount(of, weights=self._looks, minlength=len(place))).astype(np.float64)
-        return Sights(self._size, rows[:, 0], rows[:, 1:], place, voxels, observations, self._frames, self._origin)
-
-    def _widen(self) -> None:
-        self._size *= 2
-        rows = _joined(self._rows) >> np.array([0, 1, 1], np.int32)
-        self._rows = [np.unique(rows, axis=0)]
-        self._count = len(self._rows[0])
-
-    def _settle(self) -> None:
-        """Count what was seen since, and let voxels go where there are too many."""
-        keys = np.concatenate([self._keys, *(seen.key for seen in self._parts)])
-        drawn = np.concatenate([self._drawn, *(seen.drawn for seen in self._parts)])
-        looks = np.concatenate([self._looks, np.ones(self._waiting, np.int64)])
-        self._parts, self._waiting = [], 0
-        self._keys, first, of = np.unique(keys, return_index=True, return_inverse=True)
-        self._looks = np.bincount(of, weights=looks, minlength=len(first)).astype(np.int64)
-        self._drawn = drawn[first]
-        while len(self._keys) > BUDGET or (self._drawn >= self._share).any():
-            self._share //= 2 if len(self._keys) > BUDGET else 1
-            kept = self._drawn < self._share
-            self._keys, self._drawn, self._looks = self._keys[kept], self._drawn[kept], self._looks[kept]
-
-
-def _joined(rows: Iterable[npt.NDArray[np.int32]]) -> npt.NDArray[np.int32]:
-    return np.concatenate([np.zeros((0, 3), np.int32), *rows])
+    rows = np.column_stack([np.full(len(packed), frame.index), packed >> 32, packed.astype(np.int32)])
+    return Seen(size, SHARE, 1, rows.astype(np.int32), key, drawn[:m][first], np.ones(len(key), np.int64))

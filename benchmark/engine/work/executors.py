@@ -33,17 +33,23 @@ class Executor(Protocol):
     name       for the manifest
     width      how many jobs it runs at once
     elsewhere  whether other processes do the work, so that observers here do not see it
+    remote     whether they may be on other machines, so that threads of this process are no help to them
     """
 
     name: str
     width: int
     elsewhere: bool
+    remote: bool
 
     def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest.
 
         `observers` are told of the work that is done in this very process.
         """
+        ...
+
+    def close(self) -> None:
+        """Nothing more is to be run."""
         ...
 
 
@@ -53,17 +59,22 @@ class InProcess:
     name = "in this process"
     width = 1
     elsewhere = False
+    remote = False
 
     def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """In order."""
         for job in jobs:
             yield job, run_job(job, observers)
 
+    def close(self) -> None:
+        """Nothing is left behind."""
+
 
 class LocalProcesses:
     """That many processes on this machine, which share its cores and its free memory."""
 
     elsewhere = True
+    remote = False
 
     def __init__(self, jobs: int) -> None:
         if jobs < 1:
@@ -110,6 +121,9 @@ class LocalProcesses:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
             pool.shutdown(wait=False, cancel_futures=True)
 
+    def close(self) -> None:
+        """Processes end with what they were started for."""
+
     def _with_a_share(self, job: Job) -> Job:
         memory = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
         threads = job.threads or default_threads()
@@ -144,6 +158,7 @@ class DaskCluster:
     """
 
     elsewhere = True
+    remote = True
 
     def __init__(self, scheduler: str) -> None:
         try:
@@ -157,14 +172,18 @@ class DaskCluster:
 
     def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
         """As they finish. The scheduler gives the job of a worker that died to another one."""
-        with self._client:
-            self._require_same_version()
-            futures = {self._client.submit(_run_settled, job, pure=False): job for job in jobs}
-            try:
-                for future in _distributed().as_completed(list(futures), loop=self._client.loop):
-                    yield futures[future], _outcomes(future, futures[future])
-            finally:
-                self._client.cancel(list(futures))
+        self._require_same_version()
+        futures = {self._client.submit(_run_settled, job, pure=False): job for job in jobs}
+        try:
+            for future in _distributed().as_completed(list(futures), loop=self._client.loop):
+                yield futures[future], _outcomes(future, futures[future])
+                future.release()
+        finally:
+            self._client.cancel(list(futures))
+
+    def close(self) -> None:
+        """Leave the scheduler."""
+        self._client.close()
 
     def _require_same_version(self) -> None:
         """Raise ConfigError where a worker's semstab is missing, or another one."""
@@ -173,19 +192,24 @@ class DaskCluster:
             there = self._client.run(importlib.metadata.version, "semstab")
         except importlib.metadata.PackageNotFoundError as error:
             raise ConfigError("a worker of the scheduler has no semstab; install semstab there") from error
+        if not there:
+            raise ConfigError("the scheduler has no worker; start some with 'dask worker'")
         for worker, version in there.items():
             if version != own:
                 raise ConfigError(f"worker {worker} has semstab {version}, here is {own}; install the same on both")
 
 
 def _run_settled(job: Job) -> tuple[Outcome, ...]:
-    """Run a job in a worker of the cluster, which has nobody else to settle it, with as many threads as are its own."""
+    """Run a job in a worker of the cluster, which has nobody else to settle it, with as many threads as are its own.
+
+    It runs a job in each of its threads at once: frames are decoded in turn where nothing else is said.
+    """
     settle()
     import numba
 
     with contextlib.suppress(ValueError):  # called outside of a worker
         numba.set_num_threads(min(_distributed().get_worker().state.nthreads, numba.get_num_threads()))
-    return run_job(job)
+    return run_job(dataclasses.replace(job, threads=job.threads or 0))
 
 
 def _distributed() -> Any:

@@ -85,7 +85,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("measure"):
         summary = _summary(one, table, found, sizes)
     with watch("write"):
-        saved, returned = _written(job, _savers(stream, one, table, truth, found))
+        saved, returned = written(job, _savers(stream, one, table, truth, found))
     with watch("reference"):
         checked = None if one.reference is None else _checked(one, table, one.reference)
     content = UnitContent(task.digest, summary, files=saved, checked=checked)
@@ -147,7 +147,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None, sizes: tup
     return unit_summary(
         one.task,
         one.rows,
-        summarise(table, one.request.config.strata),
+        summarise(table, one.request.config.strata) if found is None else found.table,
         None if found is None else found.summary,
         None if one.hard is None else reduced_of(reduced_sums(one.hard.table())),
         sizes,
@@ -223,7 +223,7 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     with watch("reference"):
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
     with watch("write"):
-        saved, returned = _written(job, _portion_savers(stream, one, portion, found))
+        saved, returned = written(job, _portion_savers(stream, one, portion, found))
         rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
         finished = Finished(
             About(portion.kind, saved, checked, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
@@ -233,7 +233,7 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
             np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),
             np.array(rows).reshape(-1, len(COLUMNS)),
         )
-        _, left = _written(job, {f"{portion.folder}/{portion.name}.npz": finished.save})
+        _, left = written(job, {f"{portion.folder}/{portion.name}.npz": finished.save})
     return Outcome(one.request.identity, portion=portion.name, files=returned | left)
 
 
@@ -339,7 +339,7 @@ def _savers(
     return savers
 
 
-def _written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
+def written(job: Job, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
     """Write files into the folder where it is shared; their digests, and their bytes where it is not."""
     digests, returned = {}, {}
     shared = shared_marker(job.folder, job.start).exists()

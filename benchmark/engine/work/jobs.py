@@ -12,6 +12,7 @@ from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.tiling.portion import SIZES, Portion
+from semstab.engine.tiling.sights import Looking
 from semstab.engine.tiling.stretches import Stretch, stretches_of
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.image_space import CLIPS
@@ -30,6 +31,7 @@ class Request:
     left_out  how many selected frames lack a file or a pose
     regions   whether it is the flicker of regions without classes, and nothing is fused
     portion   what of a unit in tiles is wanted; None for all of a unit
+    looking   where only what its frames see is wanted
     """
 
     identity: str
@@ -41,6 +43,7 @@ class Request:
     left_out: int = 0
     regions: bool = False
     portion: Portion | None = None
+    looking: Looking | None = None
 
     @property
     def within(self) -> Extent | None:
@@ -92,7 +95,11 @@ class Request:
             found.append(fused._of(portion, part.frames))
         return found
 
-    def _of(self, portion: Portion, frames: Sequence[int]) -> Request:
+    def looking_at(self, frames: Sequence[int], looking: Looking) -> Request:
+        """What these frames see."""
+        return replace(self._of(None, frames), looking=looking)
+
+    def _of(self, portion: Portion | None, frames: Sequence[int]) -> Request:
         """The same, of these frames and that portion alone."""
         config = self.config.model_copy(update={"frames": FrameSelection(list=tuple(frames))})
         return replace(self, config=config, portion=portion)
@@ -114,7 +121,7 @@ class Job:
 
     start         names this start: a worker opens the dataset once for it
     folder        of the run or study
-    threads       that decode frames ahead
+    threads       that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
     memory_bytes  that maps may take before some are put off to another pass over the frames; None: half of what is free
     observers     made where the job is done, and told of what is fused there
     width         how many jobs share the machine's memory

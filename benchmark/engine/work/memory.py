@@ -40,7 +40,7 @@ class Kind:
         fused = expected_bytes(self.backend, n, looks, self.K, soft=self.soft)
         truth = expected_bytes(self.backend, n, looks, self.K) if self.logged else 0
         logs = log_bytes(looks, self.K, soft=self.soft) if self.logged else 0
-        followed = expected_bytes("numpy", n // ONE_IN, looks // ONE_IN, self.K) if self.sampled else 0
+        followed = expected_bytes("numpy", n // ONE_IN, looks // ONE_IN, self.K, soft=self.soft) if self.sampled else 0
         return fused + truth + logs + followed + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
 
 
@@ -88,7 +88,7 @@ def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
 
 def result_bytes(voxels: int, num_classes: int, *, soft: bool) -> int:
     """A voxel table, and what comes from it when it is measured and written."""
-    return voxels * (200 + (10 * num_classes if soft else 0))
+    return voxels * (80 + (10 * num_classes if soft else 0))
 
 
 def _keeps_observations(backend: str) -> bool:

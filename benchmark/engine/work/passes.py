@@ -19,6 +19,7 @@ from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow
 from semstab.engine.work.finish import finish, finish_portion
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
+from semstab.engine.work.looking import look
 from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
@@ -51,7 +52,8 @@ def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]
         scene = _scene(job)
         regions = [request for request in requests if request.regions]
         outcomes += [measure_regions(job, scene, request) for request in regions]
-        requests = tuple(request for request in requests if not request.regions)
+        outcomes += [look(job, scene, request) for request in requests if request.looking is not None]
+        requests = tuple(request for request in requests if not request.regions and request.looking is None)
         while requests:
             fused = Pass(job, scene, requests, told)
             outcomes += fused.run()

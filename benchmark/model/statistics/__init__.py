@@ -158,7 +158,7 @@ class LagBin:
     high: float
     mean: float
     pairs: int
-    alpha: Estimate
+    alpha: Interval
     ceiling: float
 
 

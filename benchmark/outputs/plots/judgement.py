@@ -22,9 +22,10 @@ from semstab.outputs.plots.statistics import (
     draw_reliability,
 )
 from semstab.outputs.plots.style import Figure
-from semstab.outputs.plots.views import Views, column
+from semstab.outputs.plots.views import Views, kept_of
 from semstab.statistics.agreement import ALPHA, PSA
 from semstab.statistics.judging.verdict import RELIABLE, TENTATIVE
+from semstab.statistics.sampling import LEAST_FRAMES
 from semstab.statistics.versus.comparison import compared
 
 if TYPE_CHECKING:
@@ -77,8 +78,9 @@ def _correlograms(judged: Judged) -> Iterator[Figure]:
             slug("correlogram", scene),
             f"Agreement by distance of the looks: {scene}",
             "Alpha between frames of pairs of looks at a place, by how far apart they are in time, angle, range and"
-            " baseline, with bands at 95% over blocks of space, for these frames. Dashed: the same of labels that do"
-            " not depend on the view; the gap is the model's. Bins with few pairs are left out.",
+            f" baseline, with bands at 95%: for the next flight if {LEAST_FRAMES} frames of a bin tell of it, else"
+            " (open points) for this map. Dashed: the same of labels that do not depend on the view; the gap is the"
+            " model's. Bins with few pairs are left out.",
             f"Four panels of {scene}, one curve a backbone with its band and a dashed ceiling: agreement against frames"
             " apart, degrees between the views, ratio of the ranges, and metres between the cameras.",
             partial(draw_correlogram, backbones),
@@ -166,8 +168,9 @@ def _maps(result: Result, kept: Sequence[Record], views: Views) -> Iterator[Figu
 
 
 def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> Canvas:
-    above, truth = views.above(record, up), column(record, "true_label")
-    return draw_uncertainty(above, None if truth is None else right_or_wrong(above.table, truth[above.shown]))
+    above = views.above(record, up)
+    known = kept_of(record, above.table, ("true_label", "stable"))
+    return draw_uncertainty(above, None if known is None else right_or_wrong(above.table, *known))
 
 
 def _sweeps(result: Result) -> Iterator[Figure]:

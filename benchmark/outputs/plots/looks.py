@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from semstab.model.statistics import Correlogram, LagBin
+from semstab.model.statistics import NEXT_FLIGHT, Correlogram, LagBin
 from semstab.outputs.plots.style import FAINT, INK, PAGE, canvas, color, mark_panel
 
 if TYPE_CHECKING:
@@ -21,7 +21,10 @@ AXES = (
 
 
 def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
-    """Alpha between frames with its band, and its ceiling; one panel for each way of being apart."""
+    """Alpha between frames with its band, and its ceiling; one panel for each way of being apart.
+
+    Points are open where the band is for this map alone.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import NullFormatter
 
@@ -50,7 +53,10 @@ def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
 def _draw_bins(axes: Axes, bins: Sequence[LagBin], shade: str) -> None:
     x = [row.mean for row in bins]
     axes.plot(x, [row.ceiling for row in bins], color=shade, linestyle="--", linewidth=0.9)
-    axes.plot(x, [row.alpha.value for row in bins], color=shade, marker="o", markersize=3.5)
+    axes.plot(x, [row.alpha.value for row in bins], color=shade)
+    for row in bins:
+        face = shade if row.alpha.question == NEXT_FLIGHT else "white"
+        axes.plot(row.mean, row.alpha.value, color=shade, marker="o", markersize=3.5, markerfacecolor=face)
     axes.fill_between(
         x, [row.alpha.low for row in bins], [row.alpha.high for row in bins], color=shade, alpha=0.15, linewidth=0
     )

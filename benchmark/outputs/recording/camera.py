@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from semstab.datasets import Scene
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.outputs.recording.background import Background
-from semstab.outputs.recording.entities import path
+from semstab.outputs.recording.entities import Clock, path
 
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""
@@ -78,16 +79,36 @@ class CameraLog:
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
         self._depth_unit: float | None = None
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """Log the frame's pose, camera, colour and depth, where that has not happened yet."""
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, track: bool = True) -> None:
+        """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
         if frame.index in self._logged:
             return
         self._logged.add(frame.index)
-        pose = frame.T_wc.copy()
+        self._log_camera(stream, frame, self._follow(frame.T_wc))
+        if track:
+            self._log_track(stream)
+        background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
+
+    def log_track(self, stream: rr.RecordingStream, clock: Clock, indices: Sequence[int]) -> None:
+        """Log the track of frames that others log, unless it is known."""
+        times = self.scene.timestamps
+        for index in indices if not self.poses else ():
+            self._follow(self.scene.T_wc(index))
+            clock.set(stream, index, None if times is None else float(times[index]))
+            self._log_track(stream)
+
+    def _follow(self, T_wc: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The next pose, relative to the map's origin."""
+        pose = T_wc.copy()
         pose[:3, 3] -= self._translation
         self.poses.append(pose)
-        self._log_camera(stream, frame, pose)
-        background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
+        return pose
+
+    def _log_track(self, stream: rr.RecordingStream) -> None:
+        n = len(self.poses)
+        if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
+            track = np.array([p[:3, 3] for p in self.poses])
+            stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride_of(frame.shape)))
@@ -111,10 +132,6 @@ class CameraLog:
             )  # fmt: skip
             stream.log(self._path(), pinhole)
         stream.log(self._path(), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-        n = len(self.poses)
-        if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
-            track = np.array([p[:3, 3] for p in self.poses])
-            stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
 
     def _depth(self, frame: Frame, stride: int) -> rr.DepthImage:
         """16-bit depth in a unit that the scene's first frame decides: a decimal part of a metre."""

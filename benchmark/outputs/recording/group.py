@@ -87,6 +87,17 @@ class GroupLog:
 
         background.submit(frame.index, frame.timestamp, job)
 
+    def see(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
+        """Log what a frame shows that goes into no map here."""
+        previous, self._previous = self._previous, frame
+
+        def job() -> None:
+            self._log_labels(stream, frame)
+            if previous is not None:
+                self._log_flicker(stream, previous, frame)
+
+        background.submit(frame.index, frame.timestamp, job)
+
     @property
     def grown(self) -> int:
         """Voxels of the map that is drawn while it grows."""
@@ -130,17 +141,21 @@ class GroupLog:
         stream.log(path(scene, "difference_report", backbone, f"{first} and {second}"), report, static=True)
 
     def _log_pictures(self, stream: rr.RecordingStream, caused: FrameDrift) -> None:
-        frame = caused.frame
+        shape = self._log_labels(stream, caused.frame)
+        coarse = stride_of(caused.frame.shape) * _sampling(shape)
+        self._log_picture(stream, caused.frame, "drift", drift_colors.levels_of(*caused.at(coarse)), coarse)
+
+    def _log_labels(self, stream: rr.RecordingStream, frame: Frame) -> tuple[int, ...]:
+        """The shape of the picture."""
         stride = stride_of(frame.shape)
-        labels: Any = np.ascontiguousarray(frame.predicted[::stride, ::stride])
-        coarse = stride * _sampling(labels.shape)
-        for name, picture, step in (
-            ("labels", labels, stride),
-            ("drift", drift_colors.levels_of(*caused.at(coarse)), coarse),
-        ):
-            entity = f"{self._entity}/{name}"
-            self._overlay.log(stream, entity, frame.shape, picture.shape, step)
-            stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
+        labels = np.ascontiguousarray(frame.predicted[::stride, ::stride])
+        self._log_picture(stream, frame, "labels", labels, stride)
+        return labels.shape
+
+    def _log_picture(self, stream: rr.RecordingStream, frame: Frame, name: str, picture: Any, stride: int) -> None:
+        entity = f"{self._entity}/{name}"
+        self._overlay.log(stream, entity, frame.shape, picture.shape, stride)
+        stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
 
     def _log_flicker(self, stream: rr.RecordingStream, previous: Frame, frame: Frame) -> None:
         """Motion-compensated flicker: of a sample of the frame's pixels, looked up in the whole frame before."""

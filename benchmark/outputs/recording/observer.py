@@ -130,11 +130,14 @@ class Recording(Observer):
             background.submit(frame.index, frame.timestamp, show)
 
     def frame_seen(self, task: Task, frame: Frame) -> None:
-        """Log what the camera shows; the map follows when its tiles are there."""
+        """Log what the camera shows; the map follows when its tiles are there, and the track where others look too."""
         (stream, background), scene = self._opened(), task.scene.name
         self._clock.set(stream, frame.index, frame.timestamp)
-        self._origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
-        self._cameras[scene].log(stream, frame, background)
+        origin = self._origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
+        self._cameras[scene].log(stream, frame, background, track=not self.pictures_only)
+        if self._group is None or self._group.task is not task:
+            self._group = GroupLog(task, self._plan.config.voxel_size, origin)
+        self._group.see(stream, frame, background)
 
     def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
         """Log the unit's series and voxels from the folder."""
@@ -318,6 +321,9 @@ class Recording(Observer):
                 if group is None:
                     at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
                     group = GroupLog(task, summary.table.voxel_size, self._origin(stream, task, at))
+                    if self._parts is not None and voxels_of(self._run, unit).is_dir():
+                        self._cameras[unit.scene].log_track(stream, self._clock, task.indices)
+                        self._clock.set(stream, task.indices[-1])
                 factor, table = thinned_map(voxels_of(self._run, unit), group.origin)
                 for values in series.send_rows(
                     stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock

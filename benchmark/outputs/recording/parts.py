@@ -37,8 +37,9 @@ class Parts:
         return replace(target, file=self.folder / "whole.rrd", name=self.name, final=target.file)
 
     def of_group(self, task: Task) -> Target:
-        """Where the pictures of a backbone on a scene go."""
-        return Target(self.folder / f"{slug(task.scene.name, task.backbone)}.rrd", name=self.name)
+        """Where the pictures of a backbone on a scene go, or of a stretch of its frames."""
+        file = f"{slug(task.scene.name, task.backbone)}-{task.indices[0]}.rrd"
+        return Target(self.folder / file, name=self.name)
 
     def merged(self, whole: Target) -> Target:
         """Make one file of the parts, and remove them. Raises ConfigError where that fails."""

@@ -10,6 +10,7 @@ from semstab.model.statistics import Correlogram, Estimate, LagBin, MapStatistic
 from semstab.outputs.tables.statistics import by_scene
 from semstab.outputs.tables.table import Column, Table
 from semstab.statistics.looks.correlogram import STANDARD
+from semstab.statistics.sampling import LEAST_FRAMES
 
 
 def correlogram(result: Result) -> list[Table]:
@@ -32,7 +33,8 @@ def correlogram(result: Result) -> list[Table]:
         "Alpha between frames of pairs of looks at a place, by how far apart they are: models and flights compare at a"
         " stated angle between the directions of view, not over whatever pairs a flight has. Nearest, farthest: the"
         " first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance of the"
-        " cameras. In sampled voxels; intervals at 95% over blocks of space, for these frames."
+        " cameras. In sampled voxels; intervals at 95%, for the next flight"
+        f" if {LEAST_FRAMES} frames of a bin tell of it, else for this map."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the looks", caption, columns, numbers)
 

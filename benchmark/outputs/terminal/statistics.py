@@ -144,7 +144,8 @@ def _reach(reach: Reach) -> list[Row]:
 
 
 def _standard(found: LagBin) -> list[Row]:
-    ceiling = "" if math.isnan(found.ceiling) else f"ceiling {found.ceiling:.2f}; {found.pairs} pairs; this map"
+    alpha, known = found.alpha, not math.isnan(found.ceiling)
+    ceiling = f"ceiling {found.ceiling:.2f}; {found.pairs} pairs; {alpha.undecided or alpha.question}" if known else ""
     return [(f"alpha b.f., views {found.low:g} to {found.high:g} deg.", found.alpha, ceiling)]
 
 

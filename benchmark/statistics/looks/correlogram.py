@@ -15,11 +15,13 @@ import numpy.typing as npt
 
 from semstab.metrics.matching import shared_observations
 from semstab.model.evidence import Evidence
-from semstab.model.statistics import UNDEFINED, Correlogram, Estimate, LagBin
+from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
-from semstab.statistics.blocks import LEVEL, Statistic, gradient_of, spatial_blocks
 from semstab.statistics.looks.entries import Sample
+from semstab.statistics.sampling.collect import cell_edge, cells_of
+from semstab.statistics.sampling.influence import MOST_GROUPS
+from semstab.statistics.sampling.intervals import of_looks
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -27,21 +29,55 @@ Int64 = npt.NDArray[np.int64]
 STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
 
-LEAST_PAIRS, LEAST_BLOCKS = 100, 8
-"""Below so many pairs, or blocks that hold them, a bin is left out."""
+LEAST_PAIRS, LEAST_CUBES = 100, 8
+"""Below so many pairs, or cubes that hold them, a bin is left out."""
+
+MOST_CUBES, MOST_SUMS = 160, 2**17
+"""Of cubes, and of the sums of a bin: of many classes fewer groups of frames are kept apart."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of looks (m,) at one voxel each: the block it is in, how far apart they are by axis, and their sums.
+    """Pairs of looks (m,) at one voxel each: the cube it is in, how far apart they are by axis, and their sums.
 
-    seen, limit  (m, 3 + K) what `between_of` is a function of, of each pair by itself
+    group  of the frames of the first looks, and of the second ones
+    seen   (m, 3 + K) what `between_of` is a function of, of the first looks and of the second ones
+    limit  (m, 3 + K) of both together, in the limit
     """
 
-    block: Int64
+    cube: Int64
     apart: dict[str, Float64]
-    seen: Float64
+    group: tuple[Int64, Int64]
+    seen: tuple[Float64, Float64]
     limit: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cubes (G, 3) and groups of frames (F,) that are kept apart.
+
+    of     (n,) the cube of each voxel, group (m,) the group of each observation
+    edge   of a cube in metres, step frames of a group
+    """
+
+    at: npt.NDArray[np.int32]
+    frames: npt.NDArray[np.int32]
+    of: Int64
+    group: Int64
+    edge: float
+    step: int
+
+    @classmethod
+    def over(cls, seen: Events) -> _Cells:
+        index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
+        edge = cell_edge(index, seen.voxel_size)
+        while len((found := cells_of(index, seen.voxel_size, edge))[0]) > MOST_CUBES:
+            edge *= 2
+        at, of = found
+        step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(at), 1) * (3 + seen.K))))
+        while len(frames := np.unique(seen.frame // step)) > most:
+            step *= 2
+        return cls(at, frames, of, np.searchsorted(frames, seen.frame // step), edge, step)
 
 
 EDGES: dict[str, tuple[float, ...]] = {
@@ -57,17 +93,17 @@ def correlogram(sample: Sample) -> Correlogram:
     """Alpha between frames in bins of the distance of two looks, over the pairs of looks at sampled voxels.
 
     Of a voxel's looks those that are 1, 2, 4, 8, ... looks apart are paired, so that the cost is linear. Chance is that
-    of the pairs in the bin. Bands are at 95 % over blocks of space, for these frames.
+    of the pairs in the bin. Bands are at 95 %, for the next flight where the frames of a bin tell of it, else for this
+    map.
     """
     seen, limit = _of_seen_classes(*shared_observations(sample.seen, sample.limit))
-    bins = {axis: _Bins(edges, 3 + seen.K) for axis, edges in (*EDGES.items(), ("standard", STANDARD))}
-    index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
-    blocks = spatial_blocks(index, seen.voxel_size)
-    for pairs in _pairs(sample, seen, limit, index, blocks.of):
+    cells = _Cells.over(seen)
+    bins = {axis: _Bins(edges, cells, 3 + seen.K) for axis, edges in (*EDGES.items(), ("standard", STANDARD))}
+    for pairs in _pairs(sample, seen, limit, cells):
         for axis, into in bins.items():
-            into.add(pairs.apart["angle" if axis == "standard" else axis], pairs, blocks.count)
-    found = {axis: into.found() for axis, into in bins.items()}
-    nothing = LagBin(*STANDARD, math.nan, 0, UNDEFINED, math.nan)
+            into.add(pairs.apart["angle" if axis == "standard" else axis], pairs)
+    found = {axis: tuple(into.found()) for axis, into in bins.items()}
+    nothing = LagBin(*STANDARD, math.nan, 0, UNKNOWN, math.nan)
     (standard,) = found.pop("standard") or (nothing,)
     return Correlogram(**found, standard=standard)
 
@@ -78,11 +114,12 @@ def _of_seen_classes(*logs: Events) -> Iterator[Events]:
     return (dataclasses.replace(log, evidence=log.evidence.only(labels), classes=()) for log in logs)
 
 
-def _pairs(sample: Sample, seen: Events, limit: Events, index: npt.NDArray[np.int32], block: Int64) -> Iterator[_Pairs]:
+def _pairs(sample: Sample, seen: Events, limit: Events, cells: _Cells) -> Iterator[_Pairs]:
     """The pairs of looks that are 1, 2, 4, ... looks apart, one lag after the other."""
     order = {view.frame: rank for rank, view in enumerate(sample.views)}
     rank = np.array([order[frame] for frame in seen.frame.tolist()], dtype=np.int64)
     camera = np.array([view.centre for view in sample.views]).reshape(-1, 3)[rank]
+    index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     ray = camera - ((index + 0.5) * seen.voxel_size)[seen.voxel]
     reach = np.linalg.norm(ray, axis=1)
     lag = 1
@@ -95,61 +132,57 @@ def _pairs(sample: Sample, seen: Events, limit: Events, index: npt.NDArray[np.in
             "range": np.maximum(reach[first], reach[second]) / np.minimum(reach[first], reach[second]),
             "baseline": np.linalg.norm(camera[second] - camera[first], axis=1),
         }
-        of_pair = block[seen.voxel[first]]
-        yield _Pairs(of_pair, apart, *(_sums(log.evidence, first, second) for log in (seen, limit)))
+        groups = cells.group[first], cells.group[second]
+        one, other = _sums(limit.evidence, first, second)
+        looks = _sums(seen.evidence, first, second)
+        yield _Pairs(cells.of[seen.voxel[first]], apart, groups, looks, one + other)
         lag *= 2
 
 
-def _sums(evidence: Evidence, first: Int64, second: Int64) -> Float64:
-    """(m, 3 + K) of pairs of observations: s . s', how many, ||s||^2 and s, summed over both."""
+def _sums(evidence: Evidence, first: Int64, second: Int64) -> tuple[Float64, Float64]:
+    """(m, 3 + K) of each look of pairs: s . s' with the other one, how many, ||s||^2 and s."""
     a, b = evidence[first], evidence[second]
-    own = (a**2).sum(axis=1) + (b**2).sum(axis=1)
-    columns = np.stack([2 * (a * b).sum(axis=1), np.full(len(a), 2.0), own], axis=1)
-    return np.concatenate([columns, a + b], axis=1)
+    both = (a * b).sum(axis=1), np.ones(len(a))
+    one, other = (np.concatenate([np.stack([*both, (own**2).sum(axis=1)], axis=1), own], axis=1) for own in (a, b))
+    return one, other
 
 
 class _Bins:
-    """Sums of the pairs by bin and block."""
+    """Sums of the pairs by bin: of looks by cube and group of frames (n, G, F, C), of the limit (n, C)."""
 
-    def __init__(self, edges: tuple[float, ...], columns: int) -> None:
+    def __init__(self, edges: tuple[float, ...], cells: _Cells, columns: int) -> None:
+        n = len(edges) - 1
         self.edges = np.array(edges)
-        self.columns = columns
-        self._sums: npt.NDArray[np.float64] | None = None
+        self.cells = cells
+        self._looks = np.zeros((columns, n, len(cells.at), len(cells.frames)))
+        self._limit = np.zeros((columns, n))
+        self._pairs, self._apart = np.zeros(n), np.zeros(n)
 
-    def add(self, apart: Float64, pairs: _Pairs, blocks: int) -> None:
+    def add(self, apart: Float64, pairs: _Pairs) -> None:
         """Pairs (m,) that are so far apart; those beyond the edges are left out."""
-        n = len(self.edges) - 1
-        if self._sums is None:
-            self._sums = np.zeros((n, blocks, 2 + 2 * self.columns))
-        of = np.searchsorted(self.edges, apart, side="right") - 1
+        n, of = len(self._pairs), np.searchsorted(self.edges, apart, side="right") - 1
         inside = (of >= 0) & (of < n)
-        cell = (of * blocks + pairs.block)[inside]
-        columns = (np.ones(len(apart)), apart, *pairs.seen.T, *pairs.limit.T)
-        for k, column in enumerate(columns):
-            self._sums[..., k] += np.bincount(cell, weights=column[inside], minlength=n * blocks).reshape(n, blocks)
+        of = of[inside]
+        self._pairs += np.bincount(of, minlength=n)
+        self._apart += np.bincount(of, weights=apart[inside], minlength=n)
+        for to, column in zip(self._limit, pairs.limit.T, strict=True):
+            to += np.bincount(of, weights=column[inside], minlength=n)  # noqa: PLW2901 - in place
+        shape = self._looks.shape[1:]
+        for group, looks in zip(pairs.group, pairs.seen, strict=True):
+            cell = np.ravel_multi_index((of, pairs.cube[inside], group[inside]), shape)
+            for to, column in zip(self._looks, looks.T, strict=True):
+                to += np.bincount(cell, weights=column[inside], minlength=to.size).reshape(shape)  # noqa: PLW2901
 
-    def found(self) -> tuple[LagBin, ...]:
+    def found(self) -> Iterator[LagBin]:
         """The bins in which there is enough."""
-        return () if self._sums is None else tuple(self._rows(self._sums))
-
-    def _rows(self, sums: Float64) -> Iterator[LagBin]:
-        for low, high, by_block in zip(self.edges[:-1], self.edges[1:], sums, strict=True):
-            of_bin = by_block[by_block[:, 0] > 0]
-            pairs, apart = of_bin[:, :2].sum(axis=0)
-            if pairs >= LEAST_PAIRS and len(of_bin) >= LEAST_BLOCKS:
-                seen, limit = np.split(of_bin[:, 2:], 2, axis=1)
-                ceiling = float(between_of(limit.sum(axis=0)))
-                yield LagBin(float(low), float(high), float(apart / pairs), int(pairs), band(seen, between_of), ceiling)
-
-
-def band(sums: Float64, statistic: Statistic, level: float = LEVEL) -> Estimate:
-    """A statistic of block sums (B, C) with its interval by the delta method, t(B - 1), on the scale log(1 - value)."""
-    from scipy.stats import t as student
-
-    total, B = sums.sum(axis=0), len(sums)
-    value = float(statistic(total))
-    error = math.sqrt(B / max(B - 1, 1) * float(np.square(sums @ gradient_of(statistic, total)).sum()))
-    if B < 2 or math.isnan(error) or value >= 1:
-        return Estimate(value, math.nan, math.nan)
-    half = float(student.ppf((1 + level) / 2, B - 1)) * error / (1 - value)
-    return Estimate(value, max(-1.0, 1 - (1 - value) * math.exp(min(half, 30.0))), 1 - (1 - value) * math.exp(-half))
+        for k in np.flatnonzero(self._pairs >= LEAST_PAIRS):
+            columns = self._looks[:, k].transpose(1, 2, 0)
+            cube, group = np.nonzero(columns[:, :, 1])
+            if len(np.unique(cube)) < LEAST_CUBES:
+                continue
+            own, looks = self.cells, columns[cube, group]
+            whole = looks[:, :2]  # of its agreement with the other one, neither look has half for itself alone
+            alpha = of_looks(own.at[cube], own.frames[group], own.edge, own.step, looks, whole, between_of)
+            low, high, pairs = float(self.edges[k]), float(self.edges[k + 1]), self._pairs[k]
+            ceiling = float(between_of(self._limit[:, k]))
+            yield LagBin(low, high, float(self._apart[k] / pairs), int(pairs), alpha, ceiling)

@@ -113,10 +113,14 @@ def _sums(row: npt.NDArray[np.int64], values: Float64, rows: int) -> Float64:
 
 @dataclass(frozen=True)
 class TwoWay:
-    """The variance that comes from places, and what frames add to it."""
+    """The variance that comes from places, and what frames add to it.
+
+    most  degrees of freedom that it has at most
+    """
 
     places: Spread
     frames: Spread
+    most: float = math.inf
 
     @property
     def total(self) -> float:
@@ -128,7 +132,7 @@ class TwoWay:
         """Of the sum (Satterthwaite 1946)."""
         parts = (self.places, self.frames)
         spread = sum(part.variance**2 / part.degrees for part in parts if part.variance > 0)
-        return max(self.total**2 / spread, 1.0) if spread else self.places.degrees
+        return min(max(self.total**2 / spread, 1.0) if spread else self.places.degrees, self.most)
 
     def half(self, level: float) -> float:
         """Half the width of the interval."""
@@ -156,7 +160,7 @@ def _beyond_places(grid: Grid, places: Arrangement, by_place: Spread) -> Spread:
     frames = arrangement(grid.frames[:, None])
     influence, size = grid.cell.sum(axis=0), grid.size.sum(axis=0)
     influence = influence - size / size.sum() * influence.sum()  # of a sample they do not sum to 0
-    by_frame = frames.spread(influence, size)
+    by_frame = frames.spread(influence, size, modelled=True)
     if not by_frame.variance > 0:
         return NO_FRAMES
     with one_thread():
@@ -176,5 +180,5 @@ def apart(one: Grid, other: Grid, question: Question) -> TwoWay:
     if question == THIS_MAP:
         return both
     added = [two_way(grid, question).frames for grid in (one, other)]
-    joined = TwoWay(*added)
+    joined = TwoWay(added[0], added[1])
     return TwoWay(both.places, Spread(joined.total, joined.degrees, added[0].block))

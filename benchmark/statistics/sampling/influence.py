@@ -317,7 +317,8 @@ def reached_of(of: Statistic) -> Statistic:
     def ratio(sums: Float64) -> Float64:
         seen, limit = np.split(sums, 2, axis=-1)
         ceiling = of(limit)
-        share: Float64 = of(seen) / np.where(ceiling.real > 0, ceiling, np.nan)
+        with np.errstate(invalid="ignore"):  # of complex sums, by which slopes are found
+            share: Float64 = of(seen) / np.where(ceiling.real > 0, ceiling, np.nan)
         return share
 
     return ratio

@@ -29,13 +29,16 @@ LEAST_FRAMES = 30
 """Of fewer frames nothing is said about the next flight: a kind of bad frame, one in ten, is missed by one flight of 20
 frames in eight, by one of 30 in 24."""
 
+LASTING = 6.0
+"""For each degree of freedom of a number of the next flight so many frames are asked for, whatever they look like: that
+quality lasts so long, or that there is a kind of bad frame which did not occur, does not show in a short flight."""
+
 LEAST_DEGREES = 3.0
 """Where it is more likely than not that fewer places err independently of each other, nothing is said: errors reach as
-far as the scene."""
+far as the scene. Where fewer frames do, nothing of the next flight: their quality lasts as long as this one."""
 
-LEAST_OF_BOTH = 2.0
-"""Of fewer degrees of freedom, the doubt about reaches in them, nothing is said: of places errors reach as far as the
-scene, of places and frames together quality lasts as long as the flight."""
+LEAST_OF_PLACES = 1.0
+"""The same with fewer degrees of freedom, the doubt about reaches in them."""
 
 AS_FAR = "errors reach as far as the scene: fly more of it"
 AS_LONG = "the quality of frames lasts about as long as the flight: fly longer"
@@ -126,6 +129,26 @@ def of_places(
     return _with_interval(found, grid, THIS_MAP, scale, bounds, level)
 
 
+def of_looks(
+    cell: npt.NDArray[np.integer],
+    frame: npt.NDArray[np.integer],
+    edge: float,
+    step: int,
+    columns: Float64,
+    halves: Float64,
+    statistic: Statistic,
+    level: float = LEVEL,
+) -> Interval:
+    """An agreement of sums (m, C) of cubes and groups of frames, see `influences`.
+
+    Its interval is for the next flight where frames tell of it, else for this map.
+    """
+    found = float(statistic(columns.sum(axis=0)))
+    grid = influences(cell, frame, columns, statistic, edge, step, halves)
+    told = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
+    return _with_interval(found, grid, NEXT_FLIGHT if told else THIS_MAP, "agreement", (-1.0, 1.0), level)
+
+
 def question_of(sums: InfluenceSums) -> Question:
     """What verdicts on a map answer: for the next flight, if there are enough frames to tell."""
     return NEXT_FLIGHT if sums.frames * sums.step >= LEAST_FRAMES else THIS_MAP
@@ -144,7 +167,7 @@ def _with_interval(
     if grid is None:
         return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
     question = question if grid.step and len(grid.frames) > 1 else THIS_MAP
-    spread = two_way(grid, question)
+    spread = _of_flight(grid) if question == NEXT_FLIGHT else two_way(grid, question)
     if math.isnan(found) or not spread.degrees > 0:
         low, high = math.nan, math.nan
     elif scale == "share":
@@ -152,6 +175,12 @@ def _with_interval(
     else:
         low, high = _ends(found, spread, grid.unseen(question, level), scale, level)
     return _interval(found, max(low, bounds[0]), min(high, bounds[1]), grid, spread, question)
+
+
+def _of_flight(grid: Grid) -> TwoWay:
+    """For the next flight, with no more degrees of freedom than a quality that lasts may leave."""
+    most = max(len(grid.frames) * grid.step / LASTING, LEAST_DEGREES)
+    return dataclasses.replace(two_way(grid, NEXT_FLIGHT), most=most)
 
 
 def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
@@ -205,12 +234,12 @@ def _p_value(found: float, spread: TwoWay) -> float:
 def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay, question: Question) -> Interval:
     frames = len(grid.frames) * grid.step
     places = spread.places
-    few = places.with_fewer(LEAST_DEGREES) > 0.5 or not places.degrees >= LEAST_OF_BOTH
+    few = places.with_fewer(LEAST_DEGREES) > 0.5 or not places.degrees >= LEAST_OF_PLACES
     far = spread.total > TINY and few
     reasons = [AS_FAR] if far else []
     if question == NEXT_FLIGHT and frames < LEAST_FRAMES:
         reasons.append(TOO_FEW.format(least=LEAST_FRAMES))
-    elif spread.frames.variance > 0 and not far and not spread.degrees >= LEAST_OF_BOTH:
+    elif not far and spread.frames.with_more_alike(len(grid.frames) / LEAST_DEGREES) > 0.5:
         reasons.append(AS_LONG)
     return Interval(
         found,

@@ -7,6 +7,7 @@ kernel misses, where blocks are few or errors reach far, is put back.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Sequence
@@ -26,6 +27,9 @@ ALONE, DOUBT = (0.0, 0.5), 4.0
 """Shares of a cell's variance that it may have for itself, and by how much the log likelihood must be better for that:
 a weak correlation that reaches far is seldom real, and leaves hardly anything to say."""
 
+FAR = 0.5
+"""Of places, a reach counts with this power of its length besides: one that is found too short does more harm."""
+
 UNLIKELY = 1e-3
 """A reach of a smaller weight does not count."""
 
@@ -44,12 +48,16 @@ MOST_KNOWN = 96
 
 @dataclass(frozen=True)
 class Part:
-    """The variance of a sum as it is under one reach: its weight, degrees of freedom, and the block, in cells."""
+    """The variance of a sum as it is under one reach: its weight, degrees of freedom, and the block, in cells.
+
+    alike  how much larger than that of independent cells
+    """
 
     weight: float
     variance: float
     degrees: float
     block: float
+    alike: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,10 @@ class Spread:
         """The weight of the parts that have fewer degrees of freedom."""
         return sum(part.weight for part in self.parts if part.degrees < degrees)
 
+    def with_more_alike(self, times: float) -> float:
+        """The weight of the parts whose variance is more than so many times that of independent cells."""
+        return sum(part.weight for part in self.parts if part.alike > times)
+
 
 @dataclass(frozen=True, eq=False)
 class _Correlation:
@@ -104,13 +116,24 @@ class _Correlation:
         return correlations
 
 
+@dataclass(frozen=True)
+class _Likely:
+    """A correlation by its number, what a cell has for itself, its weight, and the variance of a cell of size 1."""
+
+    number: int
+    alone: float
+    weight: float
+    scatter: float
+
+
 class Arrangement:
     """Cells of a grid, at (G, D) whole numbers: cubes of space, or groups of frames in their order."""
 
     def __init__(self, at: npt.NDArray[np.integer]) -> None:
         self.at = at.astype(np.float64)
         self.count = len(at)
-        self._known: dict[tuple[int, float, bytes], tuple[float, float]] = {}
+        self._far = FAR if at.shape[1] > 1 else 0.0
+        self._known: dict[tuple[int, float, bytes], tuple[float, float, float]] = {}
         self._kernels: dict[float, Float64] = {}
 
     @functools.cached_property
@@ -145,14 +168,17 @@ class Arrangement:
             total += part.weight * self.kernel(part.block)
         return total
 
-    def spread(self, influence: Float64, size: Float64) -> Spread:
-        """Of the sum over cells of influences (G,), which are centred; size (G,) is how much is in each cell."""
+    def spread(self, influence: Float64, size: Float64, *, modelled: bool = False) -> Spread:
+        """Of the sum over cells of influences (G,), which are centred; size (G,) is how much is in each cell.
+
+        modelled  as the correlation has it, instead of by a kernel: where there are too few blocks for one
+        """
         if self.count < 2:
             return Spread(math.nan, 0.0, 1.0)
         if np.abs(influence).max() < ROUNDING:
             return Spread(0.0, self.count - 1.0, 1.0)
         with one_thread():
-            parts = self._parts(influence, size)
+            parts = (self._modelled if modelled else self._parts)(influence, size)
         return Spread.mean(parts) if parts else Spread(math.nan, 0.0, 1.0)
 
     def longest(self, influence: Float64, size: Float64, level: float) -> float:
@@ -161,47 +187,55 @@ class Arrangement:
             return 0.0
         with one_thread():
             weights = self._weights(influence, size)
-        reaches, shares = np.array(
-            sorted((self._correlations[number].reach, weight) for number, _, weight in weights)
-        ).T
+        reaches, shares = np.array(sorted((self._correlations[own.number].reach, own.weight) for own in weights)).T
         return float(reaches[min(np.searchsorted(np.cumsum(shares), level), len(reaches) - 1)])
 
     def _parts(self, influence: Float64, size: Float64) -> list[Part]:
-        """What the variance is under each reach that is not unlikely."""
+        """What the variance is under each reach that is not unlikely, by its kernel."""
         most, found = carriers(influence), []
-        for number, alone, weight in self._weights(influence, size):
-            block = max(1.0, BLOCK * self._correlations[number].reach)
-            kernel = self.kernel(block)
-            missed, degrees = self._missed(number, alone, size)
-            variance = float(influence @ kernel @ influence) * missed
+        for own in self._weights(influence, size):
+            block = self._block(own)
+            _, missed, degrees = self._under(own, size)
+            variance = float(influence @ self.kernel(block) @ influence) * missed
             if variance > 0 and degrees > 0:
-                found.append(Part(weight, variance, min(degrees, most), block))
+                found.append(Part(own.weight, variance, min(degrees, most), block))
         total = sum(part.weight for part in found)
         return [Part(part.weight / total, part.variance, part.degrees, part.block) for part in found]
 
-    def _missed(self, number: int, alone: float, size: Float64) -> tuple[float, float]:
-        """By how much the kernel's sum falls short under a correlation, and the degrees of freedom that it has."""
-        key = (number, alone, size.tobytes())
+    def _modelled(self, influence: Float64, size: Float64) -> list[Part]:
+        """The same as its correlation has it."""
+        degrees = min(self.count - 1.0, carriers(influence))
+        alone, found = float((size ** (2 * GROWTH)).sum()), []
+        for own in self._weights(influence, size):
+            total = self._under(own, size)[0]
+            found.append(Part(own.weight, own.scatter * total, degrees, self._block(own), total / alone))
+        return found
+
+    def _block(self, of: _Likely) -> float:
+        return max(1.0, BLOCK * self._correlations[of.number].reach)
+
+    def _under(self, of: _Likely, size: Float64) -> tuple[float, float, float]:
+        """The variance of the sum where that of a cell of size 1 is 1, by how much the kernel falls short of it, and
+        the degrees of freedom of that."""
+        key = (of.number, of.alone, size.tobytes())
         if key not in self._known:
             scale = size**GROWTH
-            correlation = self._correlations[number]
-            covariance = (1 - alone) * correlation(self._distance) * scale[:, None] * scale
-            covariance[np.diag_indices(self.count)] += alone * scale**2
-            seen = _centred(self.kernel(max(1.0, BLOCK * correlation.reach)), size) @ covariance
-            expected = float(np.trace(seen))
+            covariance = (1 - of.alone) * self._correlations[of.number](self._distance) * scale[:, None] * scale
+            covariance[np.diag_indices(self.count)] += of.alone * scale**2
+            seen = _centred(self.kernel(self._block(of)), size) @ covariance
+            total, expected = float(covariance.sum()), float(np.trace(seen))
             some = expected > 0
-            missed = float(covariance.sum()) / expected if some else math.nan
             degrees = expected**2 / float((seen * seen.T).sum()) if some else 0.0
             if len(self._known) >= MOST_KNOWN:
                 self._known.clear()
-            self._known[key] = missed, degrees
+            self._known[key] = total, total / expected if some else math.nan, degrees
         return self._known[key]
 
-    def _weights(self, influence: Float64, size: Float64) -> list[tuple[int, float, float]]:
-        """Correlations by their number, with the share that a cell has for itself, and how likely they are (REML)."""
+    def _weights(self, influence: Float64, size: Float64) -> list[_Likely]:
+        """How likely each correlation is (REML)."""
         scale = size**GROWTH
         seen, mean = influence / scale, size / scale
-        found, likely = [], []
+        found = []
         for number, correlation in enumerate(self._correlations):
             a, b = correlation.vectors.T @ seen, correlation.vectors.T @ mean
             for alone in ALONE if correlation.reach else (0.0,):
@@ -210,11 +244,13 @@ class Arrangement:
                 left = float((a * a / v).sum()) - float((a * b / v).sum()) ** 2 / within
                 if left > 0:
                     log = float(np.log(v).sum()) + math.log(within) + (self.count - 1) * math.log(left)
-                    found.append((number, alone))
-                    likely.append(-0.5 * log - (DOUBT if alone else 0.0))
-        weight = np.exp(np.array(likely) - max(likely)) if likely else np.zeros(0)
+                    before = self._far * math.log(max(correlation.reach, REACHES[0])) - (DOUBT if alone else 0.0)
+                    found.append(_Likely(number, alone, before - 0.5 * log, left / (self.count - 1)))
+        likely = np.array([own.weight for own in found])
+        weight = np.exp(likely - likely.max(initial=-math.inf))
         weight = np.where(weight < UNLIKELY * weight.sum(), 0.0, weight)
-        return [(*key, float(w / weight.sum())) for key, w in zip(found, weight, strict=True) if w > 0]
+        shares = weight / weight.sum()
+        return [dataclasses.replace(own, weight=float(w)) for own, w in zip(found, shares, strict=True) if w > 0]
 
 
 @functools.lru_cache(maxsize=4)

@@ -26,9 +26,8 @@ def _correlogram(found: MapStatistics) -> Iterator[str]:
     for axis, unit in AXES:
         bins: Sequence[LagBin] = getattr(found.correlogram, axis)
         if bins:
-            yield from ("", f"| {unit} | alpha | 95% | ceiling |", "|---|---|---|---|")
+            yield from ("", f"| {unit} | alpha | 95% | for | ceiling |", "|---|---|---|---|---|")
             for row in bins:
                 alpha = row.alpha
-                yield (
-                    f"| {row.mean:.3g} | {alpha.value:.2f} | {alpha.low:.2f} to {alpha.high:.2f} | {row.ceiling:.2f} |"
-                )
+                band = f"{alpha.low:.2f} to {alpha.high:.2f} | {alpha.question}{'' if alpha.decided else ', undecided'}"
+                yield f"| {row.mean:.3g} | {alpha.value:.2f} | {band} | {row.ceiling:.2f} |"
