@@ -1,7 +1,7 @@
 """A map in tiles against the same one at once: peak memory and CPU time of the whole command, and are they the same?
 
     python tests/perf/bench_tiles.py [--frames 50 150 ...] [--memory-gb 1] [--jobs 1] [--record] [--json FILE]
-    python tests/perf/bench_tiles.py --city 0.4 0.2 0.1 --memory-gb 0.1
+    python tests/perf/bench_tiles.py --city 0.4 0.2 0.1 --tile-size 128
 
 A flight goes to and fro over a field, in legs 40 m apart, with a frame every 30 m: a frame adds about 30,000 voxels of
 0.2 m. It is written as a posed folder and run on one thread, without report, and without recording unless `--record`
@@ -36,7 +36,7 @@ from posed_writer import write_posed  # noqa: E402
 WIDTH, HEIGHT, K = 640, 480, 7
 STAGES = {"fuse": "fuse numba", "table": "table", "statistics": "statistics", "summary": "measure", "Parquet": "write"}
 LEG, BESIDE, STEP = 10, 40.0, 30.0
-CITY = ["--data", "city", "--scene", "scene0", "--backbone", "sim-flicker", "--frames", "40"]
+CITY = ["--scene", "scene0", "--backbone", "sim-flicker", "--frames", ":40"]
 COLUMNS = ("ix", "iy", "iz", "op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum",
            "vss", "sbd", "entropy", "margin", "label")  # fmt: skip
 
