@@ -58,7 +58,7 @@ __all__ = [
 
 _HOMES = {
     "Belief": "outputs.relabel",
-    "Commit": "statistics.commit",
+    "Commit": "statistics.judging.commit",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",

@@ -19,12 +19,14 @@ from pyarrow import dataset, parquet
 
 import semstab
 from semstab import backends
+from semstab.comparison import pairing
 from semstab.engine import InProcess
 from semstab.engine.tiling import stretches
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
+from semstab.gating.calibration import calibrated
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.extent import Extent
@@ -331,6 +333,32 @@ def test_backbones_are_compared_tile_by_tile(tmp_path) -> None:
         found.append(summary_of(tmp_path / str(size))["comparisons"])
     assert found[0][0]["fusion_rules"]["values"]
     assert differences(*found, tolerance=1e-12) == []
+    assert_same_comparison(*(tmp_path / size for size in ("None", "8")))
+
+
+def test_evidence_is_calibrated_on_tiles_as_on_the_whole_map(judged, monkeypatch) -> None:
+    """Also on the sample that stands for a large map."""
+    for most in (pairing.MOST, 100):
+        monkeypatch.setattr(pairing, "MOST", most)
+        one, other = (calibrated(folder, precision=0.6) for folder in judged)
+        assert one == other
+        assert ("1 in 4 of the places" in one.calibrated_on) == (most == 100)
+
+
+def assert_same_comparison(whole, tiles) -> None:
+    """Of two label sources of a run: numbers, places that got worse, and what changed in each voxel."""
+    said, columns = [], []
+    for run in (whole, tiles):
+        semstab.compare([f"{run}:a", f"{run}:b"], run.parent / f"compared{run.name}")
+        said.append(json.loads((run.parent / f"compared{run.name}" / "comparison.json").read_text()))
+        (file,) = (run.parent / f"compared{run.name}" / "columns").iterdir()
+        columns.append(
+            sorted(parquet.read_table(file).to_pylist(), key=lambda row: [row[axis] for axis in ("ix", "iy")])
+        )
+    (scene,) = said[0]["scenes"]
+    assert scene["against"][0]["places"]
+    assert [line for line in differences(*said, tolerance=1e-9) if "source" not in line] == []
+    assert columns[0] == columns[1]
 
 
 def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:

@@ -71,12 +71,12 @@ def _scene(scene: str, contenders: Sequence[Contender]) -> tuple[SceneComparison
     against, changes = [], {}
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
         found = Against(names[n], own, of_classes)
-        if common.maps:
-            worse = worse_places(common, common.truth, n)
+        if common.regions is not None:
+            worse = worse_places(common, n)
             changes[names[n]] = worse.changes
             found = dataclasses.replace(
                 found,
-                compared=len(worse.changes.change),
+                compared=worse.changes.compared,
                 worse=worse.changes.worse,
                 better=worse.changes.better,
                 places=worse.places,

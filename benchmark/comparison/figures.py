@@ -90,10 +90,11 @@ def _maps(found: Found) -> Iterator[Figure]:
 
 
 def _draw(changes: Changes, up: tuple[float, float, float], own: Against) -> Canvas:
-    panels = [Panel("agreement", ("lost", "gained"), changes.change, *_numbers(own, "agreement"))]
-    if changes.right is not None:
-        panels.append(Panel("truth", ("wrong now", "right now"), changes.right.astype(float), *_numbers(own, "truth")))
-    return draw_changes(changes.table, up, panels)
+    shown = changes.shown
+    panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(own, "agreement"))]
+    if shown.right is not None:
+        panels.append(Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(own, "truth")))
+    return draw_changes(shown.table, up, panels)
 
 
 def _numbers(own: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:

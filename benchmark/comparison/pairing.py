@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.comparison.opening import Entry
-from semstab.metrics.matching import observations, rows_of
+from semstab.metrics.matching import observations, rows_of, shared_rows
 from semstab.model.measures import sbd
 from semstab.model.records import Record
 from semstab.model.statistics.comparison import CommonLooks, MapCoverage
 from semstab.model.statistics.contrast import Basis
 from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels.tiles import Tiles, side_by_side
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.looks import Looks
 from semstab.statistics.looks.ignored import common_looks
-from semstab.statistics.order.drift import expected_sbd
+from semstab.statistics.order.drift import expected_sbd, streams
 from semstab.statistics.sampling import InfluenceSums, influence_sums
-from semstab.statistics.versus.comparison import coverage, repeated_rows
+from semstab.statistics.versus.backbones import Region, Regions, truth_at
+from semstab.statistics.versus.comparison import coverage_of, held, repeated_rows
 
 Int64 = npt.NDArray[np.int64]
 
 NEAR = 1e-3
 """Metres within which cameras of the same frame lie."""
+
+MOST = 1 << 22
+"""Voxels that are in memory at a time: of more common ones a sample is compared, and shown."""
+
+SAMPLED = "of {millions:.3g} million common voxels 1 in {n} is compared, by a hash of its place"
+SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of the others"
 
 FEW = 0.1
 """A part of a map's voxels below which it is said how few are in common."""
@@ -52,8 +62,9 @@ class Common:
     logs    of these tables, where looks are in common
     label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
     looks   what the common looks are
-    maps    where there are voxels: the whole maps if they were made of the same frames and are all of labels or all of
-            scores, else `tables`; and truth, the map of the ground truth
+    regions where there are voxels: the whole maps if they were made of the same frames and are all of labels or all of
+            scores, else `tables`, place by place, with the ground truth
+    shown   the part of them that figures show beside those that changed
     sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on looks
     same_frames  whether frames are paired; None where the sums tell
     """
@@ -66,12 +77,12 @@ class Common:
     logs: tuple[Events, ...] = ()
     label: Int64 | None = None
     looks: CommonLooks | None = None
-    maps: tuple[VoxelTable, ...] = ()
-    truth: VoxelTable | None = None
+    regions: Regions | None = None
     coverage: tuple[MapCoverage, ...] = ()
     same_frames: bool | None = None
     sizes_differ: bool = False
     frames_differ: bool = False
+    shown: float = 1.0
 
     def among(self, where: npt.NDArray[np.bool_]) -> tuple[InfluenceSums, ...]:
         """The sums of some of the common places (n,)."""
@@ -98,47 +109,88 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     if remark := _no_voxels(entries):
         return _of_whole_maps("cubes", remark, entries)
     records = [entry.with_voxels("a comparison by voxels") for entry in entries]
-    maps = {name: record.table() for name, record in zip(names, records, strict=True)}
-    covered = coverage(maps)
+    maps = [Tiles.open(file, VoxelTable) for record in records if (file := record.voxels_file) is not None]
+    regions = partial(_regions, names, maps, _truth(records))
+    covered = coverage_of(names, [held(region.tables) for region in regions()])
     if not any(row.common_share for row in covered):
         return _apart(entries, "the maps have no voxel in common: other places, or other frames of reference")
-    truth = _truth(records)
-    found = _by_looks(records, maps, truth) or _by_voxels(maps, truth)
-    remarks = (*found.remarks, *_remarks(covered))
-    return replace(found, remarks=remarks, maps=found.maps or tuple(maps.values()), truth=truth, coverage=covered)
+    found = _by_looks(names, records, regions) or _by_voxels(regions)
+    shown = share_of(min(row.voxels for row in covered))
+    remarks = (*found.remarks, *_remarks(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
+    return replace(found, remarks=remarks, regions=found.regions or regions, coverage=covered, shown=shown)
+
+
+def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
+    """The map of the ground truth, of the first run that fused it."""
+    files = [file for record in records if (file := record.truth_file) is not None and file.exists()]
+    return Tiles.open(files[0], VoxelTable) if files else None
+
+
+def _regions(
+    names: Sequence[str], maps: Sequence[Tiles[VoxelTable]], truth: Tiles[VoxelTable] | None
+) -> Iterator[Region]:
+    """The maps of runs tile by tile, or whole, with the ground truth, where it is of their classes."""
+    for own in side_by_side([*maps, *([] if truth is None else [truth])]):
+        tables, true = own[: len(maps)], own[len(maps) :]
+        known = true[0] if true and true[0].classes == tables[0].classes else None
+        yield Region(dict(zip(names, tables, strict=True)), None, known)
+
+
+def share_of(voxels: int) -> float:
+    """Which part of so many is at most MOST; a power of 1/2."""
+    return 1.0 if voxels <= MOST else 2.0 ** -math.ceil(math.log2(voxels / MOST))
+
+
+def in_share(table: VoxelTable, share: float) -> npt.NDArray[np.bool_]:
+    """(n,) which voxels are in the sample that is so large a part of all, by a hash of their index."""
+    if share >= 1:
+        return np.ones(len(table), np.bool_)
+    drawn: npt.NDArray[np.bool_] = streams(table.index, 0) >> np.uint64(11) < np.uint64(share * 2**53)
+    return drawn
 
 
 # --- What is in common ------------------------------------------------------------------------------------------------
 
 
-def _by_looks(records: Sequence[Record], maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common | None:
+def _by_looks(names: Sequence[str], records: Sequence[Record], regions: Regions) -> Common | None:
     """The looks that all made; None where the looks of one were not kept, or are of other frames."""
     looks = [_looks_of(record) for record in records]
     there = [own for own in looks if own is not None]
     if len(there) < len(looks) or not _same_frames(there):
         return None
-    shared = common_looks(dict(zip(maps, there, strict=True)))
+    shared = common_looks(dict(zip(names, there, strict=True)))
     tables = tuple(log.table() for log in shared.logs.values())
     if not any(table.op.max(initial=0) >= 2 for table in tables):
         return None
+    truth = truth_at(regions, tables[0])
     label = None if truth is None else join_truth(tables[0], truth).label
     logs = tuple(shared.logs.values())
     sums = tuple(_sums(table, log, label) for table, log in zip(tables, logs, strict=True))
     remarks = _fewer_frames(there)
-    alike = not (remarks or shared.found.decided)
-    maps_apart = () if alike else tables
+    apart = Region(dict(zip(names, tables, strict=True)), None, truth) if remarks or shared.found.decided else None
+    of_looks = None if apart is None else lambda: [apart]
     return Common(
-        "looks", remarks, sums, False, tables, logs, label, shared.found, maps_apart, frames_differ=bool(remarks)
+        "looks", remarks, sums, False, tables, logs, label, shared.found, of_looks, frames_differ=bool(remarks)
     )
 
 
-def _by_voxels(maps: dict[str, VoxelTable], truth: VoxelTable | None) -> Common:
-    """The voxels that all saw twice or more, whatever each saw of them."""
-    tables = tuple(table.rows(rows) for table, rows in zip(maps.values(), repeated_rows(maps), strict=True))
-    label = None if truth is None else join_truth(tables[0], truth).label
+def _by_voxels(regions: Regions) -> Common:
+    """The voxels that all saw twice or more, whatever each saw of them; of very many a sample."""
+    common = sum(len(repeated_rows(region.tables)[0]) for region in regions())
+    share, parts, truths = share_of(common), [], []
+    for region in regions():
+        pairs = zip(region.tables.values(), repeated_rows(region.tables), strict=True)
+        own = [table.rows(rows) for table, rows in pairs]
+        drawn = in_share(own[0], share)
+        parts.append([table.rows(drawn) for table in own])
+        if region.truth is not None:
+            truths.append(region.truth.rows(shared_rows(region.truth, parts[-1][0])[0]))
+    tables = tuple(VoxelTable.joined(own) for own in zip(*parts, strict=True))
+    label = join_truth(tables[0], VoxelTable.joined(truths)).label if truths else None
     sums = tuple(_sums(table, None, label) for table in tables)
     remark = "the runs made other looks, of other frames: they are paired on voxels alone, for this map"
-    return Common("voxels", (remark,), sums, False, tables, (), label, same_frames=False)
+    sampled = () if share == 1 else (SAMPLED.format(millions=common / 1e6, n=round(1 / share)),)
+    return Common("voxels", (remark, *sampled), sums, False, tables, (), label, same_frames=False)
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:
@@ -193,13 +245,6 @@ def _fewer_frames(looks: Sequence[Looks]) -> tuple[str, ...]:
         f"of {listed} frames the {both} that all have are compared; the share of the ceiling and"
         " flicker, which are of all, are left out",
     )
-
-
-def _truth(records: Sequence[Record]) -> VoxelTable | None:
-    """The map of the ground truth, of the first run that fused it."""
-    files = [record.truth_file for record in records if record.truth_file is not None and record.truth_file.exists()]
-    truth = VoxelTable.load(files[0]) if files else None
-    return truth if truth is not None and truth.classes == records[0].table().classes else None
 
 
 # --- What is not ------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ by as much: its rivals.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.comparison.contrasts import joint_class
-from semstab.comparison.pairing import Common
+from semstab.comparison.pairing import Common, in_share
 from semstab.metrics.matching import shared_rows, voxel_keys
 from semstab.model.measures import dominant
 from semstab.model.statistics.contrast import Blame, Place
@@ -40,47 +40,76 @@ SHARE, MOST_FRAMES = 0.9, 8
 
 
 @dataclass(frozen=True, eq=False)
-class Changes:
-    """Voxel by voxel, of those that both maps saw twice or more; 0 in a place's column: in none.
+class Changed:
+    """Voxel by voxel, of those that both maps saw twice or more.
 
     table   (n,) the base's voxels
     change  (n,) agreement between frames, the run's less the base's
     label   (n,) the class that both maps together give
-    place   (n,) number of the place that got worse
+    true    (n,) the true class, -1 where it is not known; None without ground truth
     right   (n,) -1 where it was right and is wrong now, 1 the other way round, else 0; None without ground truth
-    wrong_place  (n,) number of the place that is wrong now
     """
 
     table: VoxelTable
     change: Float64
     label: Int64
-    place: Int64
+    true: Int64 | None
     right: Int64 | None
+
+    @classmethod
+    def of(cls, base: VoxelTable, other: VoxelTable, truth: VoxelTable | None) -> Changed:
+        """Of two maps, or of what both have in one place."""
+        rows = shared_rows(base, other)
+        again = (base.op[rows[0]] >= 2) & (other.op[rows[1]] >= 2)
+        base, other = (table.rows(own[again]) for table, own in zip((base, other), rows, strict=True))
+        between = [disagreement(table)[1] for table in (base, other)]
+        true = right = None
+        if truth is not None:
+            true = join_truth(base, truth).label
+            gained = (dominant(other) == true).astype(int) - (dominant(base) == true)
+            right = np.where(true >= 0, gained, 0).astype(np.int64)
+        return cls(base, between[0] - between[1], joint_class((base, other)), true, right)
+
+    @property
+    def matters(self) -> npt.NDArray[np.bool_]:
+        """(n,) which may be part of a place, or of its rivals."""
+        much: npt.NDArray[np.bool_] = np.abs(self.change) >= WORSE
+        return much if self.right is None else much | (self.right != 0)
+
+    def rows(self, where: npt.NDArray[np.bool_]) -> Changed:
+        """Some of them (n,)."""
+        true, right = (None if own is None else own[where] for own in (self.true, self.right))
+        return Changed(self.table.rows(where), self.change[where], self.label[where], true, right)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Changed]) -> Changed:
+        """Of several places."""
+        order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
+
+        def column(name: str) -> Any:
+            own = [getattr(part, name) for part in parts]
+            return None if own[0] is None else np.concatenate(own)[order]
+
+        table = VoxelTable.joined([part.table for part in parts])
+        return cls(table, *(column(name) for name in ("change", "label", "true", "right")))
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """What changed between two maps; of a large one `shown` are those that matter, and some of the others.
+
+    compared, worse, better  how many voxels both saw twice or more, and how many changed by WORSE
+    place, wrong_place       (m,) number of the place that got worse, or is wrong now, of each of `shown`; 0 in none
+    parts                    all voxels with their changes, by name as a file has them, some after the others
+    """
+
+    shown: Changed
+    compared: int
+    worse: int
+    better: int
+    place: Int64
     wrong_place: Int64 | None
-
-    @property
-    def worse(self) -> int:
-        """How many voxels got worse."""
-        return int(np.count_nonzero(self.change <= -WORSE))
-
-    @property
-    def better(self) -> int:
-        """How many got better by as much."""
-        return int(np.count_nonzero(self.change >= WORSE))
-
-    def columns(self) -> dict[str, npt.NDArray[Any]]:
-        """By name, as a file has them."""
-        table = self.table
-        found: dict[str, npt.NDArray[Any]] = {
-            "ix": table.ix,
-            "iy": table.iy,
-            "iz": table.iz,
-            "change": self.change,
-            "place": self.place.astype(np.int32),
-        }
-        if self.right is not None and self.wrong_place is not None:
-            found |= {"right_change": self.right.astype(np.int8), "wrong_place": self.wrong_place.astype(np.int32)}
-        return found
+    parts: Callable[[], Iterator[dict[str, npt.NDArray[Any]]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,32 +121,71 @@ class Worse:
     changes: Changes
 
 
-def worse_places(common: Common, truth: VoxelTable | None, number: int) -> Worse:
+def worse_places(common: Common, number: int) -> Worse:
     """Of a run against the base; the frames to blame are known where the looks were kept."""
-    maps = (common.maps[0], common.maps[number])
-    rows = shared_rows(*maps)
-    again = (maps[0].op[rows[0]] >= 2) & (maps[1].op[rows[1]] >= 2)
-    base, other = (table.rows(kept[again]) for table, kept in zip(maps, rows, strict=True))
-    between = [disagreement(table)[1] for table in (base, other)]
-    change = between[0] - between[1]
-    label, index = joint_class((base, other)), base.index
-    place, rivals = _clusters(index, label, -change, WORSE)
+    compared = worse = better = 0
+    kept, shown = list[Changed](), list[Changed]()
+    for own in _changed(common, number):
+        compared += len(own.change)
+        worse += int(np.count_nonzero(own.change <= -WORSE))
+        better += int(np.count_nonzero(own.change >= WORSE))
+        kept.append(own.rows(own.matters))
+        shown.append(own.rows(own.matters | in_share(own.table, common.shown)))
+    found, seen = Changed.joined(kept), Changed.joined(shown)
+    index = found.table.index
+    place, rivals = _clusters(index, found.label, -found.change, WORSE)
     looks = _looks(common, number, index)
-    names = base.classes or tuple(str(k) for k in range(base.K))
-    listed = _places("agreement", place, rivals, -change, index, base.voxel_size, label, names, looks)
-    right = wrong_place = None
-    if truth is not None:
-        true = join_truth(base, truth).label
-        right = np.where(true >= 0, (dominant(other) == true).astype(int) - (dominant(base) == true), 0).astype(
-            np.int64
-        )
-        wrong_place, wrong_rivals = _clusters(index, true, -right.astype(float), 1.0)
-        listed += _places(
-            "truth", wrong_place, wrong_rivals, -right.astype(float), index, base.voxel_size, true, names, looks
-        )
-    changes = Changes(base, change, label, place, right, wrong_place)
-    blamed = () if looks is None else _blamed(looks.among(place > 0, label))
+    names = found.table.classes or tuple(str(k) for k in range(found.table.K))
+    size = found.table.voxel_size
+    listed = _places("agreement", place, rivals, -found.change, index, size, found.label, names, looks)
+    wrong_place = None
+    if found.true is not None and found.right is not None:
+        loss = -found.right.astype(float)
+        wrong_place, wrong_rivals = _clusters(index, found.true, loss, 1.0)
+        listed += _places("truth", wrong_place, wrong_rivals, loss, index, size, found.true, names, looks)
+
+    def numbers(table: VoxelTable) -> tuple[Int64, Int64 | None]:
+        """The places of some voxels (n,), which hold those that matter among them."""
+        own, theirs = voxel_keys(table.index, index)
+        at = np.minimum(np.searchsorted(own, theirs), max(len(own) - 1, 0))
+        there = own[at] == theirs if len(own) else np.zeros(len(theirs), np.bool_)
+        wrong = None if wrong_place is None else _put(len(own), at[there], wrong_place[there])
+        return _put(len(own), at[there], place[there]), wrong
+
+    def parts() -> Iterator[dict[str, npt.NDArray[Any]]]:
+        for own in _changed(common, number):
+            yield _columns(own, *numbers(own.table))
+
+    changes = Changes(seen, compared, worse, better, *numbers(seen.table), parts)
+    blamed = () if looks is None else _blamed(looks.among(place > 0, found.label))
     return Worse(tuple(listed), blamed, changes)
+
+
+def _changed(common: Common, number: int) -> Iterator[Changed]:
+    assert common.regions is not None
+    for region in common.regions():
+        tables = [*region.tables.values()]
+        yield Changed.of(tables[0], tables[number], region.truth)
+
+
+def _put(n: int, at: Int64, values: Int64) -> Int64:
+    found = np.zeros(n, dtype=np.int64)
+    found[at] = values
+    return found
+
+
+def _columns(own: Changed, place: Int64, wrong_place: Int64 | None) -> dict[str, npt.NDArray[Any]]:
+    table = own.table
+    found: dict[str, npt.NDArray[Any]] = {
+        "ix": table.ix,
+        "iy": table.iy,
+        "iz": table.iz,
+        "change": own.change,
+        "place": place.astype(np.int32),
+    }
+    if own.right is not None and wrong_place is not None:
+        found |= {"right_change": own.right.astype(np.int8), "wrong_place": wrong_place.astype(np.int32)}
+    return found
 
 
 # --- Places -----------------------------------------------------------------------------------------------------------

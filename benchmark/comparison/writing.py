@@ -111,8 +111,8 @@ def _write_columns(found: Found, folder: Path) -> None:
             if own.columns is not None:
                 changes = found.changes[scene.scene, own.other]
                 written.append(folder / own.columns)
-                table = changes.table
-                parquet.write(written[-1], [changes.columns()], KIND, table.voxel_size, table.classes)
+                table = changes.shown.table
+                parquet.write(written[-1], changes.parts(), KIND, table.voxel_size, table.classes)
     if written:
         keep_only(written, written[0].parent)
 
@@ -122,8 +122,8 @@ def _recorded(found: Found) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]
         for own in scene.against:
             if (changes := found.changes.get((scene.scene, own.other))) is not None:
                 places = [(place.what, f"{place.number} {place.of}", place.centre) for place in own.places]
-                title = heading(found.result, scene.scene, own)
-                yield (scene.scene, own.other), (title, changes.table, changes.change, changes.right, places)
+                title, shown = heading(found.result, scene.scene, own), changes.shown
+                yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, places)
 
 
 def _require_own(folder: Path) -> None:

@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ from semstab.model.voxels.tiles import Tiles, side_by_side
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 from semstab.statistics import BackboneComparison, Looks, claimed_together
-from semstab.statistics.versus.backbones import Region
+from semstab.statistics.versus.backbones import Region, Regions
 
 GB = 1e9
 
@@ -404,7 +403,7 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
         if len(there) > 1:
-            regions = partial(_regions_of, there, config, tables)
+            regions = _regions_of(there, config, tables)
             kept = {record.unit.backbone: record.looks_file for record in there}
             looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
             found = comparison(scene, regions, looks if len(looks) == len(there) else None)
@@ -412,21 +411,31 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
                 yield found
 
 
-def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Iterator[Region]:
+def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
     """The maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
     names = [record.unit.backbone for record in there]
-    truths = [record.truth_file for record in there if record.truth_file is not None][:1]
+    in_tiles = any(record.in_tiles for record in there)
     files = [record.events_file for record in there if config.events]
-    logs = [file for file in files if file is not None and file.exists()]
+    logs: list[Tiles[Any]] = [Tiles.open(file, Events) for file in files if file is not None and file.exists()]
     logs = logs if len(logs) == len(there) else []
-    maps = [Tiles.open(file, VoxelTable) for record in there if (file := record.voxels_file) is not None]
-    if not any(record.in_tiles for record in there):
-        maps = [Tiles.of(tables.of(record)) for record in there]
-    further = [Tiles.open(file, VoxelTable) for file in truths], [Tiles.open(file, Events) for file in logs]
-    for own in side_by_side([*maps, *further[0], *further[1]]):
-        found, true, events = own[: len(maps)], own[len(maps) : len(own) - len(logs)], own[len(own) - len(logs) :]
-        log = dict(zip(names, events, strict=True)) if logs else None
-        yield Region(dict(zip(names, found, strict=True)), log, true[0] if truths else None)
+    truths = [Tiles.open(file, VoxelTable) for record in there if (file := record.truth_file) is not None][:1]
+    maps = [
+        Tiles.open(file, VoxelTable) if in_tiles else Tiles.of(tables.of(record))
+        for record in there
+        if (file := record.voxels_file) is not None
+    ]
+
+    def regions() -> Iterator[Region]:
+        for own in side_by_side([*maps, *logs, *truths]):
+            found, events, truth = (
+                own[: len(maps)],
+                own[len(maps) : len(maps) + len(logs)],
+                own[len(maps) + len(logs) :],
+            )
+            log = dict(zip(names, events, strict=True)) if logs else None
+            yield Region(dict(zip(names, found, strict=True)), log, truth[0] if truth else None)
+
+    return regions
 
 
 def _regions(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[RegionFlicker]:

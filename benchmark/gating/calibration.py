@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from semstab.comparison.opening import open_contender
+from semstab.comparison.pairing import in_share, share_of
 from semstab.errors import ConfigError, DataError
+from semstab.model.records import Record
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.correctness import join_truth
+from semstab.model.voxels.tiles import Tiles, side_by_side
+from semstab.statistics.correctness import Truth, join_truth
 from semstab.statistics.judging.commit import Commit, calibrate
 
 
@@ -18,21 +23,34 @@ def calibrated(run: str | Path, *, precision: float = 0.95, confidence: float = 
     Raises ConfigError and DataError as `open_contender`, and for a scene whose ground truth was not fused.
     """
     own = open_contender(run)
-    maps = []
+    maps, sampled = [], 1.0
     for scene, entry in own.scenes.items():
         record = entry.with_voxels("a calibration")
         if record.truth_file is None:
             raise ConfigError(
                 f"{own.source}: ground truth of {scene} was not fused; run it with --statistics, on a scene that has it"
             )
-        table = record.table()
-        maps.append((table, join_truth(table, VoxelTable.load(record.truth_file))))
+        maps.append(_judged(record, record.truth_file))
+        sampled = min(sampled, share_of(record.summary.table.voxels))
     first = maps[0][0]
     for table, _ in maps[1:]:
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
             raise DataError(f"{own.source}: its scenes differ in classes or voxel size; calibrate on one at a time")
     on = f"{own.backbone} on {', '.join(own.scenes)}"
+    on += f", 1 in {round(1 / sampled)} of the places of a large map" if sampled < 1 else ""
     return calibrate(maps, precision=precision, confidence=confidence, on=on)
+
+
+def _judged(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
+    """A map with its true classes; of a very large one a sample, by a hash of the place."""
+    share, parts = share_of(record.summary.table.voxels), []
+    files = [file for file in (record.voxels_file, truth_file) if file is not None]
+    for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
+        some = table.rows(in_share(table, share))
+        parts.append((some, join_truth(some, truth).label))
+    order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
+    label = np.concatenate([own for _, own in parts])[order]
+    return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
 
 
 def lines(commit: Commit) -> Iterator[str]:

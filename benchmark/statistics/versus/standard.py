@@ -116,9 +116,8 @@ def standardised_of(parts: Sequence[Float64], size: float, weights: Float64, *, 
     def weighted(own: Float64) -> Float64:
         with np.errstate(invalid="ignore", divide="ignore"):
             means = own[..., :S] / own[..., S:]
-        used = (weights > 0) & (own[..., S:].real > 0)
-        total, of = np.where(used, weights * means, 0.0).sum(axis=-1), np.where(used, weights, 0.0).sum(axis=-1)
-        with np.errstate(invalid="ignore", divide="ignore"):
+            used = (weights > 0) & (own[..., S:].real > 0)
+            total, of = np.where(used, weights * means, 0.0).sum(axis=-1), np.where(used, weights, 0.0).sum(axis=-1)
             value: Float64 = total / of
         return value
 
