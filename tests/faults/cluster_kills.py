@@ -81,7 +81,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, list[str]]:
 
 
 def main(count: int, seed: int) -> None:
-    """Kill so many of each, and fail where one did not end as it should."""
+    """Kill so many of each, every second one while parts are finished, and fail where one did not end as it should."""
     rng, wrong = random.Random(seed), []
     with tempfile.TemporaryDirectory() as temporary:
         base = Path(temporary)
@@ -95,8 +95,11 @@ def main(count: int, seed: int) -> None:
             expected = of_run(base / "whole")
             for k in range(3 * count):
                 who, out = ("scheduler", "first", "command")[k % 3], base / f"run{k}"
-                running, moment = command(scene, out), rng.random() * seconds
-                time.sleep(moment)
+                running, started = command(scene, out), time.monotonic()
+                while k % 2 and running.poll() is None and not any(out.glob("parts/*/*.npz")):
+                    time.sleep(0.01)  # every second time once something is finished
+                time.sleep(rng.random() * seconds * (0.1 if k % 2 else 1))
+                moment = time.monotonic() - started
                 victim = running if who == "command" else cluster.processes[who]
                 os.kill(victim.pid, signal.SIGKILL)
                 victim.wait()
