@@ -3,7 +3,7 @@
     python tests/perf/bench_long.py [--frames 100000] [--fused 2000 10000] [--json FILE]
 
 A posed folder of tiny frames, of which all but 50 are links. CPU seconds and resident memory in MB after each step:
-open the scene, select frames (each pose is read: tracking may have been lost), hash the input, and pickle what a task is
+open the scene, select frames (each pose is read: tracking may have been lost), hash the input, pickle what a task is
 sent of a stretch of 4096 frames. Then the command fuses so many of its frames: peak memory, and what a frame adds.
 """
 
