@@ -102,8 +102,8 @@ class NumbaHash:
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
-        """A record, its share of the hash, and of the nodes or a dense row of scores; and room to grow."""
-        return (200 + (10 * num_classes if soft else 0)) * voxels
+        """A record, its share of the nodes or a dense row of scores, and room to grow; a table has the hash's place."""
+        return (75 + (9 * num_classes if soft else 0)) * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""

@@ -63,9 +63,9 @@ class NumpyReference:
         self._total = MapTotal(num_classes)
 
     @staticmethod
-    def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
+    def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
         """A dictionary's entry and the evidence a voxel; an observation is in the history, and sorted for a table."""
-        return voxels * (300 + 16 * num_classes) + 4 * observations * (8 * num_classes + 24)
+        return voxels * (300 + 9 * num_classes) + observations * (140 + (30 * num_classes if soft else 0))
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""

@@ -32,6 +32,7 @@ from semstab.outputs.terminal.summary import print_summary
 from semstab.runtime.json_form import to_json
 from semstab.statistics import Estimate, Looks, Reliability, Sample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
+from semstab.statistics.steady import steady
 
 BACKBONES = ("a", "b", "gt")
 
@@ -316,8 +317,8 @@ def test_what_is_right_and_stable_by_voxel() -> None:
     """Five observations of two classes: 5 to 0 is stable, 3 to 2 is not; OP = 2 does not count."""
     table = voxels((1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 2, [2, 0, 0]))
     one_hot = dataclasses.replace(table, self_sum=table.op.astype(float))
-    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1])).tolist() == [1, 2, 4, 3, 0]
-    assert right_or_wrong(one_hot, np.full(5, -1)).tolist() == [0] * 5
+    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1]), steady(one_hot)).tolist() == [1, 2, 4, 3, 0]
+    assert right_or_wrong(one_hot, np.full(5, -1), steady(one_hot)).tolist() == [0] * 5
 
 
 def test_reliability_pools_the_bins_of_several_scenes() -> None:

@@ -13,10 +13,17 @@ from semstab.errors import DataError
 from semstab.metrics.matching import voxel_keys
 from semstab.statistics import BlockBootstrap, spatial_blocks
 from semstab.statistics.agreement import alpha_columns, alpha_of, psa_columns, ratio_of
-from semstab.statistics.blocks import interval
+from semstab.statistics.blocks import gradient_of, interval
 
 COVERED = (0.91, 0.99)
 """Of 300 intervals at 95 % this share is within 3 standard errors."""
+
+
+def test_slopes_are_exact():
+    """Of a mean s / n: 1 / n and -s / n^2, to the last digits; NaN where it is not defined."""
+    sums = np.array([0.3e6, 1e6])
+    np.testing.assert_allclose(gradient_of(ratio_of, sums), [1e-6, -0.3e-6], rtol=1e-15)
+    assert np.isnan(gradient_of(alpha_of, np.array([0.5, 1.0, 0.7, 0.5, 0.5]))).any()
 
 
 def weights(blocks, replicates=400, seed=0):

@@ -221,7 +221,8 @@ def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
     By a step into the complex plane, which takes no difference and so loses no digit (Squire and Trapp 1998, SIAM
     Review 40).
     """
-    value = statistic(totals + STEP * 1j * direction)
+    with np.errstate(all="ignore"):  # complex numbers warn of NaN where real ones do not
+        value = statistic(totals + STEP * 1j * direction)
     derivative: Float64 = np.where(np.isnan(value.real), np.nan, value.imag / STEP)
     return derivative
 

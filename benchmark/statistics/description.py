@@ -48,11 +48,13 @@ Float64 = npt.NDArray[np.float64]
 class Analysis:
     """What the statistics say of a map.
 
+    table  the means of its measures
     sums  by frame and cube of space, from which intervals and differences follow without voxels
     make  gives the maps, when they are asked for
     """
 
     summary: MapStatistics
+    table: TableSummary
     sums: InfluenceSums
     make: Callable[[], Maps]
 
@@ -127,7 +129,7 @@ def analyse(
         own = maps_of(table, expected_sbd(table) if null is None else null)
         return {**own, **further, **more, **whole.maps(table, further)}
 
-    return Analysis(summary, sums, maps)
+    return Analysis(summary, first.own.table.summary(table.voxel_size, table.classes, edges), sums, maps)
 
 
 def concluded(

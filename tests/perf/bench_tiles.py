@@ -1,6 +1,7 @@
 """A map in tiles against the same one at once: peak memory and CPU time of the whole command, and are they the same?
 
     python tests/perf/bench_tiles.py [--frames 50 150 ...] [--memory-gb 1] [--jobs 1] [--record] [--json FILE]
+    python tests/perf/bench_tiles.py --city 0.4 0.2 0.1 --tile-size 128
 
 A flight goes to and fro over a field, in legs 40 m apart, with a frame every 30 m: a frame adds about 30,000 voxels of
 0.2 m. It is written as a posed folder and run on one thread, without report, and without recording unless `--record`
@@ -35,6 +36,7 @@ from posed_writer import write_posed  # noqa: E402
 WIDTH, HEIGHT, K = 640, 480, 7
 STAGES = {"fuse": "fuse numba", "table": "table", "statistics": "statistics", "summary": "measure", "Parquet": "write"}
 LEG, BESIDE, STEP = 10, 40.0, 30.0
+CITY = ["--scene", "scene0", "--backbone", "sim-flicker", "--frames", ":40"]
 COLUMNS = ("ix", "iy", "iz", "op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum",
            "vss", "sbd", "entropy", "margin", "label")  # fmt: skip
 
@@ -51,11 +53,11 @@ def write_flight(root: Path, count: int) -> Path:
     return write_posed(root, names, {"a": frames}, scale=None, classes=classes, up_axis="z")
 
 
-def run(scene: Path, out: Path, *options: str) -> dict[str, Any]:
+def run(out: Path, *options: str) -> dict[str, Any]:
     """Run the command; its peak memory in GB, CPU time in seconds, and that of the stages."""
     watched = out.with_suffix(".json")
-    command = [sys.executable, str(HERE / "staged.py"), str(watched), "run", "--data", str(scene), "--out", str(out),
-               "--voxel-size", "0.2", "--trust-geometry", "--report", "off", "--quiet", *options]  # fmt: skip
+    command = [sys.executable, str(HERE / "staged.py"), str(watched), "run", "--out", str(out), "--trust-geometry",
+               "--report", "off", "--quiet", *options]  # fmt: skip
     process = subprocess.Popen(command, env={**os.environ, "NUMBA_NUM_THREADS": "1"})
     _, status, usage = os.wait4(process.pid, 0)
     if status:
@@ -92,6 +94,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", nargs="+", type=int, default=[50, 150])
+    parser.add_argument(
+        "--city", nargs="+", type=float, help="the built-in city instead, at these voxel sizes in metres"
+    )
     parser.add_argument("--memory-gb", type=float, default=1.0)
     parser.add_argument("--tile-size", help="forced; else chosen where the map would not fit")
     parser.add_argument("--jobs", type=int, default=1)
@@ -99,21 +104,25 @@ def main() -> None:
     parser.add_argument("--json", help="also write the figures there")
     arguments = parser.parse_args()
     forced = ["--tile-size", arguments.tile_size] if arguments.tile_size else []
-    shown = [] if arguments.record else ["--rerun", "off"]
+    recording = [] if arguments.record else ["--rerun", "off"]
     print(f"{'voxels':>12} {'':>7} {'tiles':>6} {'peak GB':>8} {'CPU s':>7} {'us a voxel':>11}", end="")
     print(*(f"{name:>11}" for name in STAGES))
     rows = []
-    for count in arguments.frames:
+    for size in arguments.city or arguments.frames:
         with tempfile.TemporaryDirectory() as folder:
-            scene = write_flight(Path(folder) / "field", count)
+            if arguments.city:
+                shown = [*CITY, "--voxel-size", str(size), "--rerun", "off"]
+            else:
+                scene = write_flight(Path(folder) / "field", int(size))
+                shown = ["--data", str(scene), "--voxel-size", "0.2", *recording]
             tiled = ["--set", f"memory_gb={arguments.memory_gb}", "--jobs", str(arguments.jobs), *forced]
             limits = {"whole": ["--set", "memory_gb=1000", "--tile-size", "off"], "tiles": tiled}
             for name, options in limits.items():
                 out = Path(folder) / name
-                found = run(scene, out, *shown, *options)
+                found = run(out, *shown, *options)
                 (summary,) = json.loads((out / "summary.json").read_text())["runs"]
                 voxels, tiles = summary["voxels"], len(list((out / "voxels").glob("*/tile=*")))
-                rows.append({"run": name, "frames": count, "voxels": voxels, "tiles": tiles, **found})
+                rows.append({"run": name, "size": size, "voxels": voxels, "tiles": tiles, **found})
                 peak, cpu = found["peak_gb"], found["cpu_s"]
                 print(f"{voxels:12,} {name:>7} {tiles:6} {peak:8.2f} {cpu:7.1f} {1e6 * cpu / voxels:11.2f}", end="")
                 print(*(f"{1e6 * found.get(stage, 0.0) / voxels:11.3f}" for stage in STAGES), flush=True)

@@ -36,21 +36,28 @@ def watched(self: Stopwatch, stage: str) -> Iterator[Any]:
     """A stage of the stopwatch, of which CPU time is noted as well."""
     own, everything = time.thread_time(), time.process_time()
     inside.append(stage)
+    note(stage)
     try:
         with plain(self, stage) as lap:
             yield lap
     finally:
         inside.pop()
+        note(stage)
         now = of(stage)
         now["own_s"] += time.thread_time() - own
         now["all_s"] += time.process_time() - everything
 
 
+def note(stage: str) -> None:
+    """The memory that the process has now, in that stage."""
+    now = of(stage)
+    now["peak_gb"] = max(now["peak_gb"], resident_bytes() / 1e9)
+
+
 def look() -> None:
-    """Note the largest memory of each stage."""
+    """Note the memory all the time."""
     while True:
-        now = of(inside[-1])
-        now["peak_gb"] = max(now["peak_gb"], resident_bytes() / 1e9)
+        note(inside[-1])
         time.sleep(EVERY)
 
 

@@ -3,6 +3,7 @@
     python tests/simulation/intervals.py this-map [--trials 300] [--seed 0]
     python tests/simulation/intervals.py next-flight [--trials 300] [--seed 0]
     python tests/simulation/intervals.py differences [--trials 300] [--seed 0]
+    python tests/simulation/intervals.py correlogram [--trials 300] [--seed 0]
 
 Prints a table in Markdown. What an interval is about is the number that very many such scenes and flights have
 together: that of the sums of all trials.
@@ -12,12 +13,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from flights import Flight, fly, sums_of, world
+from flights import Flight, fly, sample_of, sums_of, world
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
+from semstab.statistics.looks import View, correlogram
 from semstab.statistics.sampling import difference, estimate
 from semstab.statistics.sampling.influence import FUNCTIONALS
 
@@ -160,9 +163,34 @@ def _pairs(flight: Flight, count: int, seed: int, question: Question = NEXT_FLIG
         yield Row(", ".join(filter(None, parts)), f"{key} a - b", 0.0, tuple(intervals))
 
 
+# --- Correlogram ------------------------------------------------------------------------------------------------------
+
+APART = (1, 2, 4)
+"""Frames that two looks are apart."""
+
+
+def correlograms(count: int, seed: int) -> Iterator[Row]:
+    """Bands of the bins in time. The target is the mean of all trials."""
+    along = np.stack([np.linspace(0, 5.6, 40), np.full(40, 2.8), np.full(40, 10.0)], axis=1)
+    views = tuple(View(frame, centre, math.nan) for frame, centre in enumerate(along))
+    for quality in ("alike", "uneven", "lasting"):
+        flight = Flight(45, 2.0, 1.0, 40, 10, quality)
+        found: dict[int, list[Interval]] = {apart: [] for apart in APART}
+        for trial in range(count):
+            rng = np.random.default_rng([seed, trial])
+            over = world(flight, rng)
+            sample = sample_of(fly(flight, over, rng), over, flight, rng)
+            bins = correlogram(dataclasses.replace(sample, views=views)).time
+            for own, lag in zip(found.values(), bins, strict=False):
+                own.append(lag.alpha)
+        for apart, own in found.items():
+            target = float(np.mean([alpha.value for alpha in own]))
+            yield Row(f"40 frames, {quality}, strips, {apart} apart", "alpha_between", target, tuple(own))
+
+
 # --- Table ------------------------------------------------------------------------------------------------------------
 
-STUDIES = {"this-map": this_map, "next-flight": next_flight, "differences": differences}
+STUDIES = {"this-map": this_map, "next-flight": next_flight, "differences": differences, "correlogram": correlograms}
 
 
 def main() -> None:

@@ -147,7 +147,7 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None, sizes: tup
     return unit_summary(
         one.task,
         one.rows,
-        summarise(table, one.request.config.strata),
+        summarise(table, one.request.config.strata) if found is None else found.table,
         None if found is None else found.summary,
         None if one.hard is None else reduced_of(reduced_sums(one.hard.table())),
         sizes,

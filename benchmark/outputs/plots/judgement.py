@@ -22,7 +22,7 @@ from semstab.outputs.plots.statistics import (
     draw_reliability,
 )
 from semstab.outputs.plots.style import Figure
-from semstab.outputs.plots.views import Views, column
+from semstab.outputs.plots.views import Views, kept_of
 from semstab.statistics.agreement import ALPHA, PSA
 from semstab.statistics.judging.verdict import RELIABLE, TENTATIVE
 from semstab.statistics.sampling import LEAST_FRAMES
@@ -168,8 +168,9 @@ def _maps(result: Result, kept: Sequence[Record], views: Views) -> Iterator[Figu
 
 
 def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> Canvas:
-    above, truth = views.above(record, up), column(record, "true_label")
-    return draw_uncertainty(above, None if truth is None else right_or_wrong(above.table, truth[above.shown]))
+    above = views.above(record, up)
+    known = kept_of(record, above.table, ("true_label", "stable"))
+    return draw_uncertainty(above, None if known is None else right_or_wrong(above.table, *known))
 
 
 def _sweeps(result: Result) -> Iterator[Figure]:

@@ -23,7 +23,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.plots.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.outputs.plots.topdown import EMPTY, Float64, FromAbove, Int64
 from semstab.statistics import decompose
-from semstab.statistics.steady import LIKELY, steady
+from semstab.statistics.steady import LIKELY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,10 +95,12 @@ def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | Non
     return figure
 
 
-def right_or_wrong(table: VoxelTable, truth: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """What is known of each voxel (n,), a row of RIGHT_COLORS, by its true class (n,), -1 where that is not known."""
-    with np.errstate(invalid="ignore"):
-        stable = np.nan_to_num(steady(table)) >= LIKELY
+def right_or_wrong(table: VoxelTable, truth: npt.NDArray[np.int64], likely: Float64) -> npt.NDArray[np.int64]:
+    """What is known of each voxel (n,), a row of RIGHT_COLORS.
+
+    By its true class (n,), -1 where that is not known, and how likely it is stable (n,), NaN likewise.
+    """
+    stable = np.nan_to_num(likely) >= LIKELY
     right = dominant(table) == truth
     known = (truth >= 0) & (table.op >= RECURRENT)
     return np.where(known, np.where(right, np.where(stable, 1, 2), np.where(stable, 4, 3)), 0)

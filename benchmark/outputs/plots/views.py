@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.metrics.matching import voxel_keys
 from semstab.model.records import Record, Tables
 from semstab.model.results import Unit
 from semstab.model.voxels import VoxelTable, parquet
@@ -82,9 +83,21 @@ class Views:
         return self._last[1]
 
 
-def column(record: Record, name: str) -> npt.NDArray[Any] | None:
-    """A column that was written beside the voxels; None where it was not."""
-    return None if record.voxels_file is None else _column(record.voxels_file, name)
+def kept_of(record: Record, table: VoxelTable, names: Sequence[str]) -> list[npt.NDArray[Any]] | None:
+    """Columns (n,) that were written beside the voxels, of these of them, tile by tile; None where they were not."""
+    if record.voxels_file is None or not {*names} <= {*parquet.names_in(record.voxels_file)}:
+        return None
+    found: list[npt.NDArray[Any]] | None = None
+    for file in parquet.files_of(record.voxels_file):
+        own = VoxelTable.columns(file, ("ix", "iy", "iz", *names))
+        wanted, there = voxel_keys(table.index, np.stack([own[axis] for axis in ("ix", "iy", "iz")], axis=1))
+        at = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
+        met = there[at] == wanted
+        if found is None:
+            found = [np.zeros(len(table), own[name].dtype) for name in names]
+        for values, name in zip(found, names, strict=True):
+            values[met] = own[name][at[met]]
+    return found
 
 
 def _column(file: Path, name: str) -> npt.NDArray[Any] | None:

@@ -32,8 +32,8 @@ STANDARD = (5.0, 15.0)
 LEAST_PAIRS, LEAST_CUBES = 100, 8
 """Below so many pairs, or cubes that hold them, a bin is left out."""
 
-MOST_CUBES, MOST_SUMS = 64, 2**16
-"""Of cubes, and of the sums of a bin."""
+MOST_CUBES, MOST_SUMS = 160, 2**17
+"""Of cubes, and of the sums of a bin: of many classes fewer groups of frames are kept apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class _Pairs:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cubes (G, 3) and groups of frames (F,) that are kept apart: as many as leave each bin at most MOST_SUMS sums.
+    """Cubes (G, 3) and groups of frames (F,) that are kept apart.
 
     of     (n,) the cube of each voxel, group (m,) the group of each observation
     edge   of a cube in metres, step frames of a group
@@ -71,10 +71,9 @@ class _Cells:
     def over(cls, seen: Events) -> _Cells:
         index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
         edge = cell_edge(index, seen.voxel_size)
-        at, of = cells_of(index, seen.voxel_size, edge)
-        while len(at) > MOST_CUBES:
+        while len((found := cells_of(index, seen.voxel_size, edge))[0]) > MOST_CUBES:
             edge *= 2
-            at, of = cells_of(index, seen.voxel_size, edge)
+        at, of = found
         step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(at), 1) * (3 + seen.K))))
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2

@@ -244,9 +244,10 @@ class Arrangement:
                 left = float((a * a / v).sum()) - float((a * b / v).sum()) ** 2 / within
                 if left > 0:
                     log = float(np.log(v).sum()) + math.log(within) + (self.count - 1) * math.log(left)
-                    likely = self._far * math.log(max(correlation.reach, REACHES[0])) - (DOUBT if alone else 0.0)
-                    found.append(_Likely(number, alone, likely - 0.5 * log, left / (self.count - 1)))
-        weight = np.exp([own.weight - max(one.weight for one in found) for own in found])
+                    before = self._far * math.log(max(correlation.reach, REACHES[0])) - (DOUBT if alone else 0.0)
+                    found.append(_Likely(number, alone, before - 0.5 * log, left / (self.count - 1)))
+        likely = np.array([own.weight for own in found])
+        weight = np.exp(likely - likely.max(initial=-math.inf))
         weight = np.where(weight < UNLIKELY * weight.sum(), 0.0, weight)
         shares = weight / weight.sum()
         return [dataclasses.replace(own, weight=float(w)) for own, w in zip(found, shares, strict=True) if w > 0]
