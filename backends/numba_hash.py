@@ -103,7 +103,7 @@ class NumbaHash:
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
         """A record, its share of the nodes or a dense row of scores, and room to grow; a table has the hash's place."""
-        return (115 + (9 * num_classes if soft else 0)) * voxels
+        return (75 + (9 * num_classes if soft else 0)) * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""

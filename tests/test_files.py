@@ -2,6 +2,7 @@ import json
 import math
 import os
 import stat
+import zipfile
 
 import numpy as np
 import pytest
@@ -103,6 +104,10 @@ def test_arrays_are_read_as_they_were_written_or_not_at_all(tmp_path):
     ):
         np.savez(path, **whole | change)  # with checksums that are right
         assert read_arrays(path) is None
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x.npy", b"no array")
+        archive.writestr("digest.npy", b"none either")
+    assert read_arrays(path) is None
     path.write_bytes(b"PK")
     assert read_arrays(path) is None
     assert read_arrays(tmp_path / "nowhere.npz") is None

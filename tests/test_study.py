@@ -186,12 +186,13 @@ def test_a_changed_input_computes_what_reads_it(root, tmp_path) -> None:
     assert len(count(config, out).computed) == 6
 
 
-def test_voxels_that_were_lost_or_damaged_are_computed_again(root, tmp_path) -> None:
+def test_voxels_that_were_lost_or_damaged_are_computed_again_and_told(root, tmp_path, caplog) -> None:
     out, config = tmp_path / "out", configure(root, sweeps={}, backends=["numpy"])
     run_study(config, out)
     (out / "voxels/wall__a__numpy.parquet").unlink()
     (out / "voxels/wall__b__numpy.parquet").write_bytes(b"x")
     assert len(count(config, out).computed) == 2
+    assert "wall__b__numpy.parquet: not as it was written; what it belongs to is computed again" in caplog.text
     assert count(config, out).computed == []
 
 

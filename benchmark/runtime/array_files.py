@@ -43,7 +43,8 @@ def read_arrays(path: Path) -> Arrays | None:
     except DAMAGED:
         return None
     digest = arrays.pop(DIGEST, None)
-    return arrays if digest is not None and np.array_equal(digest, _digest(arrays)) else None
+    whole = all(isinstance(array, np.ndarray) for array in arrays.values())  # else bytes, where it is none
+    return arrays if whole and digest is not None and np.array_equal(digest, _digest(arrays)) else None
 
 
 def _digest(arrays: Arrays) -> npt.NDArray[np.uint8]:

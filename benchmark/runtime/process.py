@@ -6,7 +6,10 @@ import os
 import signal
 import sys
 import threading
-from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
 """The parameters' numbers in glibc's malloc.h; see mallopt(3)."""
@@ -38,6 +41,8 @@ def settle() -> None:
 
 def follow_parent(listening: Connection) -> None:
     """Let this worker process end with its parent, which holds the other end of a pipe, and leave Ctrl-C to it."""
+    from multiprocessing.connection import wait
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches all processes; the parent decides
 
     def end_with_parent() -> None:

@@ -150,7 +150,7 @@ def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     return rule_means_of(rule_sums(fused, where, truth))
 
 
-def rule_sums(fused: Fused, where: Mask, truth: Truth | None) -> Float64:
+def rule_sums(fused: Fused | VoxelTable, where: Mask, truth: Truth | None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`."""
     rows: list[float] = []
     for measure in measures():

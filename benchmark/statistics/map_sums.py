@@ -59,26 +59,30 @@ class MapSums:
         events      its log, with which null (n,) comes, the SBD of its voxels in random order
         true_label  (n,) the true classes; how likely places are stable only the whole map tells: `StableLooks`
         """
+        alone = events is None and true_label is None
         parts = (
-            cls._of_few(table.rows(some), None if null is None else null[some], edges) for some in stretches(len(table))
+            cls._of_few(table.rows(some), None if null is None else null[some], edges, alone=alone)
+            for some in stretches(len(table))
         )
         found = functools.reduce(lambda one, other: cls.merged([one, other]), parts)
-        if events is None and true_label is None:
+        if alone:
             return found
         excess = sbd(table) - (expected_sbd(table) if null is None else null)
         by_frame = influence_sums(table, events, true_label, sbd_excess=excess, edge=found.places.edge, likely=None)
         return replace(found, classes=class_sums(table, events), influence=by_frame)
 
     @classmethod
-    def _of_few(cls, table: VoxelTable, null: Float64 | None, edges: Sequence[int]) -> MapSums:
+    def _of_few(cls, table: VoxelTable, null: Float64 | None, edges: Sequence[int], *, alone: bool) -> MapSums:
+        """Without what its log or its true classes tell better, unless it is alone."""
         maps = maps_of(table, null=expected_sbd(table) if null is None else null)
+        some = table if alone else table.rows(slice(0, 0))
         places = Places(table.index[table.op >= 2], table.voxel_size)
         return cls(
             TableSums.of(table, edges),
             place_sums(table, maps, places),
             stratum_sums(table, maps, edges),
             class_sums(table),
-            influence_sums(table, sbd_excess=maps["sbd_excess"], edge=places.edge),
+            influence_sums(some, sbd_excess=maps["sbd_excess"][: len(some)], edge=places.edge),
         )
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,7 @@ def find_sources(options: FileOptions, place: ScenePlace, names: FileNames) -> d
     """
     folders, found = Folders(), {}
     base = place.folder if options.labels_root is None else options.labels_root
-    if not base.is_dir():
+    if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
     for kind in KINDS:
         for backbone, template in _templates(kind, options, place, base).items():

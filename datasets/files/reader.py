@@ -120,7 +120,7 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
 
     Raises DataError where there is none, or two would have one name.
     """
-    if not root.is_dir():
+    if not os.path.isdir(root):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise DataError(f"{root}: there is no such folder; set root to a scene or to the folder above scenes")
     if is_scene(root):
         name = root.resolve().name or "scene"

@@ -157,7 +157,8 @@ def of_npz(content: bytes, rng: random.Random) -> bytes:
             body = old.read(name)
             called = rng.choice((name, name, name, "x", "../x.npy")) if name == chosen else name
             damage = {".json": of_json, ".parquet": of_parquet}.get(name[name.rfind(".") :], of_bytes)
-            new.writestr(called, damage(body, rng) if name == chosen else body)
+            info = zipfile.ZipInfo(called)  # without the time of day: the same for the same seed
+            new.writestr(info, damage(body, rng) if name == chosen else body, zipfile.ZIP_DEFLATED)
     return out.getvalue()
 
 

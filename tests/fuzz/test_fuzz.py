@@ -17,6 +17,7 @@ from image_files import npy_bytes, npz_bytes
 
 from semstab.backbones.outside.class_list import class_names
 from semstab.backbones.segearth.prompts import read_prompts
+from semstab.datasets import open_dataset
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.las_files import opened
 from semstab.datasets.surfaces.surface import Surface
@@ -226,3 +227,8 @@ def test_names_of_classes_that_are_no_text_are_refused(tmp_path, content) -> Non
     (tmp_path / "names.txt").write_bytes(content)
     with pytest.raises(ConfigError, match=r"classes .*names\.txt: "):
         class_names(str(tmp_path / "names.txt"))
+
+
+def test_a_folder_whose_name_no_file_system_takes_is_not_there() -> None:
+    with pytest.raises(DataError, match="there is no such folder"):
+        open_dataset("posed_folder", {"root": "a" * 5000, "classes": ["a", "b"]})

@@ -4,11 +4,12 @@
 
 A folder is made for each kind of depth and noise level: views of the built-in city, rendered at half the size and
 scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as
-16-bit PNGs or as .npy in metres, and 8-bit labels. A bare read of .npy looks at each value once. Noise 0 compresses
-best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page cache, and are
-bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured start compiles
-what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop` is what
-manifest.json says of reading, flicker, fusion and observers.
+16-bit PNGs or as .npy in metres, and 8-bit labels. `jpeg` is 16-bit PNGs beside colour as JPEG, which the loop reads
+where the run is `--recorded`, and only there; so does the bare decode. A bare read of .npy looks at each value once.
+Noise 0 compresses best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page
+cache, and are bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured
+start compiles what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop`
+is what manifest.json says of reading, flicker, fusion and observers.
 """
 
 from __future__ import annotations
@@ -72,8 +73,10 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 10.0, 50.0], help="of the depth, mm")
     parser.add_argument(
-        "--depth", nargs="+", default=["png"], choices=["png", "npy"], help="16-bit PNG, or float32 metres"
-    )
+        "--depth", nargs="+", default=["png", "jpeg", "npy"], choices=["png", "jpeg", "npy"],
+        help="16-bit PNG, alone or beside colour as JPEG; or float32 metres",
+    )  # fmt: skip
+    parser.add_argument("--recorded", action="store_true", help="write the recording, which takes colour")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2, help="cores for both sides, and decoding threads")
     parser.add_argument("--json", type=Path)
@@ -108,18 +111,23 @@ def write_scene(root: Path, views: list[Any], size: tuple[int, int], noise: floa
         labels = cv2.resize(view.labels, size, interpolation=cv2.INTER_NEAREST)
         cv2.imwrite(str(root / "labels/net" / f"{name}.png"), labels)
         np.savetxt(root / "pose" / f"{name}.txt", view.T_wc)
+        if kind == "jpeg":
+            (root / "color").mkdir(exist_ok=True)
+            color = cv2.resize(view.color[..., ::-1], size, interpolation=cv2.INTER_LINEAR)
+            cv2.imwrite(str(root / "color" / f"{name}.jpg"), color)
 
 
 # --- the measurement --------------------------------------------------------------------------------------------------
 
 
 def measured(root: Path, backend: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    files = sorted([*root.glob("depth/*"), *root.glob("labels/net/*.png")], key=lambda path: path.stem)
-    run_command(root, backend, arguments.threads)
+    colors = root.glob("color/*") if arguments.recorded else ()
+    files = sorted([*root.glob("depth/*"), *root.glob("labels/net/*.png"), *colors], key=lambda path: path.stem)
+    run_command(root, backend, arguments)
     runs, bare = [], []
     for _ in range(arguments.runs):
         bare.append(seconds(lambda: decode_all(files, arguments.threads)) * 1e3 / arguments.frames)
-        runs.append(run_command(root, backend, arguments.threads))
+        runs.append(run_command(root, backend, arguments))
     middle = {key: statistics.median(run[key] for run in runs) for key in runs[0] if key != "stages_ms"}
     stages = {name: [run["stages_ms"][name] for run in runs] for name in runs[0]["stages_ms"]}
     decode = statistics.median(bare)
@@ -147,10 +155,12 @@ def decode_all(files: list[Path], threads: int) -> None:
         list(pool.map(decode, files))
 
 
-def run_command(root: Path, backend: str, threads: int) -> dict[str, Any]:
+def run_command(root: Path, backend: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """Seconds of the whole process and of its parts, and mean ms by stage, from what the run itself wrote."""
     with tempfile.TemporaryDirectory() as out:
-        options = ["--check", "none", "--rerun", "off", "--quiet", "--set", f"threads={threads}", "--out", out]
+        recording = str(Path(out) / "recording.rrd") if arguments.recorded else "off"
+        options = ["--check", "none", "--rerun", recording, "--quiet", "--set", f"threads={arguments.threads}"]
+        options += ["--report", "off", "--out", out]
         command = [COMMAND, "--backend", backend, "--data", str(root), *options]
         whole = seconds(lambda: subprocess.run(command, check=True))
         spent = json.loads((Path(out) / "manifest.json").read_text())["seconds"]

@@ -23,7 +23,7 @@ class Kind:
 
     backend  that fuses it
     K        number of classes
-    soft     whether frames have scores
+    soft     whether frames have scores, which are fused as labels as well
     logged   whether every observation is kept, and the ground truth fused too
     sampled  whether the reference follows a sample of its voxels
     """
@@ -40,8 +40,9 @@ class Kind:
         fused = expected_bytes(self.backend, n, looks, self.K, soft=self.soft)
         truth = expected_bytes(self.backend, n, looks, self.K) if self.logged else 0
         logs = log_bytes(looks, self.K, soft=self.soft) if self.logged else 0
-        followed = expected_bytes("numpy", n // ONE_IN, looks // ONE_IN, self.K, soft=self.soft) if self.sampled else 0
-        return fused + truth + logs + followed + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
+        followed = expected_bytes("numpy", n // ONE_IN, 0, self.K) if self.sampled else 0  # looks: when the map is gone
+        reduced = expected_bytes(self.backend, n, looks, self.K) if self.soft else 0
+        return fused + truth + logs + followed + reduced + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
 
 
 def limit(config: Config) -> int:

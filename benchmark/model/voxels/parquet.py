@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
 from semstab.model.evidence import Evidence
+from semstab.runtime.arrow import column
 from semstab.runtime.files import atomic_path, parse_json
 
 if TYPE_CHECKING:
@@ -181,8 +182,8 @@ def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
     import pyarrow as pa
 
     if values.ndim == 1:
-        return pa.array(values)
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+        return column(values)
+    return pa.FixedSizeListArray.from_arrays(column(values.ravel()), values.shape[1])
 
 
 def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:

@@ -18,6 +18,7 @@ from semstab.errors import DataError, one_line
 from semstab.metrics.matching import shared_observations, voxel_keys
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
+from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
 
 CELLS = 4
@@ -143,7 +144,7 @@ class Looks:
         columns |= {"weight": self.weight, "drawn": self.drawn.astype(np.uint32)}
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
         about["views"] = [(view.frame, *view.centre.tolist(), view.timestamp) for view in self.views]
-        content = pa.table({name: pa.array(np.ascontiguousarray(column)) for name, column in columns.items()})
+        content = pa.table({name: arrow.column(values) for name, values in columns.items()})
         text = json.dumps({"schema": SCHEMA, "kind": "Looks", **about})
         with atomic_path(path) as temporary:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")

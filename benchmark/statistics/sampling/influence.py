@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
+from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
 from semstab.runtime.json_form import from_json
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
@@ -146,9 +147,7 @@ class InfluenceSums:
             for k in range(own.stop - own.start)
         ]
         arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *columns.T]
-        content = pa.table(
-            {name: pa.array(np.ascontiguousarray(array)) for name, array in zip([*KEYS, *names], arrays, strict=True)}
-        )
+        content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
         text = json.dumps({"schema": SCHEMA, "kind": "InfluenceSums", **about})
         with atomic_path(path) as temporary:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")

@@ -113,7 +113,7 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
 def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
     again, usual, rows = table.op >= 2, fusion_rules.labels(table.evidence), []
     for rule in fusion_rules.RULES:
-        fused = fusion_rules.fuse(events, rule)
+        fused = table if rule == fusion_rules.RULES[0] else fusion_rules.fuse(events, rule)  # the map's own rule
         relabelled = (fusion_rules.labels(fused.evidence) != usual)[again]
         rows.append(np.concatenate([[relabelled.sum(), len(relabelled)], rule_sums(fused, again, truth)]))
     return np.stack(rows)
