@@ -273,7 +273,8 @@ def executor_of(jobs: int, scheduler: str | None) -> Executor:
     if jobs > 1:
         raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
     cluster = DaskCluster(scheduler)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what becomes of a unit is said in one line
+    for name in ("distributed", "distributed.client"):  # what becomes of a unit is said in one line
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     return cluster
 
 

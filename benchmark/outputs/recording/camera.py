@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from semstab.datasets import Scene
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.outputs.recording.background import Background
-from semstab.outputs.recording.entities import Clock, path
+from semstab.outputs.recording.entities import path
 
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""
@@ -86,16 +86,21 @@ class CameraLog:
         self._logged.add(frame.index)
         self._log_camera(stream, frame, self._follow(frame.T_wc))
         if track:
-            self._log_track(stream)
+            self.log_track(stream)
         background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
 
-    def log_track(self, stream: rr.RecordingStream, clock: Clock, indices: Sequence[int]) -> None:
-        """Log the track of frames that others log, unless it is known."""
-        times = self.scene.timestamps
+    def follow(self, indices: Sequence[int]) -> Iterator[int]:
+        """Read the poses of frames that are not logged here, one by one, unless they are known."""
         for index in indices if not self.poses else ():
             self._follow(self.scene.T_wc(index))
-            clock.set(stream, index, None if times is None else float(times[index]))
-            self._log_track(stream)
+            yield index
+
+    def log_track(self, stream: rr.RecordingStream) -> None:
+        """Log where it has been so far, unless the frames are so many that this one is left out."""
+        n = len(self.poses)
+        if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
+            track = np.array([p[:3, 3] for p in self.poses])
+            stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
 
     def _follow(self, T_wc: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The next pose, relative to the map's origin."""
@@ -103,12 +108,6 @@ class CameraLog:
         pose[:3, 3] -= self._translation
         self.poses.append(pose)
         return pose
-
-    def _log_track(self, stream: rr.RecordingStream) -> None:
-        n = len(self.poses)
-        if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
-            track = np.array([p[:3, 3] for p in self.poses])
-            stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride_of(frame.shape)))

@@ -321,9 +321,8 @@ class Recording(Observer):
                 if group is None:
                     at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
                     group = GroupLog(task, summary.table.voxel_size, self._origin(stream, task, at))
-                    if self._parts is not None and voxels_of(self._run, unit).is_dir():
-                        self._cameras[unit.scene].log_track(stream, self._clock, task.indices)
-                        self._clock.set(stream, task.indices[-1])
+                    self._follow(stream, task, log=self._parts is not None and voxels_of(self._run, unit).is_dir())
+                    self._clock.set(stream, task.indices[-1])
                 factor, table = thinned_map(voxels_of(self._run, unit), group.origin)
                 for values in series.send_rows(
                     stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
@@ -334,6 +333,14 @@ class Recording(Observer):
                 self._log_numbers(stream, group, summary)
             if group is not None:
                 self._lay_out(stream, group, table)
+
+    def _follow(self, stream: rr.RecordingStream, task: Task, *, log: bool) -> None:
+        """Know where the camera was in frames that are not logged here, and log the track where nobody else does."""
+        times, camera = task.scene.timestamps, self._cameras[task.scene.name]
+        for index in camera.follow(task.indices):
+            if log:
+                self._clock.set(stream, index, None if times is None else float(times[index]))
+                camera.log_track(stream)
 
     def _origin(self, stream: rr.RecordingStream, task: Task, position: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """The scene's map origin, in voxels: settled near the first position that is known, and said."""
