@@ -1,12 +1,12 @@
 """Fill the disk while runs, maps in tiles, studies, predictions and conversions are made: page by page, file by file.
 
-    python tests/faults/disk.py [COUNT [KIND]]           make faults: 24
+    python tests/faults/disk.py [COUNT [KIND]]           make faults: 12
 
 Each kind gets COUNT file systems in memory from one page (4 kB) to all that it takes, and as many that have room for so
 many files, from one to all that it makes, at even steps; every page and every file where COUNT is larger. It has to
 end in one line and exit code 2, or to come to its end, and with a larger disk, started again, to keep what was finished
 (units, parts of maps in tiles) and to leave what one without a full disk leaves. Mounting takes a name space of one's
-own (`unshare`), where the system lets users have it. 24 take about 250 pairs of starts.
+own (`unshare`), where the system lets users have it. 12 are some 120 pairs of starts, a quarter of an hour of CPU.
 """
 
 from __future__ import annotations
@@ -119,4 +119,4 @@ if __name__ == "__main__":
         os.execvpe(
             "unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {MARK: "1", "RUST_LOG": "off"}
         )  # as `settle` has it
-    sys.exit(main(int((sys.argv[1:] or ["24"])[0]), (sys.argv[2:] or [""])[0]))
+    sys.exit(main(int((sys.argv[1:] or ["12"])[0]), (sys.argv[2:] or [""])[0]))

@@ -66,7 +66,7 @@ def stages(scene: Path, out: Path, backend: str, voxel_size: float, *options: st
 
 def above(found: dict[str, float], program: dict[str, float]) -> tuple[float, str]:
     """Bytes that the map took, and in which stage."""
-    more = {name: peak - program.get(name, peak) for name, peak in found.items() if name != "beside"}
+    more = {name: peak - program.get(name, peak) for name, peak in found.items() if name not in ("beside", "all")}
     stage = max(more, key=more.__getitem__)
     return more[stage] * GB, stage
 

@@ -67,23 +67,22 @@ def run(out: Path, *options: str) -> dict[str, Any]:
         name: found.get(stage, {}).get("own_s" if name == "fuse" else "all_s", 0.0) for name, stage in STAGES.items()
     }
     cpu = usage.ru_utime + usage.ru_stime
-    return {"peak_gb": usage.ru_maxrss * 1024 / 1e9, "cpu_s": cpu, **own, "stages": found}
+    return {"peak_gb": found["all"]["peak_gb"], "cpu_s": cpu, **own, "stages": found}
 
 
 def same(whole: Path, tiles: Path) -> bool:
     """Whether both runs found the same, to the last bit of every column."""
-    (file,) = (whole / "voxels").glob("*.parquet")
-    folder = file.with_suffix("")
-    folder = tiles / "voxels" / folder.name
-    for name in COLUMNS:
-        a, b = (VoxelTable.columns(path, [name])[name] for path in (file, folder))
-        if a.tobytes() != b.tobytes():
-            print(f"column {name} differs")
+    for file in (whole / "voxels").glob("*.parquet"):
+        folder = tiles / "voxels" / file.stem
+        for name in COLUMNS:
+            a, b = (VoxelTable.columns(path, [name])[name] for path in (file, folder))
+            if a.tobytes() != b.tobytes():
+                print(f"{file.stem}: column {name} differs")
+                return False
+        evidence = [VoxelTable.load(path).evidence for path in (file, folder)]
+        if any(not np.array_equal(a, b) for a, b in zip(evidence[0].entries, evidence[1].entries, strict=True)):
+            print(f"{file.stem}: evidence differs")
             return False
-    evidence = [VoxelTable.load(path).evidence for path in (file, folder)]
-    if any(not np.array_equal(a, b) for a, b in zip(evidence[0].entries, evidence[1].entries, strict=True)):
-        print("evidence differs")
-        return False
     summaries = [json.loads((run / "summary.json").read_text()) for run in (whole, tiles)]
     found = [line for line in differences(*summaries, tolerance=1e-12) if "voxels_file" not in line]
     print(*found, sep="\n", end="\n" if found else "")
@@ -120,8 +119,8 @@ def main() -> None:
             for name, options in limits.items():
                 out = Path(folder) / name
                 found = run(out, *shown, *options)
-                (summary,) = json.loads((out / "summary.json").read_text())["runs"]
-                voxels, tiles = summary["voxels"], len(list((out / "voxels").glob("*/tile=*")))
+                voxels = sum(one["voxels"] for one in json.loads((out / "summary.json").read_text())["runs"])
+                tiles = len(list((out / "voxels").glob("*/tile=*")))
                 rows.append({"run": name, "size": size, "voxels": voxels, "tiles": tiles, **found})
                 peak, cpu = found["peak_gb"], found["cpu_s"]
                 print(f"{voxels:12,} {name:>7} {tiles:6} {peak:8.2f} {cpu:7.1f} {1e6 * cpu / voxels:11.2f}", end="")

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
+import resource
 import sys
 import threading
 import time
@@ -70,4 +72,7 @@ if __name__ == "__main__":
     try:
         main()
     finally:
+        most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+        (own,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())  # ru_maxrss has the parent's
+        of("all")["peak_gb"] = max(most, int(own) * 1024) / 1e9
         file.write_text(json.dumps(found))
