@@ -35,7 +35,7 @@ fuzz-short: setup-dev
 
 faults: setup-dev
 	$(BIN)/python tests/faults/kills.py 100
-	$(BIN)/python tests/faults/disk.py 24
+	$(BIN)/python tests/faults/disk.py 12
 
 lint: setup-dev
 	$(BIN)/ruff check .

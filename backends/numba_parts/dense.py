@@ -34,13 +34,14 @@ def update_dense(
     seen, seen_sums  row and sums of `ObservedScores`; the others as in `update`
     """
     stride = dense.shape[1]
+    flat = dense.reshape(-1)
     for p in nb.prange(PARTITIONS):
         out = np.zeros(8)
         vss = entropy = drift = 0.0
         reached = 0
         free = dense_base[p]
         for v in range(bounds[p], bounds[p + 1]):
-            _touch_ahead(v, bounds[p + 1] - 1, row, records, dense, seen, seen_sums)
+            _touch_ahead(v, bounds[p + 1] - 1, row, records, flat, stride, seen, seen_sums)
             r = row[v]
             if r < 0:
                 r = base[p] - r - 1
@@ -71,15 +72,15 @@ def update_dense(
 
 
 @serial
-def _touch_ahead(v, last, row, records, dense, seen, seen_sums):
-    touch(records, max(row[min(v + AHEAD, last)], 0))
+def _touch_ahead(v, last, row, records, flat, stride, seen, seen_sums):
+    later = max(row[min(v + AHEAD, last)], 0)
+    touch(records, later)
+    touch(records, later + 1)
     soon = min(v + AHEAD // 4, last)
-    following = records[max(row[soon], 0)].next
-    flat = dense.reshape(-1)
-    for k in range(0, dense.shape[1], 8):
+    place = max(DENSE - np.int64(records[max(row[soon], 0)].next), 0) * stride
+    for k in range(0, stride, 8):
         touch(seen_sums, seen[soon] + k)
-        if following <= DENSE:
-            touch(flat, np.int64(DENSE - following) * dense.shape[1] + k)
+        touch(flat, place + k)
 
 
 @serial

@@ -50,7 +50,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     look_at(task, 0.25).save(folder / "sights.npz")
     yield Kind("sights", (folder / "sights.npz",), Sights.load)
     portion = folder / "frames.npz"
-    Finished(About({"a.csv": "0"}), np.zeros((3, 18)), {"strata": np.zeros(4)}).save(portion)
+    Finished(About("frames", {"a.csv": "0"}), np.zeros((3, 18)), {"strata": np.zeros(4)}).save(portion)
     yield Kind("portion of a unit", (portion,), Finished.load)
     view = View(Intrinsics(12, 12, 7.5, 5.5), np.eye(4), (12, 16))
     casts = Casts(folder / "casts", b"surface")
