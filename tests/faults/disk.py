@@ -58,9 +58,10 @@ def limits(path: Path, count: int) -> Iterator[str]:
 
 
 def finished(out: Path) -> dict[Path, int]:
-    """What is finished of a run or study, by the time at which it was written: units, and the files of parts."""
+    """What is finished of a run or study, by when it was written: units, and the files that parts leave."""
     portions = [Finished.load(path) for path in out.glob(f"{PORTIONS}/*/*.npz")]
-    files = [out / name for portion in portions if portion is not None for name in portion.about.files]
+    names = [name for portion in portions if portion is not None for name in portion.about.files]
+    files = [out / name for name in names if not name.startswith(f"{PORTIONS}/")]  # the rest goes with the last part
     return {path: path.stat().st_mtime_ns for path in (*out.glob("units/*.json"), *files)}
 
 
