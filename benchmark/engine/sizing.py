@@ -19,8 +19,8 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
 
-SHARE = 0.7
-"""Of the memory that maps may take, a part of one in tiles takes so much: frames are read ahead beside it."""
+SHARE = 0.45
+"""Of the memory that maps may take, a part of one in tiles takes so much: a hash or a grid that doubles needs room."""
 
 
 @dataclass

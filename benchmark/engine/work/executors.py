@@ -24,6 +24,8 @@ from semstab.runtime.process import follow_parent, settle
 
 CONNECT_SECONDS = 10
 
+LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
+
 Finished = tuple[Job, tuple[Outcome, ...]]
 
 
@@ -192,6 +194,8 @@ class DaskCluster:
             there = self._client.run(importlib.metadata.version, "semstab")
         except importlib.metadata.PackageNotFoundError as error:
             raise ConfigError("a worker of the scheduler has no semstab; install semstab there") from error
+        except OSError as error:
+            raise ConfigError(LOST) from error
         if not there:
             raise ConfigError("the scheduler has no worker; start some with 'dask worker'")
         for worker, version in there.items():
@@ -220,6 +224,8 @@ def _distributed() -> Any:
 
 
 def _outcomes(future: Any, job: Job) -> tuple[Outcome, ...]:
+    if future.cancelled():
+        return tuple(failed(job.requests, LOST))
     try:
         outcomes: tuple[Outcome, ...] = future.result()
     except Exception as error:  # noqa: BLE001 - whatever happened to it on the cluster
