@@ -547,3 +547,12 @@ def test_what_was_recorded_so_far_can_be_read_while_the_run_goes_on(tmp_path) ->
     assert found == {0: 1.0, 1: 1.0, 2: 1.0}
     watching.close()
     verify(path)
+
+
+@pytest.mark.parametrize("stamp", [1.7e9, 12.5, -3.0, 1.7e12, 1.7e18, math.inf, math.nan])
+def test_timestamps_of_any_unit_are_taken(stamp):
+    """Of a camera's clock in seconds; in others, as some datasets have them, frames are shown by their number."""
+    stream = rr.RecordingStream("clock")
+    Clock().set(stream, 3, stamp)
+    columns = Clock().columns([3, 4], [stamp, stamp])
+    assert len(columns) == (2 if abs(stamp) < 1e10 else 1)

@@ -47,6 +47,9 @@ FRESH = 20_000
 PEAK = 500
 """Megabytes that one input may take beyond what the process had."""
 
+DIED = "died.txt"
+"""Where a worker says why it ends between two inputs."""
+
 LIMIT = 4000
 """Megabytes of addresses beyond what the process had that it gets at all."""
 
@@ -155,13 +158,17 @@ def work(folder: str, seed: int, wanted: str | None, pipe: Any) -> None:
     pipe.send([kind.name for kind in every])
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + LIMIT * 2**20, resource.RLIM_INFINITY))
-    with watched():
-        for kind, file, content in inputs(every, seed):
-            pipe.send((kind.name, file.name, content))
-            outcome = attempt(kind, file, content)
-            if outcome.fault and outcome.fault.startswith("takes"):
-                Path("/proc/self/clear_refs").write_text("5")  # the peak counts anew
-            pipe.send(outcome)
+    try:
+        with watched():
+            for kind, file, content in inputs(every, seed):
+                pipe.send((kind.name, file.name, content))
+                outcome = attempt(kind, file, content)
+                if outcome.fault and outcome.fault.startswith("takes"):
+                    Path("/proc/self/clear_refs").write_text("5")  # the peak counts anew
+                pipe.send(outcome)
+    except BaseException:
+        (Path(folder) / DIED).write_text(traceback.format_exc(), encoding="utf-8")
+        raise
 
 
 def report_of(counts: dict[str, collections.Counter[str]]) -> str:
@@ -198,7 +205,9 @@ def fuzz(seconds: float, most: float, seed: int, wanted: str | None, failures: P
                     name, file, content = ours.recv()
                 except EOFError:
                     worker.join()
-                    faults[f"the worker died between two inputs ({worker.exitcode}), seed {start}"] += 1
+                    why = Path(folder) / DIED
+                    last = why.read_text(encoding="utf-8")[-600:] if why.is_file() else ""
+                    faults[f"the worker died between two inputs ({worker.exitcode}), seed {start} {last}"] += 1
                     break
                 try:
                     outcome = ours.recv() if ours.poll(DEAD) else Outcome(False, f"hangs for {DEAD} s, deaf")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import rerun as rr
 
-FIRST_DATE = 1e8
-"""Seconds; timestamps from here on count from 1970 and are shown as dates, smaller ones as durations."""
+FIRST_DATE, LAST_DATE = 1e8, 9e9
+"""Seconds; timestamps from the first on count from 1970 and are shown as dates, smaller ones as durations. Beyond the
+last one they are no seconds, and more nanoseconds than 64 bits hold: frames are shown by their number alone."""
 
 
 def path(*parts: str) -> str:
@@ -25,7 +24,7 @@ class Clock:
         """What is logged from now on belongs to that frame."""
         stream.reset_time()
         stream.set_time("frame", sequence=frame)
-        if timestamp is None or not math.isfinite(timestamp):
+        if timestamp is None or not abs(timestamp) <= LAST_DATE:
             return
         if self._dated is None:
             self._dated = timestamp >= FIRST_DATE
@@ -37,7 +36,7 @@ class Clock:
     def columns(self, frames: list[int], timestamps: list[float | None]) -> list[rr.TimeColumn]:
         """The times of a whole series; without timestamps where one is missing."""
         columns = [rr.TimeColumn("frame", sequence=frames)]
-        known = [stamp for stamp in timestamps if stamp is not None and math.isfinite(stamp)]
+        known = [stamp for stamp in timestamps if stamp is not None and abs(stamp) <= LAST_DATE]
         if not known or len(known) < len(frames):
             return columns
         if self._dated is None:
