@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun as rr
 
 from semstab.engine.units import Plan
@@ -72,10 +73,10 @@ def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, cl
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             rows = list(csv.DictReader(lines))
-        numbers = [int(row["frame"]) for row in rows]
+        numbers = [int(np.int64(int(row["frame"]))) for row in rows]
         stamps = [float(row["timestamp"]) if row["timestamp"] else None for row in rows]
         found = [values(row) for row in rows]
-    except (OSError, LookupError, TypeError, ValueError, csv.Error) as error:
+    except (OSError, LookupError, TypeError, ArithmeticError, ValueError, csv.Error) as error:
         raise DataError(
             f"{file}: not a time series of a run ({one_line(error)}); delete the run folder's units/"
         ) from error
