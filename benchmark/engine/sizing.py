@@ -61,14 +61,15 @@ def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
 def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: Sizing) -> None:
     task, settings, width = group[0].task, group[0].config, survey.executor.width
     forced = isinstance(config.tile_size, int)
-    if not forced and _surely_fits(config, group):
+    own = limit(config) / width  # of the process that a unit is fused in
+    if not forced and _surely_fits(own, group):
         return
     size = config.tile_size if isinstance(config.tile_size, int) else None
     sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
     kinds = _kinds(group, soft=_is_soft(task))
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
-    if not forced and needed <= limit(config):
+    if not forced and needed <= own:
         return
     if (why := _cannot_be_tiled(config, group)) is not None:
         if forced:
@@ -77,23 +78,24 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
         line = too_large(task, names, settings, voxels, needed, f" ({why})")
         found.refused |= {each.identity: line for each in group}
         return
-    budget = SHARE * limit(config) / width
+    budget = SHARE * own
     for each, kind in zip(group, kinds, strict=True):
         found.tilings[each.identity] = tiled(sights, kind.bytes, budget, size, 2 * width if width > 1 else 1)
     tiling = found.tilings[group[0].identity]
     decoded = tiling.decodes / max(len(task.indices), 1)
+    each_has = " for each process" if width > 1 else ""
     found.remarks.append(
-        f"{takes(task, settings, voxels, needed)}, {limit(config) / GB:.2g} GB are there: fused in {len(tiling.parts)}"
+        f"{takes(task, settings, voxels, needed)}, {own / GB:.2g} GB are there{each_has}: fused in {len(tiling.parts)}"
         f" parts, of tiles of {tiling.size * settings.voxel_size:g} m; a frame is decoded {decoded:.2f} times for them"
     )
 
 
-def _surely_fits(config: Config, group: Sequence[PlannedUnit]) -> bool:
+def _surely_fits(memory: float, group: Sequence[PlannedUnit]) -> bool:
     task, settings = group[0].task, group[0].config
     voxels = most_voxels(task, settings, _first(task, settings))
 
     def fits(*, soft: bool) -> bool:
-        return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft)) <= limit(config)
+        return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft)) <= memory
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import random
@@ -101,7 +102,7 @@ def replace_somewhere(values: Any, rng: random.Random) -> None:
     elif rng.random() < 0.2:
         values[key] = [values[key], values[key]]
     else:
-        values[key] = rng.choice(VALUES)
+        values[key] = copy.deepcopy(rng.choice(VALUES))  # else a list might come to hold itself
 
 
 def of_json(content: bytes, rng: random.Random) -> bytes:
