@@ -64,8 +64,8 @@ class Whole:
         return found if truth is None else truth.stable.added_to(found, self._likely)
 
     def _likely(self, seen: Int64, most: Int64) -> Float64:
-        votes, of = np.unique(np.stack([seen, most]), axis=1, return_inverse=True)  # many places have the same
-        return Votes(*votes, np.ones_like(votes[0])).stable(self.shares)[of.ravel()]
+        (seen, most), of = np.unique(np.stack([seen, most]), axis=1, return_inverse=True)  # many places have the same
+        return Votes(seen, most, np.ones_like(seen)).stable(self.shares)[of.ravel()]
 
     def drift_tests(self) -> DriftTests:
         """Of a map with its log."""
