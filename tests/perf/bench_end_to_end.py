@@ -53,6 +53,7 @@ def main() -> None:
             write_scene(root, views, (width, height), noise, depth)
             for backend in arguments.backend:
                 results.append({"depth": depth, "noise_mm": noise, **measured(root, backend, arguments)})
+                print(f"{depth}, {noise:g} mm, {backend}: {results[-1]['ratio']:.2f}", file=sys.stderr, flush=True)
             shutil.rmtree(root)
     report = {
         "command": " ".join(["python", *sys.argv]),
