@@ -38,7 +38,7 @@ def write(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) -> int
 
     Raises MissingDependencyError, and ConfigError for a table of codes.
     """
-    las, left = library(path), iter(parts)
+    las, left = with_lazrs(path), iter(parts)
     first = next(left)
     header, written = _header(first), 0
     compress = path.suffix.lower() == ".laz"
@@ -54,7 +54,7 @@ def write(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) -> int
 
 def _header(voxels: Voxels) -> laspy.LasHeader:
     """Of a cloud that begins with these voxels."""
-    las = library(Path("header"))
+    las = with_lazrs(Path("header"))
     header = las.LasHeader(point_format=FORMAT, version="1.4")
     header.scales = np.full(3, MILLIMETRE)
     header.offsets = np.floor(voxels.points.min(axis=0))
@@ -66,7 +66,7 @@ def _header(voxels: Voxels) -> laspy.LasHeader:
 
 
 def _points(voxels: Voxels, header: laspy.LasHeader, asprs: Path | None) -> laspy.ScaleAwarePointRecord:
-    points = library(Path("points")).ScaleAwarePointRecord.zeros(len(voxels.table), header=header)
+    points = with_lazrs(Path("points")).ScaleAwarePointRecord.zeros(len(voxels.table), header=header)
     points.x, points.y, points.z = voxels.points.T
     points.red, points.green, points.blue = (voxels.colors[voxels.classified - 1].astype(np.uint16) * 257).T
     points.classification = codes(voxels, asprs)[voxels.classified]
@@ -76,7 +76,7 @@ def _points(voxels: Voxels, header: laspy.LasHeader, asprs: Path | None) -> lasp
     return points
 
 
-def library(path: Path) -> Any:
+def with_lazrs(path: Path) -> Any:
     """Laspy, with what compresses LAZ. Raises MissingDependencyError."""
     try:
         import laspy
@@ -88,7 +88,7 @@ def library(path: Path) -> Any:
 
 def declare(header: laspy.LasHeader, name: str, kind: npt.DTypeLike, about: str) -> None:
     """An extra dimension, where the header has none of that name."""
-    las = library(Path(name))
+    las = with_lazrs(Path(name))
     if name not in header.point_format.dimension_names:
         header.add_extra_dims([las.ExtraBytesParams(name=name, type=np.dtype(kind), description=about[:31])])
 
@@ -100,7 +100,7 @@ def declare_column(header: laspy.LasHeader, name: str, column: Column) -> None:
 
 def describe(header: laspy.LasHeader, voxels: Voxels) -> None:
     """Write into the header which class is which and, where the cloud has none, its reference system."""
-    las = library(Path("header"))
+    las = with_lazrs(Path("header"))
     legend = {"taxonomy": voxels.taxonomy, "classes": ["unclassified", *voxels.classes]}
     header.vlrs.append(las.VLR("semstab", 1, "classes of dimension class", json.dumps(legend).encode()))
     if voxels.georeference is not None and header.parse_crs() is None and header.point_format.id >= 6:

@@ -162,12 +162,12 @@ def _beside(cloud: Path, finder: _Finder) -> DataError:
 
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
-    library = las.library(cloud)
+    module = las.with_lazrs(cloud)
     with opened(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
         header = _extended(reader.header, voxels)
         compress = out.suffix.lower() == ".laz"
-        with library.open(out, mode="w", header=header, do_compress=compress) as writer:
+        with module.open(out, mode="w", header=header, do_compress=compress) as writer:
             for points in reader.chunk_iterator(min(CHUNK, points_at_once(reader.header))):
                 writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
             if extended := _without_copc(reader.evlrs or ()):
