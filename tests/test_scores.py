@@ -11,9 +11,9 @@ import pytest
 
 import semstab
 from semstab import backends
-from semstab.backends.shared.scores.logarithm import plogp_fast
+from semstab.backends.shared.scores.belief_vectors import observe_eights
+from semstab.backends.shared.scores.vectors import LANES
 from semstab.errors import DataError
-from semstab.runtime.compiled import serial
 from semstab.testing import EXACT, SUMS, assert_same_map
 
 
@@ -122,15 +122,22 @@ def test_a_map_of_scores_takes_what_is_expected(K) -> None:
     assert held / 3 < backends.expected_bytes("numba", voxels, voxels, K, soft=True) < 3 * held
 
 
-@serial
-def _each(p, out):
-    for i in range(p.shape[0]):
-        out[i] = plogp_fast(p[i])
+@pytest.mark.parametrize("features", [None, ""])
+def test_the_fast_logarithm(features, monkeypatch) -> None:
+    """With the instructions of this machine (None), and without wide vectors."""
+    if features is not None:
+        monkeypatch.setattr("numba.core.codegen.JITCPUCodegen.magic_tuple", lambda _: ("", "", features))
 
+    @numba.njit
+    def each(p, found):
+        sums = np.zeros(LANES)
+        for i in range(p.shape[0]):
+            sums[i % LANES] = p[i]
+            found[i] = observe_eights(np.zeros(LANES), sums, 1.0, 1.0, 1.0)[3]
+            sums[i % LANES] = 0.0
 
-def test_the_fast_logarithm() -> None:
     p = np.concatenate([[0.0, 0.5, 1.0, 1e-300], np.random.default_rng(0).random(1000), 1 + 1e-9 * np.arange(-50, 50)])
     found = np.empty_like(p)
-    _each(p, found)
+    each(p, found)
     expected = p * np.log2(np.where(p > 0, p, 1).astype(np.longdouble))
     np.testing.assert_allclose(found, expected.astype(np.float64), rtol=2e-15, atol=1e-300)

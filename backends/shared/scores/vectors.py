@@ -18,7 +18,7 @@ NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.
 NAMES = {types.float32: "f32", types.float64: "f64", types.uint16: "f16"}
 
 INT, INT32, DOUBLE = ir.IntType(64), ir.IntType(32), ir.DoubleType()
-DOUBLES = ir.VectorType(DOUBLE, LANES)
+DOUBLES, INTS = ir.VectorType(DOUBLE, LANES), ir.VectorType(INT, LANES)
 
 
 @intrinsic
@@ -47,7 +47,7 @@ def add_scaled(_typing: Any, scores: Any, _at: Any, _K: Any, _scale: Any, sums: 
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        factor = _spread(builder, arguments[3], DOUBLES)
+        factor = spread(builder, arguments[3], DOUBLES)
         row = builder.gep(context.make_array(sums)(context, builder, arguments[4]).data, [arguments[5]])
 
         def add(values: Any, k: Any) -> None:
@@ -86,7 +86,7 @@ def _each_eight(context: Any, builder: Any, kind: Any, arguments: Any, do: Calla
     with builder.if_then(builder.icmp_signed(">", rest, INT(0))):
         values = cgutils.alloca_once(builder, vector)
         lanes = ir.Constant(ir.VectorType(INT, LANES), list(range(LANES)))
-        kept = builder.icmp_signed("<", lanes, _spread(builder, rest, ir.VectorType(INT, LANES)))
+        kept = builder.icmp_signed("<", lanes, spread(builder, rest, ir.VectorType(INT, LANES)))
         nothing = ir.Constant(vector, [0.0] * LANES)
         (length,) = cgutils.unpack_tuple(builder, array.shape, 1)
         beyond = builder.add(builder.add(at, whole), INT(LANES))
@@ -103,7 +103,7 @@ def _each_eight(context: Any, builder: Any, kind: Any, arguments: Any, do: Calla
         do(widened(builder.load(values)), whole)
 
 
-def _spread(builder: Any, value: Any, vector: Any) -> Any:
+def spread(builder: Any, value: Any, vector: Any) -> Any:
     """A vector of equal values."""
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, INT32(0))
     return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(INT32, vector.count), [0] * vector.count))
