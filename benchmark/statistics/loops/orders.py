@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.backends.shared.hashing import mix
-from semstab.backends.shared.scores.logarithm import plogp_fast
 from semstab.runtime.compiled import compiled, serial
 from semstab.statistics.loops.chunks import CHUNKS
+from semstab.statistics.loops.logarithm import plogp_fast
 
 ENUMERATED = 5
 """Up to this OP all T! orders are gone through; 5! = 120."""
