@@ -64,7 +64,7 @@ def plogp_fast(p):
 
 @serial
 def exp2_fast(x):
-    """2^x of x <= 0, to a few units in the last place: of its fraction by the series of e, whose 14th term adds 2^-57."""
+    """2^x of x <= 0, to a few units in the last place: its fraction by a series, whose 14th term adds 2^-57."""
     above = max(x, LOWEST)
     rounded: Any = above + ROUNDER
     y = (above - (rounded - ROUNDER)) * LN2

@@ -45,7 +45,7 @@ def list_classes(chunk, starts, log, K, first, label):
 
 @compiled(fastmath={"reassoc", "contract", "nnan"})
 def _beliefs(total, lanes, of, scale, pooled, after, logs, norm):
-    """The beliefs after (A + 1, lanes) that follow from sums total (A + 1, lanes), and logs (lanes,) their sum q log2 q.
+    """The beliefs after (A + 1, lanes) that follow from sums total (A + 1, lanes); logs (lanes,) is their sum q log2 q.
 
     The sums are of evidence, or of its binary logarithms where they are pooled; of (A + 1, lanes) is how many classes
     each row stands for, norm (2, lanes) is work space.
@@ -97,9 +97,9 @@ def _add_drift(before, after, of, lanes, logs_before, logs, drift):
 def _observe(e, end, label, weight, classes, a, floor, certain, totals, lane):
     """Add the log's entries from e to before `end`, an observation, to the sums by class of the voxel in a lane.
 
-    classes[a:] are those that it saw, ascending, as an observation's are. totals (3, A + 1, lanes) are sums of evidence,
-    of votes for the largest, the lowest on ties, and of log2(max(s, floor) / floor), which is 0 for what is not seen:
-    that evidence is not normalised changes no belief. certain is -log2 floor, or 0 where logarithms are not needed.
+    classes[a:] are those that it saw, ascending, as an observation's are. totals (3, A + 1, lanes) are sums of
+    evidence, of votes for the largest, the lowest on ties, and of log2(max(s, floor) / floor), which is 0 for what is
+    not seen: that evidence is not normalised changes no belief. certain is -log2 floor, or 0 where none are needed.
     """
     own = best = 0
     most = 0.0

@@ -16,7 +16,7 @@ from semstab.errors import ConfigError
 from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.order.ranks import ranked
+from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

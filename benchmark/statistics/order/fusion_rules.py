@@ -13,7 +13,7 @@ from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.order.ranks import ranked
+from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
