@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term
 from semstab.runtime.compiled import serial
-from semstab.statistics.loops.kernels import CHUNKS, load
+from semstab.statistics.loops.chunks import CHUNKS
 
 
 @serial
@@ -70,6 +70,29 @@ def count_classes(chunk, starts, log, K, count):
 
 
 @serial
+def load(log, first, T, number, starts, column, share):
+    """Copy a voxel's T observations: the t-th has entries starts[t] to starts[t + 1].
+
+    log is (starts, label, weight) of all observations. An entry has its class, numbered among the A that the voxel ever
+    saw, and its share of the observation; number is work space (K,), all -1. Returns A.
+    """
+    at, label, weight = log
+    A = 0
+    for t in range(T + 1):
+        starts[t] = at[first + t] - at[first]
+    for e in range(starts[T]):
+        k = label[at[first] + e]
+        if number[k] < 0:
+            number[k] = A
+            A += 1
+        column[e] = number[k]
+        share[e] = weight[at[first] + e]
+    for e in range(starts[T]):
+        number[label[at[first] + e]] = -1
+    return A
+
+
+@serial
 def fuse_by_rule(chunk, starts, log, K, entries, rule, floor, own, drift_sum):
     """Fuse each voxel's observations: add them (rule 0), votes for their argmax (1), or their logarithms (2; mean: 3).
 
@@ -92,7 +115,7 @@ def fuse_by_rule(chunk, starts, log, K, entries, rule, floor, own, drift_sum):
     unanimous = np.full((most + 1, 3), np.nan)  # by T: drift, belief and rest where all say the same with certainty
     for i in range(chunk, starts.shape[0] - 1, CHUNKS):
         T = starts[i + 1] - starts[i]
-        A, _ = load(log, starts[i], T, number, at, column, share)
+        A = load(log, starts[i], T, number, at, column, share)
         same = A == 1 and share[: at[T]].min() == 1.0
         if same and not np.isnan(unanimous[T, 0]):
             drift_sum[i], belief[first[i]], rest[i] = unanimous[T, 0], unanimous[T, 1], unanimous[T, 2]

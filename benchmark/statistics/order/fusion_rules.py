@@ -62,7 +62,7 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
     0.01, or 1/K where that is less.
     Raises ConfigError for another rule, or a floor outside (0, 1/K].
     """
-    from semstab.statistics.loops import kernels, log_kernels
+    from semstab.statistics.loops import chunks, log_kernels
 
     K = events.evidence.K
     floor = min(FLOOR, 1 / K) if floor is None else floor
@@ -72,11 +72,11 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
         raise ConfigError(f"floor = {floor:g}: it must be above 0 and at most 1/K = {1 / K:g}")
     bounds, log = np.append(events.starts, len(events)), events.evidence.entries
     count = np.zeros(len(bounds), np.int64)
-    kernels.in_chunks(log_kernels.count_classes, bounds, log, K, count)
+    chunks.in_chunks(log_kernels.count_classes, bounds, log, K, count)
     first, entries = np.cumsum(count), np.diff(log[0][bounds])
     own = first, np.zeros(first[-1], np.uint16), np.zeros(first[-1]), np.zeros(len(entries))
     drift_sum = np.zeros(len(entries))
-    kernels.in_chunks(
+    chunks.in_chunks(
         log_kernels.fuse_by_rule, bounds, log, K, int(entries.max(initial=0)), RULES.index(rule), floor, own, drift_sum
     )
     first, label, belief, rest = own
