@@ -71,6 +71,19 @@ def test_any_number_of_threads_gives_the_same_sums() -> None:
         np.testing.assert_array_equal(getattr(tables[0], column), getattr(tables[1], column), err_msg=column)
 
 
+@pytest.mark.parametrize(("K", "shape"), [(2, (1, 1)), (3, (2, 9)), (20, (17, 7))])
+def test_images_smaller_than_a_tile(K, shape) -> None:
+    """The last pixels' scores are not read together with what lies behind them."""
+    rng = np.random.default_rng(K)
+    scores = np.full((shape[0] + 1, shape[1], K), np.nan, dtype=np.float32)
+    scores[:-1] = rng.random((*shape, K))
+    frame = dataclasses.replace(soft_frame(rng, 0, K, "float32", shape), scores=scores[:-1])
+    made = [backends.create(name, voxel_size=0.3, num_classes=K) for name in ("numpy", "numba")]
+    for backend in made:
+        backend.integrate(frame)
+    assert_same_map(made[1].table(), made[0].table(), 1e-12)
+
+
 def test_every_pixel_a_voxel_of_its_own() -> None:
     """More voxels than a band has room for at first."""
     rng = np.random.default_rng(4)
