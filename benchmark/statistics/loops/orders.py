@@ -24,7 +24,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """What the states of splitmix64 are apart."""
 
 TURNS = 8
-"""A random order begins at so many places, as far from each other as can be, and goes round: what comes first differs."""
+"""A random order begins at so many places, as far apart as can be, and goes round: what comes first differs."""
 
 ROUNDING = 1e-9
 """Sums of the same terms in another order differ by less."""
@@ -213,7 +213,7 @@ def _trend(x, A, T, at):
 
 @serial
 def _tail(hits, tried, value, least, lanes, enough):
-    """The p-value, NaN until there are `enough` hits, and the hits, after `lanes` more orders: values (LANES,) >= least.
+    """The p-value, NaN until there are `enough` hits, and the hits, values >= least, after `lanes` more orders.
 
     Enough of them settle it: as the share of the orders until then (Besag and Clifford 1991, Biometrika 78).
     """

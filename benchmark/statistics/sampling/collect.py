@@ -227,7 +227,7 @@ def _sums_of_log(
         likely,
         *options,
         groups,
-        sums.reshape(cells * groups, -1),
+        sums.reshape(cells * groups, sums.shape[2]),
     )
     return sums
 
