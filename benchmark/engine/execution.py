@@ -27,6 +27,7 @@ from semstab.engine.work.passes import lend
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result, UnitContent
 from semstab.model.results import VoxelAdvice
+from semstab.runtime.process import give_back
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 
@@ -121,6 +122,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
     with folder.started() as start, lend(start, plan.scenes):
         with watch("sizing"):
             sizing = sized(plan.config, missing, Survey(executor, folder, start))
+            give_back()
         for line in sizing.remarks:
             told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         _refuse(sizing, missing, found, executor, told)

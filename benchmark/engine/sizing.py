@@ -14,7 +14,7 @@ from semstab.engine.survey import Survey
 from semstab.engine.tiling.partition import Tiling, tiled
 from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.memory import GB, Kind, limit, most_voxels, takes, too_large
+from semstab.engine.work.memory import GB, Kind, beside, most_voxels, room, takes, too_large
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
@@ -61,13 +61,15 @@ def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
 def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: Sizing) -> None:
     task, settings, width = group[0].task, group[0].config, survey.executor.width
     forced = isinstance(config.tile_size, int)
-    own = limit(config) / width  # of the process that a unit is fused in
-    if not forced and _surely_fits(own, group):
+    first = _first(task, settings)
+    if not forced and _surely_fits(config, width, group, first):
         return
+    soft = _is_soft(task)
     size = config.tile_size if isinstance(config.tile_size, int) else None
     sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
-    kinds = _kinds(group, soft=_is_soft(task))
+    kinds = _kinds(group, soft=soft)
+    own = _room(config, width, group, first, voxels, soft=soft)
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
     if not forced and needed <= own:
         return
@@ -75,7 +77,7 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
         if forced:
             raise ConfigError(f"tile_size = {config.tile_size}: {why}")
         names = [each.unit.backend for each in group]
-        line = too_large(task, names, settings, voxels, needed, f" ({why})")
+        line = too_large(task, names, settings, voxels, needed, own, f" ({why})")
         found.refused |= {each.identity: line for each in group}
         return
     budget = SHARE * own
@@ -90,14 +92,24 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
     )
 
 
-def _surely_fits(memory: float, group: Sequence[PlannedUnit]) -> bool:
+def _surely_fits(config: Config, width: int, group: Sequence[PlannedUnit], first: Frame) -> bool:
+    """Without a look at labels, which may be a network's, where that will do."""
     task, settings = group[0].task, group[0].config
-    voxels = most_voxels(task, settings, _first(task, settings))
+    voxels = most_voxels(task, settings, first)
 
     def fits(*, soft: bool) -> bool:
-        return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft)) <= memory
+        needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft))
+        return needed <= _room(config, width, group, first, voxels, soft=soft)
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
+
+
+def _room(
+    config: Config, width: int, group: Sequence[PlannedUnit], first: Frame, voxels: float, *, soft: bool
+) -> float:
+    """Bytes for maps of the process that these units are fused in."""
+    K = len(group[0].task.mapping.target)
+    return room(config, width, beside(first, K, voxels, config.threads, soft=soft))
 
 
 def _first(task: Task, settings: Config) -> Frame:
