@@ -14,7 +14,7 @@ from semstab.engine.survey import Survey
 from semstab.engine.tiling.partition import Tiling, tiled
 from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.memory import GB, Kind, beside, most_voxels, room, takes, too_large
+from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
@@ -68,9 +68,9 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
     size = config.tile_size if isinstance(config.tile_size, int) else None
     sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
-    kinds = _kinds(group, soft=soft)
-    own = _room(config, width, group, first, voxels, soft=soft)
+    kinds, load = _kinds(group, soft=soft), _load(group, first, soft=soft)
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
+    own = room(config, width, load.beside(voxels, needed))
     if not forced and needed <= own:
         return
     if (why := _cannot_be_tiled(config, group)) is not None:
@@ -99,17 +99,15 @@ def _surely_fits(config: Config, width: int, group: Sequence[PlannedUnit], first
 
     def fits(*, soft: bool) -> bool:
         needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft))
-        return needed <= _room(config, width, group, first, voxels, soft=soft)
+        return needed <= room(config, width, _load(group, first, soft=soft).beside(voxels, needed))
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
 
 
-def _room(
-    config: Config, width: int, group: Sequence[PlannedUnit], first: Frame, voxels: float, *, soft: bool
-) -> float:
-    """Bytes for maps of the process that these units are fused in."""
-    K = len(group[0].task.mapping.target)
-    return room(config, width, beside(first, K, voxels, config.threads, soft=soft))
+def _load(group: Sequence[PlannedUnit], first: Frame, *, soft: bool) -> Load:
+    """Of the process that these units are fused in."""
+    task, settings = group[0].task, group[0].config
+    return Load(first, len(task.indices), len(task.mapping.target), soft, settings.threads)
 
 
 def _first(task: Task, settings: Config) -> Frame:

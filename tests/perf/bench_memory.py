@@ -26,8 +26,7 @@ import semstab
 from semstab.engine.sizing import SHARE
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights
-from semstab.engine.work.memory import GB, Kind, beside
-from semstab.engine.work.sizes import sizes_bytes
+from semstab.engine.work.memory import GB, Kind, Load
 from semstab.runtime.files import write_json
 
 HERE = Path(__file__).resolve().parent
@@ -73,34 +72,33 @@ def taken(found: dict[str, float]) -> tuple[float, str]:
     return (found["all"] - found["digest"]) * GB, stage
 
 
-def largest_part(out: Path, kind: Kind, memory_gb: float, observed: float) -> float:
-    """Bytes of the largest part of a run in tiles, as estimated; `observed` is how often a voxel is seen."""
+def largest_part(out: Path, kind: Kind, memory_gb: float, observed: float) -> tuple[float, float]:
+    """Bytes and voxels of the largest part of a run in tiles, as estimated; `observed` is how often a voxel is seen."""
     (file,) = (out / "sights").iterdir()
     sights = Sights.load(file)
     assert sights is not None
     parts = tiled(sights, kind.bytes, SHARE * memory_gb * GB).parts
-    return max(kind.bytes(part.voxels, observed * part.voxels) for part in parts)
+    return max((kind.bytes(part.voxels, observed * part.voxels), part.voxels) for part in parts)
 
 
 def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: float) -> Iterator[dict[str, Any]]:
     """At once, then in tiles."""
     soft, (width, height) = kind == "scores", SIZE[kind]
     of = Kind(backend, K, soft=soft, sampled=backend == "numba")
-    first = flight.frame(0, width, height, K)
+    load = Load(flight.frame(0, width, height, K), FRAMES[kind], K, soft, None)
     if of.bytes(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
         print(f"{backend:>8} {K:4} {kind:>7} left out: {of.bytes(most, most) / GB:.2g} GB")
         return
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", "memory_gb=1000", "--tile-size", "off"))
     (summary,) = semstab.load_result(out).runs
     voxels, looks = summary.table.voxels, summary.table.observations
-    more = beside(first, K, voxels, None, soft=soft), sizes_bytes(first, FRAMES[kind], K, soft=soft)
     own = {"backend": backend, "K": K, "kind": kind, "voxels": voxels}
     whole = of.bytes(voxels, looks)
-    yield {**own, "run": "whole", "bytes": found, "estimate": more[0] + max(more[1], whole), "stage": stage}
+    yield {**own, "run": "whole", "bytes": found, "estimate": whole + load.beside(voxels, whole), "stage": stage}
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
-    part = largest_part(out, of, limit, looks / voxels)
-    yield {**own, "run": "tiles", "bytes": found, "estimate": more[0] + max(more[1], part), "stage": stage}
+    part, voxels = largest_part(out, of, limit, looks / voxels)
+    yield {**own, "run": "tiles", "bytes": found, "estimate": part + load.beside(voxels, part), "stage": stage}
 
 
 def main() -> None:

@@ -229,8 +229,9 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     with watch("write"):
         saved, returned = written(job, _portion_savers(stream, one, portion, found))
         rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
+        sizes, voxels = () if one.sizes is None else one.sizes.alphas(), 0 if table is None else len(table)
         finished = Finished(
-            About(portion.kind, saved, checked, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
+            About(portion.kind, saved, voxels, checked, sizes, _quality(stream)),
             series_array(one.rows),
             {} if found is None else found.sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),

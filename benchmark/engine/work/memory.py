@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from semstab.backends import expected_bytes
 from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
+from semstab.engine.work.sizes import sizes_bytes
 from semstab.model.evidence import STRETCH
 from semstab.model.frames import Frame
 from semstab.runtime.memory import available_bytes
@@ -52,15 +53,36 @@ class Kind:
         return fused + truth + logs + followed + reduced + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
 
 
-def beside(first: Frame, K: int, voxels: float, threads: int | None, *, soft: bool) -> float:
-    """Bytes that a process takes beside its maps: what it loads, the sample of looks, frames, voxels that are dense.
+@dataclass(frozen=True)
+class Load:
+    """What the bytes depend on that a process takes beside its maps.
 
-    first  frame as it is fused; as many as are read ahead are there, this one, the one before, and their temporaries
+    first    frame, as it is fused
+    frames   how many there are
+    K        number of classes
+    soft     whether frames have scores
+    threads  that read ahead; None: as many as there are for it
     """
-    pixels = first.shape[0] * first.shape[1]
-    frames = (default_threads() if threads is None else threads) + FRAMES_AT_WORK
-    dense = 2 * 8 * K * min(voxels, STRETCH)
-    return LOADED + soft * LOADED_FOR_SCORES + frames * pixels * (6 + (4 * K if soft else 0)) + dense
+
+    first: Frame
+    frames: int
+    K: int
+    soft: bool
+    threads: int | None
+
+    def beside(self, voxels: float, maps: float) -> float:
+        """Beside maps of so many voxels and bytes: what is loaded, and frames.
+
+        And dense rows of statistics, when a map is but its table, or some frames fused once more, before the last third
+        of what is loaded comes; as far as they are more than what is gone by then, or not yet there.
+        """
+        pixels = self.first.shape[0] * self.first.shape[1]
+        threads = default_threads() if self.threads is None else self.threads
+        frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
+        dense = 2 * 8 * self.K * min(voxels, STRETCH)
+        sizes = sizes_bytes(self.first, self.frames, self.K, soft=self.soft)
+        loaded = LOADED + self.soft * LOADED_FOR_SCORES
+        return loaded + frames + max(0.0, dense - maps / 2, sizes - LOADED / 3 - maps)
 
 
 def room(config: Config, width: int, taken: float) -> float:

@@ -24,7 +24,7 @@ from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
-from semstab.errors import ConfigError, DataError
+from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.voxels.extent import Extent
 from semstab.runtime.memory import available_bytes, resident_bytes
@@ -266,7 +266,7 @@ class Pass:
         if largest is None:
             return
         with self._failing([largest.request]):
-            raise ConfigError(self._room.text(largest))
+            raise self._room.outgrown(largest)
         for stream in self._streams:
             stream.maps = [one for one in stream.maps if one is not largest]
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from semstab.backends import expected_bytes
 from semstab.engine.work.memory import GB, log_bytes, result_bytes
 from semstab.engine.work.stream import UnitMap
+from semstab.errors import OutgrownError
 from semstab.runtime.memory import available_bytes, resident_bytes
 
 STEP = 32e6
@@ -46,12 +47,12 @@ class Room:
             return None
         return max(maps, key=_bytes)
 
-    def text(self, one: UnitMap) -> str:
+    def outgrown(self, one: UnitMap) -> OutgrownError:
         """Why a map is given up."""
         unit, config = one.task.units[0], one.request.config
         voxels = one.rows[-1].report.map_voxels
         which = "are free" if self._limit is None else "is left of memory_gb"
-        return (
+        return OutgrownError(
             f"{unit.scene}, {unit.backbone}, {unit.backend}: after {len(one.rows)} of {len(one.task.indices)} frames"
             f" the map has {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m, of which its table"
             f" {'and statistics' if config.statistics else 'alone'} would take {end_bytes(one) / GB:.2g} GB, and"
