@@ -14,7 +14,7 @@ import pytest
 import semstab
 
 IMPORT = """
-import semstab.outputs.recording, semstab.statistics.loops.kernels  # whatever is compiled is imported without an error
+import semstab.outputs.recording, semstab.statistics.loops.orders  # whatever is compiled is imported without an error
 from semstab.backends.numba_hash import NumbaHash
 from semstab.runtime.compiled import serial
 

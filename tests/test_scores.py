@@ -11,9 +11,9 @@ import pytest
 
 import semstab
 from semstab import backends
-from semstab.backends.shared.scores.logarithm import plogp_fast
+from semstab.backends.shared.scores.belief_vectors import observe_eights
+from semstab.backends.shared.scores.vectors import LANES
 from semstab.errors import DataError
-from semstab.runtime.compiled import serial
 from semstab.testing import EXACT, SUMS, assert_same_map
 
 
@@ -71,6 +71,19 @@ def test_any_number_of_threads_gives_the_same_sums() -> None:
         np.testing.assert_array_equal(getattr(tables[0], column), getattr(tables[1], column), err_msg=column)
 
 
+@pytest.mark.parametrize(("K", "shape"), [(2, (1, 1)), (3, (2, 9)), (20, (17, 7))])
+def test_images_smaller_than_a_tile(K, shape) -> None:
+    """The last pixels' scores are not read together with what lies behind them."""
+    rng = np.random.default_rng(K)
+    scores = np.full((shape[0] + 1, shape[1], K), np.nan, dtype=np.float32)
+    scores[:-1] = rng.random((*shape, K))
+    frame = dataclasses.replace(soft_frame(rng, 0, K, "float32", shape), scores=scores[:-1])
+    made = [backends.create(name, voxel_size=0.3, num_classes=K) for name in ("numpy", "numba")]
+    for backend in made:
+        backend.integrate(frame)
+    assert_same_map(made[1].table(), made[0].table(), 1e-12)
+
+
 def test_every_pixel_a_voxel_of_its_own() -> None:
     """More voxels than a band has room for at first."""
     rng = np.random.default_rng(4)
@@ -122,15 +135,22 @@ def test_a_map_of_scores_takes_what_is_expected(K) -> None:
     assert held / 3 < backends.expected_bytes("numba", voxels, voxels, K, soft=True) < 3 * held
 
 
-@serial
-def _each(p, out):
-    for i in range(p.shape[0]):
-        out[i] = plogp_fast(p[i])
+@pytest.mark.parametrize("features", [None, ""])
+def test_the_fast_logarithm(features, monkeypatch) -> None:
+    """With the instructions of this machine (None), and without wide vectors."""
+    if features is not None:
+        monkeypatch.setattr("numba.core.codegen.JITCPUCodegen.magic_tuple", lambda _: ("", "", features))
 
+    @numba.njit
+    def each(p, found):
+        sums = np.zeros(LANES)
+        for i in range(p.shape[0]):
+            sums[i % LANES] = p[i]
+            found[i] = observe_eights(np.zeros(LANES), sums, 1.0, 1.0, 1.0)[3]
+            sums[i % LANES] = 0.0
 
-def test_the_fast_logarithm() -> None:
     p = np.concatenate([[0.0, 0.5, 1.0, 1e-300], np.random.default_rng(0).random(1000), 1 + 1e-9 * np.arange(-50, 50)])
     found = np.empty_like(p)
-    _each(p, found)
+    each(p, found)
     expected = p * np.log2(np.where(p > 0, p, 1).astype(np.longdouble))
     np.testing.assert_allclose(found, expected.astype(np.float64), rtol=2e-15, atol=1e-300)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from semstab.backends.shared.bits import bits_of
-from semstab.backends.shared.scores.logarithm import plogp_fast
+from semstab.backends.shared.scores.belief_vectors import observe_eights
 from semstab.runtime.compiled import compiled, serial
 
 
@@ -27,34 +28,21 @@ def js_term(p, q):
     return 0.5 * term
 
 
-@compiled(fastmath={"reassoc", "contract"})
+@compiled(forceinline=True)
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
-    """Add one observation to a voxel's dense evidence (K,), seen `op` times before; its loop is vectorised.
+    """Add one observation to a voxel's dense evidence, seen `op` times before.
 
-    sums (K,) are those of the normalised scores of its pixels; `dominant` and `plogp_before` what the observation
-    before left in out[4] and out[7], which spares looking for them. Leaves in `out` the change of VSS, that of the
-    entropy in bits, the drift in bits, the dominant class before and after, the squared length of s_bar, its entropy in
-    bits, and the sum of p log2 p over the classes.
+    evidence, sums  as `observe_eights` takes them; sums are those of the normalised scores of its pixels
+
+    `dominant` and `plogp_before` are what the observation before left in out[4] and out[7], which spares looking for
+    them. Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, the dominant class before
+    and after, the squared length of s_bar, its entropy in bits, and the sum of p log2 p over the classes.
     """
-    before, after, share = 1.0 / max(op, 1), 1.0 / (op + 1), 1.0 / pixels
-    plogp_after = plogp_between = squares = plogp_seen = 0.0
+    before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
     top_before = evidence[dominant] * before
-    most = np.int64(0)  # the largest evidence, by its bits: maxima of integers are vectorised
-    for k in range(evidence.shape[0]):
-        s = sums[k] * share
-        p = evidence[k] * before
-        evidence[k] += s
-        value = np.float64(evidence[k])
-        most = max(most, bits_of(value))
-        q = value * after
-        plogp_after += plogp_fast(q)
-        plogp_between += plogp_fast(0.5 * (p + q))
-        squares += s * s
-        plogp_seen += plogp_fast(s)
-    then = 0
-    while bits_of(np.float64(evidence[then])) != most:
-        then += 1
-    out[0] = evidence[then] * after - top_before
+    found: Any = observe_eights(evidence, sums, 1.0 / pixels, before, after)
+    plogp_after, plogp_between, squares, plogp_seen, top, then = found
+    out[0] = top * after - top_before
     out[1] = plogp_before - plogp_after
     out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0
     out[3], out[4], out[5], out[6], out[7] = dominant, then, squares, -plogp_seen, plogp_after

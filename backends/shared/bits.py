@@ -13,9 +13,3 @@ from numba.extending import intrinsic
 def bits_of(_typing: Any, _value: Any) -> Any:
     """The bits of a double, as int64; those of numbers from 0 on sort like the numbers."""
     return types.int64(types.float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))
-
-
-@intrinsic
-def number_of(_typing: Any, _bits: Any) -> Any:
-    """The double of these bits."""
-    return types.float64(types.int64), lambda _, builder, __, given: builder.bitcast(given[0], ir.DoubleType())

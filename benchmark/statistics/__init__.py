@@ -39,12 +39,12 @@ from semstab.statistics.looks import Looks, Sample, Sampler, View, correlogram, 
 from semstab.statistics.order.drift import (
     Flips,
     VoxelDrift,
-    benjamini_hochberg,
     expected_sbd,
     flips,
     voxel_drift,
 )
 from semstab.statistics.order.fusion_rules import RULES, Fused, fuse
+from semstab.statistics.order.p_values import benjamini_hochberg
 from semstab.statistics.scene_drift import SceneDrift, scene_drift
 from semstab.statistics.uncertainty import Uncertainty, decompose
 from semstab.statistics.versus.backbones import compare_backbones

@@ -213,11 +213,11 @@ def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[Clas
 def _squares(table: VoxelTable, events: Events | None) -> Float64:
     """The sum over frames of s_tk^2 for each entry (m,) of the table's evidence."""
     if events is not None:
-        from semstab.statistics.loops import kernels, log_kernels
+        from semstab.statistics.loops import chunks, log_kernels
 
         squares, bounds = np.zeros(len(table.evidence.weight)), np.append(events.starts, len(events))
         voxels = table.evidence.entries
-        kernels.in_chunks(log_kernels.sum_squares, bounds, events.evidence.entries, table.K, voxels, squares)
+        chunks.in_chunks(log_kernels.sum_squares, bounds, events.evidence.entries, table.K, voxels, squares)
         return squares
     again = table.op >= 2
     one_hot = (np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[again].all()

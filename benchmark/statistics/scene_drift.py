@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.order.drift import VoxelDrift, drawn, drift_tables, streams, trend_columns, varying
+from semstab.statistics.order.drift import VoxelDrift, drawn, streams, trend_columns, varying
 from semstab.statistics.sampling.reach import arrangement
 
 Float64 = npt.NDArray[np.float64]
@@ -137,7 +137,7 @@ class _Sampled:
 
     def orders(self, events: Events, K: int, seed: int, count: int) -> tuple[Int64, Float64, Float64]:
         """Voxels that many stretches see, and the sums over them of SBD and of trends (R,), in random orders."""
-        from semstab.statistics.loops import kernels
+        from semstab.statistics.loops import chunks, stretches
 
         at = np.concatenate([[0], np.cumsum(self.T)])
         changes = np.diff(self.stretch, prepend=-1) != 0
@@ -149,10 +149,11 @@ class _Sampled:
         at = np.concatenate([[0], np.cumsum(T)])
         as_seen = np.tile(np.arange(self.stretches), (count, 1))
         orders = np.random.default_rng(seed).permuted(as_seen, axis=1)
-        voxels = np.arange(kernels.CHUNKS + 1) * len(T) // kernels.CHUNKS
-        edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((kernels.CHUNKS, count, 2))
-        log, tables = events.evidence.entries, drift_tables(T)
-        kernels.in_chunks(kernels.permute_frames, edges, first, T, log, K, stretch, orders, *tables, sums)
+        voxels = np.arange(chunks.CHUNKS + 1) * len(T) // chunks.CHUNKS
+        edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((chunks.CHUNKS, count, 2))
+        log = events.evidence.entries
+        entries = int((log[0][first + T] - log[0][first]).max(initial=0))
+        chunks.in_chunks(stretches.permute_stretches, edges, first, T, log, K, entries, stretch, orders, sums)
         drifted, trended = sums.sum(axis=0).T
         return self.voxel[kept], drifted, trended
 

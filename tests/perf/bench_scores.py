@@ -32,7 +32,7 @@ import numpy.typing as npt  # noqa: E402
 import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
 from semstab.backends.shared.pixels.pixel_keys import frame_terms, keys_of_row  # noqa: E402
-from semstab.backends.shared.scores.vectors import total_of  # noqa: E402
+from semstab.backends.shared.scores.vectors import LANES, scale_eight  # noqa: E402
 from semstab.runtime.compiled import parallel  # noqa: E402
 from semstab.runtime.files import write_json  # noqa: E402
 
@@ -40,11 +40,11 @@ VOXEL = 0.2
 
 
 @parallel
-def read(scores, totals):
+def read(scores, scales):
     """Each score once."""
-    n = scores.shape[0] // totals.shape[0]
-    for part in nb.prange(totals.shape[0]):
-        totals[part] = total_of(scores, part * n, n)
+    n = scores.shape[0] // scales.shape[0]
+    for part in nb.prange(scales.shape[0]):
+        scale_eight(scores, part * n, n // LANES, np.zeros(LANES, dtype=np.int64), scales[part], 0)
 
 
 @parallel
@@ -91,13 +91,13 @@ def steps(frame: semstab.Frame, K: int) -> dict[str, Callable[[], object]]:
     rays, margin = frame_terms(ray_x, frame.T_wc, VOXEL)
     depth, T = np.array(frame.depth), np.array(frame.T_wc)
     origin = np.floor(T[:3, 3] / VOXEL).astype(np.int64)
-    keys, labels, totals = np.empty((64, W), dtype=np.int64), np.zeros(W, dtype=np.uint8), np.empty(64)
+    keys, labels, scales = np.empty((64, W), dtype=np.int64), np.zeros(W, dtype=np.uint8), np.empty((64, LANES))
     map_ = backends.create("numba", voxel_size=VOXEL, num_classes=K)
     report = map_.integrate(frame)
     order = np.random.default_rng(0).permutation(report.voxels)
     evidence = np.zeros((report.voxels, K))
     return {
-        "read": lambda: read(flat, totals),
+        "read": lambda: read(flat, scales),
         "keys": lambda: find_keys(depth, labels, ray_x, ray_y, T, VOXEL, origin, rays, margin, keys),
         "rows": lambda: touch_rows(evidence, order),
         "frame": lambda: map_.integrate(frame),

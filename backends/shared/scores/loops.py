@@ -10,14 +10,15 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared.hashing import PARTITIONS, partition_of
+from semstab.backends.shared.hashing import PARTITIONS, mix, partition_of
 from semstab.backends.shared.pixels.pixel_keys import keep_columns, keys_of_row
+from semstab.backends.shared.pixels.run_vectors import runs_of_eight
 from semstab.backends.shared.prefetch import touch
-from semstab.backends.shared.scores.vectors import LANES, add_scaled, total_of
+from semstab.backends.shared.scores.vectors import LANES, add_four, add_one, add_two, scale_eight
 from semstab.runtime.compiled import parallel, serial
 
 ROWS, COLUMNS = 16, 128
-"""Pixels of a tile; its rows are those of a band."""
+"""Pixels of a tile at most; its rows are those of a band."""
 
 TABLE_BITS = 11
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -26,6 +27,8 @@ SHIFT = np.uint64(64 - TABLE_BITS)
 AHEAD = 512
 """Scores that are asked for before their turn comes."""
 
+LINE = 16
+"""Of them, as many as a line of the cache holds, or less."""
 
 SOON = 8
 """Rows of sums likewise."""
@@ -33,15 +36,17 @@ SOON = 8
 
 @parallel
 def sum_scores(
-    depth, labels, scores, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys, tables, table_rows,
-    scales, key, count, sums, entries, lost, spread,
+    depth, labels, scores, ending, columns, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys,
+    tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
 
     Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
 
     labels   (W,) 0 wherever there is depth: scores have no ignore id
-    scores   (H * W * K,), see `score_vectors`
+    scores   (H * W * K,), see `vectors`
+    ending   the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
+    columns  of a tile
     within   see `keep_columns`
     key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
     lost     (bands,) whether a pixel with depth is out of reach
@@ -50,6 +55,7 @@ def sum_scores(
     H, W = depth.shape
     stride = -(-K // LANES) * LANES
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+    elsewhere = scores.shape[0] + (columns + LANES) * K - ending.shape[0]
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
         keys, table = row_keys[thread], tables[thread]
@@ -64,13 +70,19 @@ def sum_scores(
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]
         n = np.int64(0)
-        for start in range(0, W, COLUMNS):
-            stop = min(W, start + COLUMNS)
+        for start in range(0, W, columns):
+            stop = min(W, start + columns)
+            words = stretches[thread, 0, : -(-(stop - start) // LANES) * LANES + LANES]
             for v in range(first, last):
                 if n >= 0:
+                    words[: stop - start] = keys[v - first, start:stop]
+                    words[stop - start :] = -1
+                    at = (v * W + start) * K
+                    near = at + words.shape[0] * K > scores.shape[0]
                     n = _add_stretch(
-                        scores, v * W, keys[v - first], start, stop, K, stride, table, table_rows[thread],
-                        scales[thread], own_key, own_count, own_sums, n,
+                        ending if near else scores, at - elsewhere if near else at, K, stride, words, scales[thread],
+                        stretches[thread, 1], stretches[thread, 2], table, table_rows[thread], own_key, own_count,
+                        own_sums, n,
                     )  # fmt: skip
         entries[band] = n
         for e in range(n):
@@ -78,49 +90,97 @@ def sum_scores(
 
 
 @serial
-def _add_stretch(scores, row, keys, start, stop, K, stride, table, table_row, scale, key, count, sums, n):
-    """Add pixels `start` to before `stop` of a row to their voxels, of which there are n; how many then, or -1.
+def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, table_row, key, count, sums, n):
+    """Add a stretch of pixels to their voxels, of which there are n; how many then, or -1 where there is no room.
 
-    row  the number of the row's first pixel in the image
+    scores, at  their scores begin at scores[at]
+    words       their keys, and at least LANES times -1 behind the last one, up to a multiple of LANES; those of pixels
+                without a prediction become -1
     """
-    for u in range(start, stop):
-        if keys[u] >= 0:
-            at = (row + u) * K
-            touch(scores, min(at + AHEAD, scores.shape[0] - 1))
-            total = total_of(scores, at, K)
-            scale[u] = 1.0 / total
-            keys[u] = keys[u] if 0.0 < total < np.inf else -1  # no prediction
-    for u in range(start, stop):  # runs of equal keys are short: to look for their ends would take longer
-        k = keys[u]
-        if k < 0:
-            continue
-        slot = np.int64((np.uint64(k) * GOLDEN) >> SHIFT)
-        if table[slot] != k:
-            if n == key.shape[0]:
-                return np.int64(-1)
-            table[slot], table_row[slot] = k, n
-            key[n], count[n] = k, 0
-            sums[n * stride : (n + 1) * stride] = 0.0
-            n += 1
-        e = np.int64(table_row[slot])
-        count[e] += 1
-        add_scaled(scores, (row + u) * K, K, scale[u], sums, e * stride)
+    pixels = words.shape[0] - LANES
+    for u in range(0, pixels, LANES):
+        some = words[u] & words[u + 1] & words[u + 2] & words[u + 3]
+        if (some & words[u + 4] & words[u + 5] & words[u + 6] & words[u + 7]) >= 0:
+            for ahead in range(at + u * K + AHEAD, min(at + (u + LANES) * K + AHEAD, scores.shape[0]), LINE):
+                touch(scores, ahead)
+            scale_eight(scores, at + u * K, K, words, scale, u)
+    runs = 0
+    for u in range(0, pixels, LANES):
+        runs = runs_of_eight(words, u, run_word, run_end, runs)
+    begin = np.int64(0)
+    for i in range(runs):
+        k, end = run_word[i], run_end[i]
+        if k >= 0:
+            slot = np.int64((np.uint64(k) * GOLDEN) >> SHIFT)
+            fresh = table[slot] != k
+            if fresh:
+                if n == key.shape[0]:
+                    return np.int64(-1)
+                table[slot], table_row[slot] = k, n
+                key[n], count[n] = k, 0
+                n += 1
+            e = np.int64(table_row[slot])
+            count[e] += end - begin
+            while begin + 4 <= end:
+                add_four(scores, at + begin * K, K, scale, begin, sums, e * stride, fresh)
+                begin += 4
+                fresh = False
+            if begin + 2 <= end:
+                add_two(scores, at + begin * K, K, scale, begin, sums, e * stride, fresh)
+                begin += 2
+                fresh = False
+            if begin < end:
+                add_one(scores, at + begin * K, K, scale, begin, sums, e * stride, fresh)
+        begin = end
     return n
 
 
 @parallel
-def merge_sums(order, edges, voxel, bounds, key, pixels, sums, K, stride, out_key, out_pixels, out_row):
-    """Add up the entries of each voxel in the sums of its first one, whose place among the sums is `out_row`."""
+def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels, out_row):
+    """Entries by partition, and within one by band and order of appearance; `out_row` is the place of their sums."""
+    for band in nb.prange(entries.shape[0]):
+        cursor = offset[:, band].copy()
+        for e in range(band * room, band * room + entries[band]):
+            p = partition_of(key[e])
+            at = cursor[p]
+            cursor[p] = at + 1
+            out_key[at], out_pixels[at], out_row[at] = key[e], count[e], e * stride
+
+
+@parallel
+def merge_rows(edges, key, pixels, row, again, first, sums, K, found):
+    """Add up the entries of each voxel in place: in its first one, and in the sums of that; how many are `found`.
+
+    again, first  work space: the sums of an entry of a voxel that has one already, and those of its first one
+    """
     for p in nb.prange(PARTITIONS):
-        low, first = edges[p], bounds[p]
-        for v in range(bounds[p + 1] - first):
-            out_key[first + v], out_pixels[first + v], out_row[first + v] = key[low + v], pixels[low + v], -1
-        for i in range(low, edges[p + 1]):
-            touch(sums, order[min(i + SOON, edges[p + 1] - 1)] * stride)
-            v, there = first + voxel[i], order[i] * stride
-            if out_row[v] < 0:
-                out_row[v] = there
+        low, high = edges[p], edges[p + 1]
+        mask = 15
+        while mask < 2 * (high - low):
+            mask = 2 * mask + 1
+        slot = np.full(mask + 1, -1, dtype=np.int32)
+        n = low
+        repeated = low
+        for i in range(low, high):
+            k = key[i]
+            at = np.int64(mix(k) & np.uint64(mask))
+            while slot[at] >= 0 and key[low + slot[at]] != k:
+                at = (at + 1) & mask
+            if slot[at] < 0:
+                slot[at] = n - low
+                key[n], pixels[n], row[n] = k, pixels[i], row[i]
+                n += 1
             else:
-                to, added = sums[out_row[v] : out_row[v] + K], sums[there : there + K]
-                for k in range(K):
-                    to[k] += added[k]
+                v = low + slot[at]
+                pixels[v] += pixels[i]
+                again[repeated], first[repeated] = row[i], row[v]
+                repeated += 1
+        for i in range(low, repeated):
+            soon = min(i + SOON, repeated - 1)
+            for k in range(0, K, LANES):
+                touch(sums, again[soon] + k)
+                touch(sums, first[soon] + k)
+            to, added = sums[first[i] : first[i] + K], sums[again[i] : again[i] + K]
+            for k in range(K):
+                to[k] += added[k]
+        found[p] = n - low

@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from semstab.backends.shared.hashing import PARTITIONS
 from semstab.backends.shared.observed import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixels.merging import group, scatter
 from semstab.backends.shared.pixels.pixel_keys import columns_of, frame_terms, keep_columns
-from semstab.backends.shared.scores.loops import ROWS, TABLE_BITS, merge_sums, sum_scores
+from semstab.backends.shared.scores.loops import COLUMNS, ROWS, TABLE_BITS, merge_rows, scatter_rows, sum_scores
 from semstab.backends.shared.scores.vectors import LANES
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
@@ -22,6 +21,9 @@ Int64 = npt.NDArray[np.int64]
 
 FIRST_ROOM = 1 << 12
 """Voxels that a band has room for at first."""
+
+STRETCH = 1 << 14
+"""Scores of a tile's row at most."""
 
 SAMPLE = 1 << 10
 """Voxels, about, that are looked at to tell whether a frame's voxels have most classes."""
@@ -51,6 +53,9 @@ class Scores:
         bands, threads = -(-H // ROWS), nb.get_num_threads()
         stride = -(-K // LANES) * LANES
         scores = _flat(frame.scores)
+        columns = min(COLUMNS, max(LANES, STRETCH // K // LANES * LANES))
+        room = (columns + LANES) * K
+        ending = fixed(np.concatenate([scores[-room:], np.zeros(room, dtype=scores.dtype)]))
         while True:
             room = min(self._band_room, ROWS * W)
             key, count = space.room("key", bands * room), space.room("count", bands * room, dtype=np.int32)
@@ -58,11 +63,13 @@ class Scores:
             entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             sum_scores(
-                fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, K, ray_x, ray_y, fixed(frame.T_wc),
-                self.voxel_size, origin, columns_of(None, origin), rays, margin, room,
+                fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, columns, K, ray_x, ray_y,
+                fixed(frame.T_wc), self.voxel_size, origin, columns_of(None, origin), rays, margin, room,
                 space.room("keys", threads, ROWS, W), space.room("table", threads, 1 << TABLE_BITS),
                 space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32),
-                space.room("scale", threads, W, dtype=np.float64), key, count, sums, entries, lost, spread,
+                space.room("stretches", threads, 3, COLUMNS + 2 * LANES),
+                space.room("scale", threads, COLUMNS + LANES, dtype=np.float64), key, count, sums, entries, lost,
+                spread,
             )  # fmt: skip
             if lost.any():
                 return None
@@ -76,20 +83,21 @@ class Scores:
         self, key: Int64, count: Any, sums: npt.NDArray[np.float64], room: int, entries: Int64, spread: Int64
     ) -> ObservedScores:
         """Add up the entries of each voxel, band after band."""
-        space, total = self._space, int(entries.sum())
+        space, total, K = self._space, int(entries.sum()), self.num_classes
+        stride = -(-K // LANES) * LANES
         offset = np.zeros((PARTITIONS, len(entries)), dtype=np.int64)
         offset.reshape(-1)[1:] = np.cumsum(spread.T.reshape(-1))[:-1]
         edges = np.append(offset[:, 0], total)
-        order, voxel = space.room("order", total), space.room("voxel", total)
-        scatter(key, room, entries, offset, order)
-        merged = [space.room(f"merged {name}", total) for name in ("key", "pixels", "size")]
+        merged = [space.room(f"merged {name}", total) for name in ("key", "pixels", "row")]
+        scatter_rows(key, count, room, stride, entries, offset, *merged)
         found = np.zeros(PARTITIONS, dtype=np.int64)
-        group(key, count, order, edges, voxel, *merged, found)
+        merge_rows(edges, *merged, space.room("again", total), space.room("first", total), sums, K, found)
         bounds = np.concatenate([[0], np.cumsum(found)])
+        ends = edges[:-1] + found
         keys, pixels, row = (space.room(name, int(bounds[-1])) for name in ("keys out", "pixels", "row"))
-        stride = -(-self.num_classes // LANES) * LANES
-        merge_sums(order, edges, voxel, bounds, *merged[:2], sums, self.num_classes, stride, keys, pixels, row)
-        return ObservedScores(keys, pixels, row, sums, bounds, self.num_classes)
+        for whole, gaps in zip((keys, pixels, row), merged, strict=True):
+            np.concatenate([gaps[low:high] for low, high in zip(edges, ends, strict=False)], out=whole)
+        return ObservedScores(keys, pixels, row, sums, bounds, K)
 
 
 def keep_columns_of(key: Int64, columns: Int64) -> npt.NDArray[np.bool_]:

@@ -1,7 +1,8 @@
-"""Sums over the scores of a pixel, eight classes at a time, for compiled loops.
+"""Sums over the scores of pixels, eight classes at a time, for compiled loops.
 
 Scores are flat arrays of float32 or float64, or of half-precision numbers by their bits (uint16), since compiled code
-knows no such type. They are added up in float64, in an order that depends on the number of classes only.
+knows no such type. They are added up in float64, in an order that depends on the number of classes only. A pixel's last
+classes are read together with what follows them: behind the last pixel there must be `LANES` numbers of whatever value.
 """
 
 from __future__ import annotations
@@ -15,95 +16,143 @@ from numba.extending import intrinsic
 
 LANES = 8
 NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.uint16: ir.HalfType()}
-NAMES = {types.float32: "f32", types.float64: "f64", types.uint16: "f16"}
 
 INT, INT32, DOUBLE = ir.IntType(64), ir.IntType(32), ir.DoubleType()
-DOUBLES = ir.VectorType(DOUBLE, LANES)
+DOUBLES, INTS = ir.VectorType(DOUBLE, LANES), ir.VectorType(INT, LANES)
+ZEROS = ir.Constant(DOUBLES, [0.0] * LANES)
 
 
 @intrinsic
-def total_of(_typing: Any, scores: Any, _at: Any, _K: Any) -> Any:
-    """total_of(scores, at, K): the sum of scores[at : at + K]."""
+def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: Any, _u: Any) -> Any:
+    """scale_eight(scores, at, K, keys, scale, u): 1 / the sum of each of eight pixels' scores, from scores[at] on.
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        total = cgutils.alloca_once_value(builder, ir.Constant(DOUBLES, [0.0] * LANES))
-
-        def add(values: Any, _: Any) -> None:
-            builder.store(builder.fadd(builder.load(total), values), total)
-
-        _each_eight(context, builder, signature.args[0], arguments, add)
-        kind = ir.FunctionType(DOUBLE, [DOUBLE, DOUBLES])
-        reduce = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.fadd.v{LANES}f64")
-        return builder.call(reduce, [ir.Constant(DOUBLE, 0.0), builder.load(total)], fastmath=["reassoc"])
-
-    return types.float64(scores, types.intp, types.intp), generate
-
-
-@intrinsic
-def add_scaled(_typing: Any, scores: Any, _at: Any, _K: Any, _scale: Any, sums: Any, _to: Any) -> Any:
-    """add_scaled(scores, at, K, scale, sums, to): sums[to : to + K] += scale * scores[at : at + K].
-
-    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
+    Leaves it in scale[u : u + 8]; keys[u : u + 8], int64, become -1 where it is not a positive number.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        factor = _spread(builder, arguments[3], DOUBLES)
-        row = builder.gep(context.make_array(sums)(context, builder, arguments[4]).data, [arguments[5]])
-
-        def add(values: Any, k: Any) -> None:
-            place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
-            scaled = builder.fmul(values, factor, flags=["contract"])
-            builder.store(builder.fadd(builder.load(place, align=8), scaled, flags=["contract"]), place, align=8)
-
-        _each_eight(context, builder, signature.args[0], arguments, add)
+        array, at, K, _, _, u = arguments
+        pixels = [builder.add(at, builder.mul(K, INT(pixel))) for pixel in range(LANES)]
+        total = _folded(builder, _sums(context, builder, signature.args[0], array, pixels, K))
+        key, scales = (
+            builder.bitcast(builder.gep(_data(context, builder, signature, arguments, i), [u]), kind.as_pointer())
+            for i, kind in ((3, INTS), (4, DOUBLES))
+        )
+        sound = builder.and_(
+            builder.fcmp_ordered(">", total, ZEROS),
+            builder.fcmp_ordered("<", total, ir.Constant(DOUBLES, [float("inf")] * LANES)),
+        )
+        kept = builder.select(sound, builder.load(key, align=8), ir.Constant(INTS, [-1] * LANES))
+        builder.store(kept, key, align=8)
+        builder.store(builder.fdiv(ir.Constant(DOUBLES, [1.0] * LANES), total), scales, align=8)
         return context.get_dummy_value()
 
-    return types.void(scores, types.intp, types.intp, types.float64, sums, types.intp), generate
+    number = types.intp
+    return types.void(scores, number, number, keys, scale, number), generate
 
 
-def _each_eight(context: Any, builder: Any, kind: Any, arguments: Any, do: Callable[[Any, Any], None]) -> None:
-    """Code that does something with each eight of `K` numbers of an array from `at`, and with the rest filled up by 0.
+def _adding(pixels: int) -> Any:
+    """The function `add_scaled` for that many pixels."""
 
-    arguments  array, at, K
-    do         is given a vector of doubles and the place of its first one among the K
+    def add_scaled(
+        _typing: Any, scores: Any, _at: Any, _K: Any, scale: Any, _u: Any, sums: Any, _to: Any, _fresh: Any
+    ) -> Any:
+        """add_scaled(scores, at, K, scale, u, sums, to, fresh): add pixels' scores, from scores[at] on, to their voxel.
+
+        sums[to : to + K] += scale[u] * scores[at : at + K] and so on, or = where `fresh`.
+
+        `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
+        """
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array, at, K, _, u, _, to, fresh = arguments
+            places = [builder.add(at, builder.mul(K, INT(pixel))) for pixel in range(pixels)]
+            scales = builder.gep(_data(context, builder, signature, arguments, 3), [u])
+            factors = [spread(builder, builder.load(builder.gep(scales, [INT(i)])), DOUBLES) for i in range(pixels)]
+            row = builder.gep(_data(context, builder, signature, arguments, 5), [to])
+
+            def add(values: list[Any], k: Any) -> None:
+                place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
+                total = builder.select(fresh, ZEROS, builder.load(place, align=8))
+                for value, factor in zip(values, factors, strict=True):
+                    scaled = builder.fmul(value, factor, flags=["contract"])
+                    total = builder.fadd(total, scaled, flags=["contract"])
+                builder.store(total, place, align=8)
+
+            _by_eights(context, builder, signature.args[0], array, places, K, add)
+            return context.get_dummy_value()
+
+        number = types.intp
+        return types.void(scores, number, number, scale, number, sums, number, types.boolean), generate
+
+    return intrinsic(add_scaled)
+
+
+add_one, add_two, add_four = _adding(1), _adding(2), _adding(4)
+
+
+def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
+    return context.make_array(signature.args[i])(context, builder, arguments[i]).data
+
+
+def _sums(context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any) -> list[Any]:
+    """For each place the vector of sums of every eighth of the K numbers from there on."""
+    totals = [cgutils.alloca_once_value(builder, ZEROS) for _ in places]
+    for total in totals:
+        builder.store(ZEROS, total)
+
+    def add(values: list[Any], _: Any) -> None:
+        for total, value in zip(totals, values, strict=True):
+            builder.store(builder.fadd(builder.load(total), value), total)
+
+    _by_eights(context, builder, kind, array, places, K, add)
+    return [builder.load(total) for total in totals]
+
+
+def _folded(builder: Any, vectors: list[Any]) -> Any:
+    """The sums of the lanes of eight vectors, as one vector: the lanes of each are halved three times, in pairs."""
+    lanes = LANES
+    while len(vectors) > 1:
+        half = lanes // 2
+        first = [i for i in range(2 * LANES) if i % lanes < half]
+        low, high = (ir.Constant(ir.VectorType(INT32, LANES), [i + by for i in first]) for by in (0, half))
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [
+            builder.fadd(builder.shuffle_vector(a, b, low), builder.shuffle_vector(a, b, high)) for a, b in pairs
+        ]
+        lanes = half
+    return vectors[0]
+
+
+def _by_eights(
+    context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any,
+    do: Callable[[list[Any], Any], None],
+) -> None:  # fmt: skip
+    """Code that does something with each eight of the K numbers from each place, the rest filled up by 0.
+
+    do  is given a vector of doubles for each place, and the place of its first one among the K
     """
-    array = context.make_array(kind)(context, builder, arguments[0])
-    at, K = arguments[1:3]
     number, vector = NUMBERS[kind.dtype], ir.VectorType(NUMBERS[kind.dtype], LANES)
-    start = builder.gep(builder.bitcast(array.data, number.as_pointer()), [at])
+    data = builder.bitcast(context.make_array(kind)(context, builder, array).data, number.as_pointer())
+    starts = [builder.gep(data, [place]) for place in places]
     size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     whole = builder.and_(K, INT(-LANES))
     rest = builder.sub(K, whole)
 
-    def place(k: Any) -> Any:
-        return builder.bitcast(builder.gep(start, [k]), vector.as_pointer())
+    def eight(start: Any, k: Any) -> Any:
+        return builder.load(builder.bitcast(builder.gep(start, [k]), vector.as_pointer()), align=size)
 
     def widened(values: Any) -> Any:
         return values if vector == DOUBLES else builder.fpext(values, DOUBLES)
 
     with cgutils.for_range_slice(builder, INT(0), whole, INT(LANES), intp=INT) as (k, _):
-        do(widened(builder.load(place(k), align=size)), k)
+        do([widened(eight(start, k)) for start in starts], k)
     with builder.if_then(builder.icmp_signed(">", rest, INT(0))):
-        values = cgutils.alloca_once(builder, vector)
-        lanes = ir.Constant(ir.VectorType(INT, LANES), list(range(LANES)))
-        kept = builder.icmp_signed("<", lanes, _spread(builder, rest, ir.VectorType(INT, LANES)))
-        nothing = ir.Constant(vector, [0.0] * LANES)
-        (length,) = cgutils.unpack_tuple(builder, array.shape, 1)
-        beyond = builder.add(builder.add(at, whole), INT(LANES))
-        # not every machine has masked loads; all but the last pixels may read into the next one instead
-        with builder.if_else(builder.icmp_signed("<=", beyond, length)) as (inside, at_the_end):
-            with inside:
-                builder.store(builder.select(kept, builder.load(place(whole), align=size), nothing), values)
-            with at_the_end:
-                mask = ir.VectorType(ir.IntType(1), LANES)
-                load = ir.FunctionType(vector, [vector.as_pointer(), mask, vector])
-                name = f"llvm.masked.load.v{LANES}{NAMES[kind.dtype]}.p0"
-                masked = cgutils.get_or_insert_function(builder.module, load, name)
-                builder.store(builder.call(masked, [place(whole), kept, nothing]), values)
-        do(widened(builder.load(values)), whole)
+        lanes = ir.Constant(INTS, list(range(LANES)))
+        kept, nothing = builder.icmp_signed("<", lanes, spread(builder, rest, INTS)), ir.Constant(vector, [0.0] * LANES)
+        do([widened(builder.select(kept, eight(start, whole), nothing)) for start in starts], whole)
 
 
-def _spread(builder: Any, value: Any, vector: Any) -> Any:
+def spread(builder: Any, value: Any, vector: Any) -> Any:
     """A vector of equal values."""
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, INT32(0))
     return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(INT32, vector.count), [0] * vector.count))

@@ -6,8 +6,7 @@ less. So it is compared with what a random order of the very same observations g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,11 @@ from semstab.errors import ConfigError
 from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-ROUNDING = 1e-9
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
 NULL_DRAWS = 16
@@ -30,15 +29,8 @@ NULL_DRAWS = 16
 MOST_DRAWS, ENOUGH_HITS = 1999, 20
 """Random orders of a voxel that is tested: at most, and how many in a tail settle its p-value."""
 
-CLEAR, LIKELY = 1e-4, 0.02
-"""P-values of the trend from its mean and variance over orders stand from LIKELY on; those from CLEAR on are computed
-from random orders; a lower one becomes the lowest that these could give."""
-
 DRIFT_SAMPLE = 5_000
 """At most so many voxels are tested for an unusual SBD."""
-
-ROUNDED = 12
-"""Bits of p-values that are kept: so few different ones are told apart that they can be counted."""
 
 TESTABLE = 6
 """Lowest OP of the voxels that are tested one by one: of fewer one-hot labels no order is rare enough."""
@@ -67,53 +59,6 @@ class VoxelDrift:
 
 
 @dataclass(frozen=True, eq=False)
-class PValues:
-    """P-values of many voxels, which add up over the parts of a map: rounded up to ROUNDED bits, and how often each.
-
-    value  (v,) ascending; count (v,)
-    """
-
-    value: Float64
-    count: Int64
-
-    @classmethod
-    def of(cls, p: Float64) -> PValues:
-        """Those that are no NaN, which is not a test."""
-        value, count = np.unique(_rounded_up(p[~np.isnan(p)]), return_counts=True)
-        return cls(value, count.astype(np.int64))
-
-    @classmethod
-    def merged(cls, parts: Sequence[PValues]) -> PValues:
-        """Those of a map from its parts."""
-        value, of = np.unique(np.concatenate([part.value for part in parts]), return_inverse=True)
-        count = np.bincount(of, weights=np.concatenate([part.count for part in parts]), minlength=len(value))
-        return cls(value, count.astype(np.int64))
-
-    def adjusted(self, p: Float64) -> Float64:
-        """What `benjamini_hochberg` makes of some of them (n,); NaN stays."""
-        q = self._adjusted()
-        found = np.full(len(p), np.nan)
-        tested = ~np.isnan(p)
-        found[tested] = q[np.searchsorted(self.value, _rounded_up(p[tested]))]
-        return found
-
-    def found(self, rate: float) -> int:
-        """How many are below that rate when they are adjusted."""
-        return int(self.count[self._adjusted() <= rate].sum())
-
-    def _adjusted(self) -> Float64:
-        raised = self.value * self.count.sum() / np.cumsum(self.count)
-        lowest: Float64 = np.minimum.accumulate(raised[::-1])[::-1]
-        return np.minimum(lowest, 1.0)
-
-
-def _rounded_up(p: Float64) -> Float64:
-    part, exponent = np.frexp(p)
-    rounded: Float64 = np.ldexp(np.ceil(np.ldexp(part, ROUNDED)), exponent - ROUNDED)
-    return rounded
-
-
-@dataclass(frozen=True, eq=False)
 class Flips:
     """Changes of the predicted class between successive observations of a voxel (n,); NaN where undefined.
 
@@ -132,17 +77,17 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
     NaN where OP < 2, where a frame's pixels in the voxel disagree, or where OP exceeds 256.
     """
-    from semstab.statistics.loops import kernels
+    from semstab.statistics.loops import chunks, one_hot
 
     T = table.op.astype(np.int64)
-    known = (T >= 2) & (T <= kernels.LONGEST_TABLE) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
+    known = (T >= 2) & (T <= one_hot.LONGEST_TABLE) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
     entries = table.evidence.take(known)
     count, voxel = np.rint(entries.weight).astype(np.int64), np.repeat(np.arange(len(entries)), np.diff(entries.starts))
-    base = kernels.LONGEST_TABLE + 1
+    base = one_hot.LONGEST_TABLE + 1
     pairs, of = np.unique(count * base + T[known][voxel], return_inverse=True)
     part = np.zeros(len(pairs))
-    drifts, _ = drift_tables(T[known])
-    kernels.in_chunks(kernels.expected_one_hot, *np.divmod(pairs, base), _log_factorials(base), drifts, part)
+    drifts = one_hot.one_hot_drifts(int(T[known].max(initial=2)))
+    chunks.in_chunks(one_hot.expected_one_hot, *np.divmod(pairs, base), _log_factorials(base), drifts, part)
     expected = np.bincount(voxel, weights=part[of], minlength=len(entries)) / (T[known] - 1)
     return _spread_out(expected, known)
 
@@ -161,30 +106,21 @@ def voxel_drift(
 
     Null and p-values are exact for OP <= 5, where all orders are gone through. Above, the null is exact for one-hot
     evidence (`expected_sbd`), else the mean of `draws` random orders; p-values come from up to `most` random orders,
-    fewer where `enough` of them are as extreme: those of SBD for `sample` voxels drawn at random, those of the trend
-    where its mean and variance over all orders, which are exact, say that it might be below 0.02. So they are valid, up
-    to there, under the hypothesis that a voxel's observations are exchangeable.
+    fewer where `enough` of them are as extreme: those of the trend for every voxel, those of SBD for `sample` voxels
+    drawn at random. So they are valid under the hypothesis that a voxel's observations are exchangeable.
     """
     if not (draws >= 1 and most >= 1 and enough >= 1):
         raise ConfigError(f"draws = {draws}, most = {most}, enough = {enough}: use 1 or more")
-    vary, _, T = varying(table, events)
-    orders = _Orders.of(table, events, vary, seed)
-    null, p, variance = orders.measure(draws)
-    spread = T * (T * T - 1.0) / 12 * variation(table)[vary]
+    orders, exact = _Orders.of(table, events, seed), expected_sbd(table)
+    vary, T = orders.vary, orders.T
+    seen, null, p = orders.measure(~np.isnan(exact[vary]), draws, most, enough)
     with np.errstate(invalid="ignore", divide="ignore"):
-        trend = np.where(T > 2, orders.seen[:, 1] / spread, np.nan)
-        trend_p = np.where(T > 2, p[:, 2], np.nan)
+        trend = np.where(T > 2, seen / (T * (T * T - 1.0) / 12 * orders.variation[vary]), np.nan)
     p_value = np.minimum(1.0, 2 * p[:, :2].min(axis=1))
-    many = np.flatnonzero(orders.enumerated < T)
-    p_value[many] = np.nan
-    drawn = many[np.argsort(orders.seeds[many])[:sample]]
-    p_value[drawn] = orders.test(drawn, by_drift=True, most=most, enough=enough)
-    trend_p[many] = np.maximum(_beta_tail(trend[many], variance[many] / spread[many] ** 2, T[many]), 1 / (most + 1))
-    unsure = many[(trend_p[many] < LIKELY) & (trend_p[many] >= CLEAR)]
-    trend_p[unsure] = orders.test(unsure, by_drift=False, most=most, enough=enough)
+    some = orders.sampled(sample)
+    p_value[some] = orders.test(some, most, enough)
     expected = np.where(table.op >= 2, 0.0, np.nan)
     expected[vary] = null / (T - 1)
-    exact = expected_sbd(table)
     expected = np.where(np.isnan(exact), expected, exact)
     return VoxelDrift(
         null=expected,
@@ -192,55 +128,97 @@ def voxel_drift(
         p_value=_spread_out(p_value, vary),
         trend=_spread_out(trend, vary),
         trend_null=_spread_out(np.where(T > 2, 1 / np.maximum(T - 1, 1), np.nan), vary),
-        trend_p=_spread_out(trend_p, vary),
+        trend_p=_spread_out(np.where(T > 2, p[:, 2], np.nan), vary),
     )
+
+
+def drift_p(table: VoxelTable, events: Events, *, seed: int = 0) -> Float64:
+    """Of `voxel_drift` p_value (n,) alone."""
+    orders = _Orders.of(table, events, seed)
+    p, few = np.full(len(orders.T), np.nan), np.flatnonzero(~orders.many)
+    _, _, exact = orders.part(few).measure(np.ones(len(few), np.bool_), 1, 1, 1)
+    p[few], some = np.minimum(1.0, 2 * exact[:, :2].min(axis=1)), orders.sampled(DRIFT_SAMPLE)
+    p[some] = orders.test(some, MOST_DRAWS, ENOUGH_HITS)
+    return _spread_out(p, orders.vary)
 
 
 @dataclass(frozen=True, eq=False)
 class _Orders:
-    """The observations of some voxels in other orders; arguments of the compiled loops.
+    """The observations of the voxels whose observations differ, in other orders.
 
+    vary, variation  (N,) which of all voxels they are, and how far the observations of each are from their mean
     first, T  (n,) their first rows of the log and OP
     log       starts, label and weight of all observations
-    seeds     (n,) of each voxel's random stream, which depends on its place only
-    seen      (n, 2) its sum of drifts and its trend
+    streams   (n,) of each voxel's random stream, which depends on its place only
+    seed      of the orders that voxels of the same OP go through
     """
 
+    vary: npt.NDArray[np.bool_]
+    variation: Float64
     first: Int64
     T: Int64
     log: tuple[Int64, npt.NDArray[np.uint16], Float64]
     K: int
-    seeds: npt.NDArray[np.uint64]
-    seen: Float64
-    enumerated: int
+    streams: npt.NDArray[np.uint64]
+    seed: np.uint64
 
     @classmethod
-    def of(cls, table: VoxelTable, events: Events, where: npt.NDArray[np.bool_], seed: int) -> _Orders:
-        from semstab.statistics.loops import kernels
+    def of(cls, table: VoxelTable, events: Events, seed: int) -> _Orders:
+        spread = variation(table)
+        vary = _vary(table, spread)
+        T = table.op[vary].astype(np.int64)
+        own = streams(table.index[vary], seed)
+        base = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
+        return cls(vary, spread, events.starts[vary], T, events.evidence.entries, table.K, own, base)
 
-        first, T = events.starts[where], table.op[where].astype(np.int64)
-        seeds = streams(table.rows(where).index, seed)
-        return cls(first, T, events.evidence.entries, table.K, seeds, np.zeros((len(T), 2)), kernels.ENUMERATED)
+    @property
+    def many(self) -> npt.NDArray[np.bool_]:
+        """(n,) whether there are too many orders to go through all of them."""
+        from semstab.statistics.loops import orders
 
-    def measure(self, draws: int) -> tuple[Float64, Float64, Float64]:
-        """Fill `seen`; the null of the drifts (n,), p-values (n, 3) of few observations, the trend's variance."""
-        from semstab.statistics.loops import kernels
+        above: npt.NDArray[np.bool_] = self.T > orders.ENUMERATED
+        return above
 
-        null, p, variance = np.zeros(len(self.T)), np.zeros((len(self.T), 3)), np.zeros(len(self.T))
-        kernels.in_chunks(kernels.measure_voxels, *self._shared(), draws, self.seen, null, p, variance)
-        return null, p, variance
+    def part(self, which: Int64) -> _Orders:
+        """The voxels of these numbers."""
+        return replace(self, first=self.first[which], T=self.T[which], streams=self.streams[which])
 
-    def test(self, which: Int64, *, by_drift: bool, most: int, enough: int) -> Float64:
-        """P-values (r,) of the voxels of these numbers."""
-        from semstab.statistics.loops import kernels
+    def sampled(self, count: int) -> Int64:
+        """Numbers of so many voxels with many orders, by chance."""
+        many = np.flatnonzero(self.many)
+        return many[np.argsort(self.streams[many])[:count]]
 
-        p = np.zeros(len(which))
-        kernels.in_chunks(kernels.permute_voxels, which, *self._shared(), by_drift, most, enough, self.seen, p)
+    def measure(
+        self, known: npt.NDArray[np.bool_], draws: int, most: int, enough: int
+    ) -> tuple[Float64, Float64, Float64]:
+        """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
+        from semstab.statistics.loops import chunks, orders
+
+        n = len(self.T)
+        trend, null, p = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
+        chunks.in_chunks(orders.measure_voxels, *self._shared(), known, draws, most, enough, trend, null, p)
+        return trend, null, p
+
+    def test(self, which: Int64, most: int, enough: int) -> Float64:
+        """P-values (r,) of the drifts of the voxels of these numbers."""
+        from semstab.statistics.loops import chunks, orders
+
+        p, part = np.zeros(len(which)), self.part(which)
+        chunks.in_chunks(orders.test_drifts, *part._shared(), most, enough, p)
         return p
 
     def _shared(self) -> tuple[Any, ...]:
         entries = self.log[0][self.first + self.T] - self.log[0][self.first]
-        return self.first, self.T, self.log, self.K, int(entries.max(initial=0)), *drift_tables(self.T), self.seeds
+        return (
+            ranked(self.T),
+            self.first,
+            self.T,
+            self.log,
+            self.K,
+            int(entries.max(initial=0)),
+            self.streams,
+            self.seed,
+        )
 
 
 def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -> Int64:
@@ -249,25 +227,14 @@ def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -
     They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
     what is drawn of a map is drawn of any part of it that holds it.
     """
-    from semstab.statistics.loops import kernels
+    from semstab.statistics.loops import orders
 
     vary, _, T = varying(table, events)
-    order = np.argsort(streams(table.rows(vary).index, seed))
+    order = np.argsort(streams(table.index[vary], seed))
     enough = order[: np.searchsorted(np.cumsum(T[order]), observations) + 1]
-    tested = order[T[order] > kernels.ENUMERATED][:DRIFT_SAMPLE]
+    tested = order[T[order] > orders.ENUMERATED][:DRIFT_SAMPLE]
     rows: Int64 = np.flatnonzero(vary)[np.union1d(enough, tested)]
     return rows
-
-
-def _beta_tail(trend: Float64, variance: Float64, T: Int64) -> Float64:
-    """P-value (n,) of a trend R^2 whose mean is 1 / (T - 1), as if it had a beta distribution of that variance."""
-    from scipy.special import betaincc
-
-    mean = 1 / (T - 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        size = mean * (1 - mean) / variance - 1
-    p: Float64 = betaincc(mean * size, (1 - mean) * size, np.clip(trend - ROUNDING, 0.0, 1.0))
-    return np.where(size > 0, p, 1.0)
 
 
 def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
@@ -279,11 +246,11 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
 
 def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
-    from semstab.statistics.loops import kernels, log_kernels
+    from semstab.statistics.loops import chunks, log_kernels
 
     n, bounds = len(events.ix), np.append(events.starts, len(events))
     changes, differing, since = np.zeros(n), np.zeros(n), np.full(n, np.nan)
-    kernels.in_chunks(
+    chunks.in_chunks(
         log_kernels.count_flips,
         bounds,
         events.frame,
@@ -301,21 +268,6 @@ def flips(events: Events) -> Flips:
     return Flips(rate, null, since)
 
 
-def benjamini_hochberg(p: Float64) -> Float64:
-    """Adjusted p-values of the same shape: rejecting those <= q keeps the false discovery rate at q (1995, JRSS B 57).
-
-    NaN is not a test. It holds for independent tests and for those that depend positively (Benjamini and Yekutieli
-    2001), as neighbouring voxels do.
-    """
-    from scipy.stats import false_discovery_control
-
-    adjusted = np.full(len(p), np.nan)
-    tested = np.flatnonzero(~np.isnan(p))
-    if len(tested):
-        adjusted[tested] = false_discovery_control(p[tested])
-    return adjusted
-
-
 def variation(table: VoxelTable) -> Float64:
     """(n,) how far a voxel's observations are from their mean: sum over frames of ||s_t - mean||^2."""
     squares: Float64 = table.self_sum - table.evidence.rowwise(lambda e: (e**2).sum(axis=1)) / table.op
@@ -324,24 +276,21 @@ def variation(table: VoxelTable) -> Float64:
 
 def varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
     """The voxels (n,) whose observations differ, with their first rows and OP; the others cannot drift."""
-    vary = variation(table) > ONE_HOT * table.op
+    vary = _vary(table, variation(table))
     return vary, events.starts[vary], table.op[vary].astype(np.int64)
 
 
-def drift_tables(T: Int64) -> tuple[Float64, Float64]:
-    """What the kernels look up for voxels of up to that OP."""
-    from semstab.statistics.loops import kernels
-
-    longest = int(T.max(initial=2))
-    return kernels.one_hot_drifts(min(longest, kernels.LONGEST_TABLE)), kernels.step_terms(longest)
+def _vary(table: VoxelTable, spread: Float64) -> npt.NDArray[np.bool_]:
+    vary: npt.NDArray[np.bool_] = spread > ONE_HOT * table.op
+    return vary
 
 
 def streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
     """A random number (n,) of each voxel that depends on its index (n, 3) and the seed only."""
-    from semstab.statistics.loops import kernels
+    from semstab.statistics.loops import orders
 
     drawn = np.empty(len(index), np.uint64)
-    kernels.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
+    orders.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
     return drawn
 
 

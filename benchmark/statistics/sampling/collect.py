@@ -204,7 +204,7 @@ def _sums_of_log(
     likely: Float64,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
-    from semstab.statistics.loops.kernels import in_chunks
+    from semstab.statistics.loops.chunks import in_chunks
     from semstab.statistics.sampling import loops
 
     K = int(events.evidence.shape[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.runtime.compiled import serial
-from semstab.statistics.loops.kernels import CHUNKS
+from semstab.statistics.loops.chunks import CHUNKS
 
 (VOXELS, PSA, OBSERVATIONS, AGREEING, OWN, TWICE, TWICE_AGREEING, RECURRENT, VSS, ENTROPY) = range(10)
 """The columns that every map has, before those by class."""

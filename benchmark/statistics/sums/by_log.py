@@ -14,7 +14,8 @@ from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
 from semstab.statistics.map_sums import Maps, mean_columns
 from semstab.statistics.order import fusion_rules
-from semstab.statistics.order.drift import TESTABLE, Flips, PValues, VoxelDrift, trend_columns, voxel_drift
+from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns
+from semstab.statistics.order.p_values import PValues
 from semstab.statistics.sampling import Places, PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
 
@@ -94,9 +95,9 @@ class LogSums:
             for rule, own in zip(fusion_rules.RULES, self.rules, strict=True)
         )
 
-    def tested(self, seed: int) -> tuple[OrderTest, VoxelDrift]:
-        """What the orders of the sampled voxels say of all, and of each of them."""
-        return order_test(self.table, self.events, seed=seed), voxel_drift(self.table, self.events, seed=seed)
+    def tested(self, seed: int) -> tuple[OrderTest, Float64]:
+        """What the orders of the sampled voxels say of all, and the p-value of the SBD of each of them (n,)."""
+        return order_test(self.table, self.events, seed=seed), drift_p(self.table, self.events, seed=seed)
 
 
 def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
@@ -112,8 +113,9 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
 
 def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
     again, usual, rows = table.op >= 2, fusion_rules.labels(table.evidence), []
-    for rule in fusion_rules.RULES:
-        fused = table if rule == fusion_rules.RULES[0] else fusion_rules.fuse(events, rule)  # the map's own rule
+    _, *others = fusion_rules.RULES  # the map's own rule is the first
+    fused_by: list[VoxelTable | fusion_rules.Fused] = [table]
+    for fused in [*fused_by, *fusion_rules.fuse_all(events, others, evidence=table.evidence)]:
         relabelled = (fusion_rules.labels(fused.evidence) != usual)[again]
         rows.append(np.concatenate([[relabelled.sum(), len(relabelled)], rule_sums(fused, again, truth)]))
     return np.stack(rows)

@@ -16,7 +16,9 @@ from semstab.statistics.correctness import Truth, quadrant_sums, stable_wrong
 from semstab.statistics.judging.ceiling import loss_sums
 from semstab.statistics.judging.flipping import FlippingSums
 from semstab.statistics.map_sums import Maps
-from semstab.statistics.order.drift import TESTABLE, benjamini_hochberg
+from semstab.statistics.order.drift import TESTABLE
+from semstab.statistics.order.p_values import benjamini_hochberg
+from semstab.statistics.ranks import distinct_rows
 from semstab.statistics.sampling import InfluenceSums, PlaceSums
 from semstab.statistics.steady import Votes, steady
 from semstab.statistics.sums.by_log import FALSE_DISCOVERIES
@@ -54,8 +56,8 @@ class Whole:
         self.shares = first.votes.shares()
         self.loss_edge = None if first.limited is None else first.limited.edge()
         if first.log is not None:
-            self.order, self._drift = first.log.tested(seed)
-            self._drift_q = benjamini_hochberg(np.where(first.log.table.op >= TESTABLE, self._drift.p_value, np.nan))
+            self.order, self._drift_p = first.log.tested(seed)
+            self._drift_q = benjamini_hochberg(np.where(first.log.table.op >= TESTABLE, self._drift_p, np.nan))
 
     @property
     def influence(self) -> InfluenceSums:
@@ -64,8 +66,8 @@ class Whole:
         return found if truth is None else truth.stable.added_to(found, self._likely)
 
     def _likely(self, seen: Int64, most: Int64) -> Float64:
-        (seen, most), of = np.unique(np.stack([seen, most]), axis=1, return_inverse=True)  # many places have the same
-        return Votes(seen, most, np.ones_like(seen)).stable(self.shares)[of.ravel()]
+        pairs, of = distinct_rows(np.stack([seen, most], axis=1))  # many places have the same
+        return Votes(pairs[:, 0], pairs[:, 1], np.ones(len(pairs), np.int64)).stable(self.shares)[of]
 
     def drift_tests(self) -> DriftTests:
         """Of a map with its log."""
@@ -94,7 +96,7 @@ class Whole:
             return {}
         rows, drawn = shared_rows(table, log.table)
         p, q = maps["drift_p"].copy(), np.full(len(table), np.nan)
-        p[rows], q[rows] = self._drift.p_value[drawn], self._drift_q[drawn]
+        p[rows], q[rows] = self._drift_p[drawn], self._drift_q[drawn]
         tested = np.where(table.op >= TESTABLE, maps["trend_p"], np.nan)
         return {"drift_p": p, "drift_q": q, "trend_q": log.p.adjusted(tested)}
 

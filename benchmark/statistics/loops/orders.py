@@ -1,0 +1,307 @@
+"""Compiled loops over the observations of voxels, in the orders in which they could have come.
+
+Many orders go side by side, one in each lane, so that logarithms are vector instructions. Voxels of the same OP go
+through the same random orders, each beginning with its observations in an order of its own, which depends on its place
+and the seed only: the same seed gives the same numbers for any number of threads, and for any parts of a map.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.backends.shared.hashing import mix
+from semstab.runtime.compiled import compiled, serial
+from semstab.statistics.loops.chunks import CHUNKS
+from semstab.statistics.loops.logarithm import plogp_fast
+
+ENUMERATED = 5
+"""Up to this OP all T! orders are gone through; 5! = 120."""
+
+LANES = 128
+"""Orders that go side by side, at most."""
+
+ROUNDING = 1e-9
+"""Sums of the same terms in another order differ by less."""
+
+
+# --- Orders, side by side ---------------------------------------------------------------------------------------------
+
+
+@compiled(fastmath={"reassoc", "contract"})
+def drifts(x, A, T, order, lanes, work, drift):
+    """The sum of drifts, bits, in each of `lanes` orders, to drift (LANES,).
+
+    x (A, T) are the observations, order (T, LANES) the number of the observation that comes at each step; work space is
+    (A + 1, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
+    each belief but the first and last is one after, then one before.
+    """
+    work[: A + 1, :lanes] = 0.0
+    drift[:lanes] = 0.0
+    share = work[A]
+    for t in range(T):
+        whole = 0.5 if t == 0 or t == T - 1 else 1.0
+        mixed = 1.0 if t > 0 else 0.0
+        before, after = 1.0 / max(t, 1), 1.0 / (t + 1)
+        for a in range(A):
+            for lane in range(lanes):
+                share[lane] = x[a, order[t, lane]]
+            for lane in range(lanes):
+                n = work[a, lane]
+                more = n + share[lane]
+                work[a, lane] = more
+                p, q = n * before, more * after
+                drift[lane] += whole * plogp_fast(q) - mixed * plogp_fast(0.5 * (p + q))
+
+
+@compiled(fastmath={"reassoc", "contract"})
+def trends(x, A, T, age, lanes, work, trend):
+    """|| sum_t (t - mean t) s_t ||^2 in each of `lanes` orders, to trend (LANES,).
+
+    age (T, LANES) is t - mean t of each observation; work space is (1, LANES).
+    """
+    trend[:lanes] = 0.0
+    moment = work[0]
+    for a in range(A):
+        moment[:lanes] = 0.0
+        for j in range(T):
+            share = x[a, j]
+            if share != 0.0:
+                for lane in range(lanes):
+                    moment[lane] += share * age[j, lane]
+        for lane in range(lanes):
+            trend[lane] += moment[lane] * moment[lane]
+
+
+@serial
+def dense(log, first, T, number, at, x):
+    """A voxel's T observations as columns `at` (T,) of x (A, T); returns A, how many classes it ever saw.
+
+    log is (starts, label, weight) of all observations; number is work space (K,), all -1.
+    """
+    starts, label, weight = log
+    A = 0
+    for t in range(T):
+        for e in range(starts[first + t], starts[first + t + 1]):
+            k = label[e]
+            if number[k] < 0:
+                number[k] = A
+                x[A, :T] = 0.0
+                A += 1
+            x[number[k], at[t]] = weight[e]
+    for e in range(starts[first], starts[first + T]):
+        number[label[e]] = -1
+    return A
+
+
+@serial
+def room(T, entries, K):
+    """Work space for voxels of OP up to T (n,) and so many entries: x, work, number, order, age, value."""
+    longest, classes = 1, max(1, min(K, entries))
+    for i in range(T.shape[0]):
+        longest = max(longest, T[i])
+    x, work, number = np.empty((classes, longest)), np.empty((classes + 1, LANES)), np.full(K, -1)
+    return x, work, number, np.empty((longest, LANES), np.int64), np.empty((longest, LANES)), np.empty(LANES)
+
+
+# --- Random and all orders --------------------------------------------------------------------------------------------
+
+
+@serial
+def draw_streams(index, seed, streams):
+    """A random stream of each voxel (n,) from its index (n, 3) and the seed."""
+    for i in range(index.shape[0]):
+        state = seed
+        for axis in range(3):
+            state = mix(state ^ np.uint64(index[i, axis]))
+        streams[i] = state
+
+
+@serial
+def _below(state, n):
+    """A random integer in [0, n) from the stream (splitmix64) whose state (1,) it moves on."""
+    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(((mix(state[0]) >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32))
+
+
+@serial
+def _shuffle(order, T, state):
+    """A random order of T observations, to order (T,)."""
+    for t in range(T):
+        other = _below(state, t + 1)
+        order[t] = order[other]
+        order[other] = t
+
+
+@serial
+def _draw_orders(order, age, T, lanes, state):
+    """Random orders (T, lanes), and t - mean t of each observation in random orders: the inverse of one is one."""
+    for lane in range(lanes):
+        _shuffle(order[:, lane], T, state)
+    for t in range(T):
+        for lane in range(lanes):
+            age[t, lane] = order[t, lane] - 0.5 * (T - 1)
+
+
+@serial
+def _all_orders(order, age, T):
+    """All T! orders, which are those of their inverses as well; returns how many."""
+    count = 1
+    order[0, 0] = 0
+    for t in range(1, T):  # the next observation at each place of each order
+        for place in range(t, -1, -1):
+            for lane in range(count):
+                to = place * count + lane
+                for earlier in range(t, place, -1):
+                    order[earlier, to] = order[earlier - 1, lane]
+                for earlier in range(place - 1, -1, -1):
+                    order[earlier, to] = order[earlier, lane]
+                order[place, to] = t
+        count *= t + 1
+    for t in range(T):
+        for lane in range(count):
+            age[t, lane] = order[t, lane] - 0.5 * (T - 1)
+    return count
+
+
+# --- Orders of one voxel ----------------------------------------------------------------------------------------------
+
+
+@serial
+def _groups(chunk, rank, T):
+    """The voxels of a chunk, those of the same OP together; rank (n,) sorts all by OP."""
+    first, last = chunk * rank.shape[0] // CHUNKS, (chunk + 1) * rank.shape[0] // CHUNKS
+    groups = []
+    for i in range(first + 1, last + 1):
+        if i == last or T[rank[i]] != T[rank[i - 1]]:
+            groups.append(rank[first:i].copy())
+            first = i
+    return groups
+
+
+@serial
+def _own_order(at, T, seed, state):
+    """The order in which a voxel's observations go through the orders that all voxels of this OP go through."""
+    if T > ENUMERATED:
+        state[0] = seed
+        _shuffle(at, T, state)
+    else:
+        at[:T] = np.arange(T)
+
+
+@serial
+def _trend(x, A, T, at):
+    """|| sum_t (t - mean t) s_t ||^2 of the observations in columns `at`."""
+    trend = 0.0
+    for a in range(A):
+        moment = 0.0
+        for t in range(T):
+            moment += (t - 0.5 * (T - 1)) * x[a, at[t]]
+        trend += moment * moment
+    return trend
+
+
+@serial
+def _tail(hits, tried, extreme, lanes, enough):
+    """The p-value, NaN until there are `enough` hits, and the hits, after `lanes` more orders.
+
+    Enough of them settle it: as the share of the orders until then (Besag and Clifford 1991, Biometrika 78).
+    """
+    for lane in range(lanes):
+        hits += 1 if extreme[lane] else 0
+        if hits == enough:
+            return enough / (tried + lane + 1), hits
+    return np.nan, hits
+
+
+@serial
+def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, draws, most, enough, trend, null, p):
+    """What each voxel's order gives, and what orders of its observations give.
+
+    rank (n,) sorts the voxels by OP; first, T (n,) are their rows of the log, seeds (n,) their random streams, and
+    `entries` is the most that one has. Where T <= ENUMERATED all orders are gone through: null (n,) takes their mean
+    sum of drifts, p (n, 3) the share of those with a sum as low, one as high, a trend as high. Else null is the mean
+    of `draws` random orders, unless it is `known` (n,), and p[:, 2] comes from random orders until `enough` of them
+    have a trend as high, or from the `most` that there are. trend (n,) takes what was seen.
+    """
+    x, work, number, order, age, value = room(T, entries, K)
+    at, own, state = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(1, np.uint64)
+    for voxels in _groups(chunk, rank, T):
+        steps = T[voxels[0]]
+        if steps <= ENUMERATED:
+            lanes = _all_orders(order, age, steps)
+            for i in voxels:
+                _own_order(at, steps, seeds[i], own)
+                A = dense(log, first[i], steps, number, at, x)
+                drifts(x, A, steps, order, lanes, work, value)
+                seen = value[lanes - 1]  # the last order is the one that was seen
+                null[i] = value[:lanes].mean()
+                p[i, 0] = (value[:lanes] <= seen + ROUNDING).mean()
+                p[i, 1] = (value[:lanes] >= seen - ROUNDING).mean()
+                trends(x, A, steps, age, lanes, work, value)
+                trend[i] = _trend(x, A, steps, at)
+                p[i, 2] = (value[:lanes] >= trend[i] - ROUNDING * (1.0 + trend[i])).mean()
+            continue
+        state[0], left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
+        hits = np.zeros(left, np.int64)
+        while left:
+            lanes = min(LANES, most - tried) if tried < most else 0
+            _draw_orders(order, age, steps, LANES, state)
+            open_ = 0
+            for j in range(left):
+                i = voxels[j]
+                _own_order(at, steps, seeds[i], own)
+                A = dense(log, first[i], steps, number, at, x)
+                if tried == 0:
+                    trend[i], p[i, 2] = _trend(x, A, steps, at), np.nan
+                if tried < draws and not known[i]:
+                    some = min(LANES, draws - tried)
+                    drifts(x, A, steps, order, some, work, value)
+                    null[i] += value[:some].sum() / draws
+                if np.isnan(p[i, 2]):
+                    trends(x, A, steps, age, lanes, work, value)
+                    extreme = value >= trend[i] - ROUNDING * (1.0 + trend[i])
+                    p[i, 2], hits[j] = _tail(hits[j], tried, extreme, lanes, enough)
+                    if np.isnan(p[i, 2]) and tried + lanes >= most:
+                        p[i, 2] = (hits[j] + 1) / (most + 1)
+                if np.isnan(p[i, 2]) or (tried + LANES < draws and not known[i]):
+                    voxels[open_], hits[open_] = i, hits[j]
+                    open_ += 1
+            left, tried = open_, tried + LANES
+
+
+@serial
+def test_drifts(chunk, rank, first, T, log, K, entries, seeds, seed, most, enough, p):
+    """P-values (n,) of the sum of drifts of voxels, either way, from up to `most` random orders; see `measure_voxels`.
+
+    Each tail is settled by `enough` orders, and the smaller one counts twice.
+    """
+    x, work, number, order, age, value = room(T, entries, K)
+    at, own, state = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(1, np.uint64)
+    for voxels in _groups(chunk, rank, T):
+        steps = T[voxels[0]]
+        state[0], left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
+        hits, tails, seen = np.zeros((left, 2), np.int64), np.full((left, 2), np.nan), np.empty(left)
+        number_of = np.arange(left)
+        while left:
+            lanes = min(LANES // 2, most - tried)
+            _draw_orders(order, age, steps, lanes, state)
+            open_ = 0
+            for j in number_of[:left]:
+                i = voxels[j]
+                _own_order(at, steps, seeds[i], own)
+                A = dense(log, first[i], steps, number, at, x)
+                if tried == 0:
+                    drifts(x, A, steps, at.reshape(-1, 1), 1, work, value)
+                    seen[j] = value[0]
+                drifts(x, A, steps, order, lanes, work, value)
+                for side in range(2):
+                    if np.isnan(tails[j, side]):
+                        extreme = value <= seen[j] + ROUNDING if side == 0 else value >= seen[j] - ROUNDING
+                        tails[j, side], hits[j, side] = _tail(hits[j, side], tried, extreme, lanes, enough)
+                        if np.isnan(tails[j, side]) and tried + lanes >= most:
+                            tails[j, side] = (hits[j, side] + 1) / (most + 1)
+                p[i] = min(1.0, 2.0 * tails[j].min())
+                if np.isnan(tails[j]).any():
+                    number_of[open_] = j
+                    open_ += 1
+            left, tried = open_, tried + lanes

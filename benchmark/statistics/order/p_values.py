@@ -1,0 +1,77 @@
+"""P-values of many voxels at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+ROUNDED = 12
+"""Bits of p-values that are kept: so few different ones are told apart that they can be counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class PValues:
+    """P-values of many voxels, which add up over the parts of a map: rounded up to ROUNDED bits, and how often each.
+
+    value  (v,) ascending; count (v,)
+    """
+
+    value: Float64
+    count: Int64
+
+    @classmethod
+    def of(cls, p: Float64) -> PValues:
+        """Those that are no NaN, which is not a test."""
+        value, count = np.unique(_rounded_up(p[~np.isnan(p)]), return_counts=True)
+        return cls(value, count.astype(np.int64))
+
+    @classmethod
+    def merged(cls, parts: Sequence[PValues]) -> PValues:
+        """Those of a map from its parts."""
+        value, of = np.unique(np.concatenate([part.value for part in parts]), return_inverse=True)
+        count = np.bincount(of, weights=np.concatenate([part.count for part in parts]), minlength=len(value))
+        return cls(value, count.astype(np.int64))
+
+    def adjusted(self, p: Float64) -> Float64:
+        """What `benjamini_hochberg` makes of some of them (n,); NaN stays."""
+        q = self._adjusted()
+        found = np.full(len(p), np.nan)
+        tested = ~np.isnan(p)
+        found[tested] = q[np.searchsorted(self.value, _rounded_up(p[tested]))]
+        return found
+
+    def found(self, rate: float) -> int:
+        """How many are below that rate when they are adjusted."""
+        return int(self.count[self._adjusted() <= rate].sum())
+
+    def _adjusted(self) -> Float64:
+        raised = self.value * self.count.sum() / np.cumsum(self.count)
+        lowest: Float64 = np.minimum.accumulate(raised[::-1])[::-1]
+        return np.minimum(lowest, 1.0)
+
+
+def _rounded_up(p: Float64) -> Float64:
+    part, exponent = np.frexp(p)
+    rounded: Float64 = np.ldexp(np.ceil(np.ldexp(part, ROUNDED)), exponent - ROUNDED)
+    return rounded
+
+
+def benjamini_hochberg(p: Float64) -> Float64:
+    """Adjusted p-values of the same shape: rejecting those <= q keeps the false discovery rate at q (1995, JRSS B 57).
+
+    NaN is not a test. It holds for independent tests and for those that depend positively (Benjamini and Yekutieli
+    2001), as neighbouring voxels do.
+    """
+    from scipy.stats import false_discovery_control
+
+    adjusted = np.full(len(p), np.nan)
+    tested = np.flatnonzero(~np.isnan(p))
+    if len(tested):
+        adjusted[tested] = false_discovery_control(p[tested])
+    return adjusted
