@@ -16,6 +16,7 @@ from semstab.errors import ConfigError
 from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -208,8 +209,16 @@ class _Orders:
 
     def _shared(self) -> tuple[Any, ...]:
         entries = self.log[0][self.first + self.T] - self.log[0][self.first]
-        rank = np.argsort(self.T, kind="stable")
-        return rank, self.first, self.T, self.log, self.K, int(entries.max(initial=0)), self.streams, self.seed
+        return (
+            ranked(self.T),
+            self.first,
+            self.T,
+            self.log,
+            self.K,
+            int(entries.max(initial=0)),
+            self.streams,
+            self.seed,
+        )
 
 
 def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -> Int64:

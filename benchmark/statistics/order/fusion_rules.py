@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,10 @@ from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
 RULES = ("averaging", "majority", "product", "geometric")
 """The paper's mean of evidence; the share of frames that vote for a class; Bayes' product of the frames' evidence under
@@ -62,25 +65,51 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
     0.01, or 1/K where that is less.
     Raises ConfigError for another rule, or a floor outside (0, 1/K].
     """
-    from semstab.statistics.loops import chunks, log_kernels
-
     K = events.evidence.K
     floor = min(FLOOR, 1 / K) if floor is None else floor
     if rule not in RULES:
         raise ConfigError(f"fusion rule '{rule}' is not known; there are {', '.join(RULES)}")
     if not 0 < floor <= 1 / K:
         raise ConfigError(f"floor = {floor:g}: it must be above 0 and at most 1/K = {1 / K:g}")
+    return fuse_all(events, [rule], floor=floor)[0]
+
+
+def fuse_all(
+    events: Events, rules: Sequence[str], *, floor: float | None = None, evidence: Evidence | None = None
+) -> list[Fused]:
+    """What `fuse` makes of a log by each of some rules, in one pass.
+
+    evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
+    """
+    from semstab.statistics.loops import chunks
+    from semstab.statistics.loops import rules as loops
+
+    K = events.evidence.K
+    bounds, log = np.append(events.starts, len(events)), events.evidence.entries
+    first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
+    belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(first) - 1, len(first) - 1))
+    op, count = np.diff(bounds), np.diff(first)
+    most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
+    seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
+    rank = ranked(op * (most + 1) + count)
+    chunks.in_chunks(loops.fuse_by_rules, rank, bounds, log, K, *seen, *how, belief, rest, drift_sum)
+    return [
+        Fused(Belief(first, label, belief[r], K, rest[r]), op.astype(np.int32), drift_sum[r]) for r in range(len(rules))
+    ]
+
+
+def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
+    """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
+    from semstab.statistics.loops import chunks
+    from semstab.statistics.loops import rules as loops
+
     bounds, log = np.append(events.starts, len(events)), events.evidence.entries
     count = np.zeros(len(bounds), np.int64)
-    chunks.in_chunks(log_kernels.count_classes, bounds, log, K, count)
-    first, entries = np.cumsum(count), np.diff(log[0][bounds])
-    own = first, np.zeros(first[-1], np.uint16), np.zeros(first[-1]), np.zeros(len(entries))
-    drift_sum = np.zeros(len(entries))
-    chunks.in_chunks(
-        log_kernels.fuse_by_rule, bounds, log, K, int(entries.max(initial=0)), RULES.index(rule), floor, own, drift_sum
-    )
-    first, label, belief, rest = own
-    return Fused(Belief(first, label, belief, K, rest), np.diff(bounds).astype(np.int32), drift_sum)
+    chunks.in_chunks(loops.count_classes, bounds, log, events.evidence.K, count)
+    first: Int64 = np.cumsum(count)
+    label = np.zeros(first[-1], np.uint16)
+    chunks.in_chunks(loops.list_classes, bounds, log, events.evidence.K, first, label)
+    return first, label
 
 
 def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:

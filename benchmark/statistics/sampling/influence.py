@@ -21,6 +21,7 @@ from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
 from semstab.runtime.json_form import from_json
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
+from semstab.statistics.ranks import distinct_rows
 from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
 
 Float64 = npt.NDArray[np.float64]
@@ -100,9 +101,9 @@ class InfluenceSums:
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
         key = np.concatenate([cell, frame[:, None]], axis=1)
-        rows, of = np.unique(key, axis=0, return_inverse=True)
+        rows, of = distinct_rows(key)
         columns = np.zeros((len(rows), self.columns.shape[1]))
-        np.add.at(columns, of.ravel(), self.columns)
+        np.add.at(columns, of, self.columns)
         return dataclasses.replace(
             self,
             cell=rows[:, :3].astype(np.int32),

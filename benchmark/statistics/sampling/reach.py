@@ -7,7 +7,6 @@ kernel misses, where blocks are few or errors reach far, is put back.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Sequence
@@ -235,22 +234,37 @@ class Arrangement:
         """How likely each correlation is (REML)."""
         scale = size**GROWTH
         seen, mean = influence / scale, size / scale
-        found = []
-        for number, correlation in enumerate(self._correlations):
-            a, b = correlation.vectors.T @ seen, correlation.vectors.T @ mean
-            for alone in ALONE if correlation.reach else (0.0,):
-                v = (1 - alone) * correlation.values + alone
-                within = float((b * b / v).sum())
-                left = float((a * a / v).sum()) - float((a * b / v).sum()) ** 2 / within
-                if left > 0:
-                    log = float(np.log(v).sum()) + math.log(within) + (self.count - 1) * math.log(left)
-                    before = self._far * math.log(max(correlation.reach, REACHES[0])) - (DOUBT if alone else 0.0)
-                    found.append(_Likely(number, alone, before - 0.5 * log, left / (self.count - 1)))
-        likely = np.array([own.weight for own in found])
+        number, alone, vectors, v, logs, before = self._alternatives
+        a, b = np.moveaxis(vectors @ np.stack([seen, mean], axis=1), -1, 0)[:, number]
+        within = (b * b / v).sum(axis=1)
+        left = (a * a / v).sum(axis=1) - (a * b / v).sum(axis=1) ** 2 / within
+        some = np.flatnonzero(left > 0)
+        log = logs[some] + np.log(within[some]) + (self.count - 1) * np.log(left[some])
+        likely = before[some] - 0.5 * log
         weight = np.exp(likely - likely.max(initial=-math.inf))
         weight = np.where(weight < UNLIKELY * weight.sum(), 0.0, weight)
-        shares = weight / weight.sum()
-        return [dataclasses.replace(own, weight=float(w)) for own, w in zip(found, shares, strict=True) if w > 0]
+        found = zip(number[some], alone[some], weight / weight.sum(), left[some] / (self.count - 1), strict=True)
+        return [_Likely(int(k), float(own), float(w), float(scatter)) for k, own, w, scatter in found if w > 0]
+
+    @functools.cached_property
+    def _alternatives(self) -> tuple[npt.NDArray[np.int64], Float64, Float64, Float64, Float64, Float64]:
+        """Numbers of correlations (A,), with what a cell has for itself (A,).
+
+        Then the transposed eigenvectors (C, G, G) of all correlations, the eigenvalues (A, G), the sum of their
+        logarithms (A,) and what counts besides (A,).
+        """
+        pairs = [
+            (number, alone)
+            for number, correlation in enumerate(self._correlations)
+            for alone in (ALONE if correlation.reach else (0.0,))
+        ]
+        number, alone = np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
+        values = np.stack([of.values for of in self._correlations])[number]
+        reach = np.array([of.reach for of in self._correlations])[number]
+        v = (1 - alone)[:, None] * values + alone[:, None]
+        before = self._far * np.log(np.maximum(reach, REACHES[0])) - np.where(alone > 0, DOUBT, 0.0)
+        vectors = np.stack([of.vectors.T for of in self._correlations])
+        return number, alone, vectors, v, np.log(v).sum(axis=1), before
 
 
 @functools.lru_cache(maxsize=4)

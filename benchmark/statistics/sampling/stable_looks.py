@@ -12,6 +12,7 @@ import numpy.typing as npt
 from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.ranks import added, distinct_rows
 from semstab.statistics.sampling.collect import cells_of
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
@@ -61,8 +62,8 @@ class StableLooks:
         parts = []
         for rows in np.split(np.arange(len(T)), bounds):
             group = _frames_of(events, counted[rows], T[rows]) // step
-            parts.append(_added(np.repeat(kind[rows], T[rows]) * groups + group, np.repeat(1.0 / T[rows], T[rows])))
-        key, weight = _added(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+            parts.append(added(np.repeat(kind[rows], T[rows]) * groups + group, np.repeat(1.0 / T[rows], T[rows])))
+        key, weight = added(*(np.concatenate(values) for values in zip(*parts, strict=True)))
         own = keys[key // groups]
         own[:, 3] = key % groups
         return cls(own.astype(np.int32), weight, edge, step)
@@ -84,10 +85,10 @@ class StableLooks:
         """The sums of the same map with what is stable, by the probability (k,) of places with these votes."""
         own = layout(sums.K, truth=True)
         stable = self.weight * likely(self.key[:, SEEN].astype(np.int64), self.key[:, MOST].astype(np.int64))
-        rows, of = np.unique(self.key[:, :4], axis=0, return_inverse=True)
+        rows, of = distinct_rows(self.key[:, :4])
         columns = np.zeros((len(rows), width(sums.K, truth=True)))
         for name, values in (("stable", stable), ("stable_wrong", stable * self.key[:, WRONG])):
-            columns[:, own[name].start] = np.bincount(of.ravel(), weights=values, minlength=len(rows))
+            columns[:, own[name].start] = np.bincount(of, weights=values, minlength=len(rows))
         return dataclasses.replace(
             sums,
             cell=np.concatenate([sums.cell, rows[:, :3]]).astype(np.int32),
@@ -103,12 +104,6 @@ def _frames_of(events: Events, voxels: Int64, T: Int64) -> Int64:
     return frames
 
 
-def _added(key: Int64, weight: Float64) -> tuple[Int64, Float64]:
-    """Distinct keys with the sums of their weights."""
-    found, of = np.unique(key, return_inverse=True)
-    return found, np.bincount(of, weights=weight, minlength=len(found)).astype(np.float64)
-
-
 def _distinct(key: npt.NDArray[np.int32], weight: Float64) -> tuple[npt.NDArray[np.int32], Float64]:
-    rows, of = np.unique(key, axis=0, return_inverse=True)
-    return rows.astype(np.int32), np.bincount(of.ravel(), weights=weight, minlength=len(rows)).astype(np.float64)
+    rows, of = distinct_rows(key)
+    return rows.astype(np.int32), np.bincount(of, weights=weight, minlength=len(rows)).astype(np.float64)

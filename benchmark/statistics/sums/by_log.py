@@ -113,8 +113,9 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
 
 def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
     again, usual, rows = table.op >= 2, fusion_rules.labels(table.evidence), []
-    for rule in fusion_rules.RULES:
-        fused = table if rule == fusion_rules.RULES[0] else fusion_rules.fuse(events, rule)  # the map's own rule
+    _, *others = fusion_rules.RULES  # the map's own rule is the first
+    fused_by: list[VoxelTable | fusion_rules.Fused] = [table]
+    for fused in [*fused_by, *fusion_rules.fuse_all(events, others, evidence=table.evidence)]:
         relabelled = (fusion_rules.labels(fused.evidence) != usual)[again]
         rows.append(np.concatenate([[relabelled.sum(), len(relabelled)], rule_sums(fused, again, truth)]))
     return np.stack(rows)

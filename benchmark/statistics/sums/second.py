@@ -18,6 +18,7 @@ from semstab.statistics.judging.flipping import FlippingSums
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order.drift import TESTABLE
 from semstab.statistics.order.p_values import benjamini_hochberg
+from semstab.statistics.ranks import distinct_rows
 from semstab.statistics.sampling import InfluenceSums, PlaceSums
 from semstab.statistics.steady import Votes, steady
 from semstab.statistics.sums.by_log import FALSE_DISCOVERIES
@@ -65,8 +66,8 @@ class Whole:
         return found if truth is None else truth.stable.added_to(found, self._likely)
 
     def _likely(self, seen: Int64, most: Int64) -> Float64:
-        (seen, most), of = np.unique(np.stack([seen, most]), axis=1, return_inverse=True)  # many places have the same
-        return Votes(seen, most, np.ones_like(seen)).stable(self.shares)[of.ravel()]
+        pairs, of = distinct_rows(np.stack([seen, most], axis=1))  # many places have the same
+        return Votes(pairs[:, 0], pairs[:, 1], np.ones(len(pairs), np.int64)).stable(self.shares)[of]
 
     def drift_tests(self) -> DriftTests:
         """Of a map with its log."""

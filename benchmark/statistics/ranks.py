@@ -1,0 +1,44 @@
+"""Sorting and telling apart small whole numbers, in linear time where they are dense."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+SPARSE = 8
+"""A table may have so many places for one number."""
+
+
+def ranked(numbers: Int64) -> Int64:
+    """The order (n,) that sorts numbers from 0 on, stably: by radix where they have 16 bits at most."""
+    order: Int64 = np.argsort(numbers.astype(np.min_scalar_type(int(numbers.max(initial=0)))), kind="stable")
+    return order
+
+
+def added(key: Int64, weight: Float64) -> tuple[Int64, Float64]:
+    """Distinct keys, whole numbers from 0 on, ascending, with the sums of their weights, which are above 0."""
+    if key.max(initial=0) < SPARSE * len(key):
+        total = np.bincount(key, weights=weight)
+        found: Int64 = np.flatnonzero(total)
+        return found, np.asarray(total[found], np.float64)
+    found, of = np.unique(key, return_inverse=True)
+    return found.astype(np.int64), np.bincount(of, weights=weight, minlength=len(found)).astype(np.float64)
+
+
+def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
+    """Each row of whole numbers (n, C) once, ascending, and which of them each is: np.unique by one number a row."""
+    low = rows.min(axis=0, initial=0).astype(np.int64)
+    size = [int(n) for n in rows.max(axis=0, initial=0) - low + 1]
+    if math.prod(size) >= 2**63:
+        found, of = np.unique(rows, axis=0, return_inverse=True)
+        return found.astype(np.int64), of.ravel()
+    key = np.zeros(len(rows), np.int64)
+    for column, least, many in zip(rows.T, low, size, strict=True):
+        key = key * many + (column - least)
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    return rows[first].astype(np.int64), of.astype(np.int64)
