@@ -273,13 +273,14 @@ def _jobs(
 def _portion_jobs(
     config: Config, folder: Path, start: str, tiled: Iterable[TiledUnit], observers: Sequence[Factory]
 ) -> Iterator[Job]:
-    """A job each, so that no two maps are in memory at once; a frame is shown to observers of one of them."""
+    """A job each, so that no two maps are in memory at once; a frame by itself is shown to observers of one of them."""
     memory = None if config.memory_gb is None else config.memory_gb * GB
     shown = set()
     for each in tiled:
         unit = each.planned.unit
         for request in each.waiting():
             frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
-            own = tuple(observers) if request.shown and frames not in shown else ()
+            seen = request.part is not None or (request.shown and frames not in shown)
+            own = tuple(observers) if seen else ()
             shown.add(frames)
             yield Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own)

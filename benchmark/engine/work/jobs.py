@@ -61,6 +61,11 @@ class Request:
         return self.stretch is not None and self.portion is not None and self.portion.kept
 
     @property
+    def part(self) -> Part | None:
+        """The part of the map in tiles that is fused, where observers are told of it."""
+        return self.portion.part if self.portion is not None and self.portion.kept else None
+
+    @property
     def stretch(self) -> Stretch | None:
         """The frames that are looked at without a map."""
         return None if self.portion is None else self.portion.stretch
