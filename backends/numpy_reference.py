@@ -14,12 +14,11 @@ from semstab.backends.shared.association import (
     Int64,
     Mask,
     Observations,
-    back_project,
     check_depth,
     check_frame,
     check_settings,
     observe,
-    voxel_index,
+    pixels_held,
 )
 from semstab.backends.shared.restricted import falling_into
 from semstab.backends.shared.total import Change, MapTotal
@@ -127,9 +126,7 @@ class NumpySample(NumpyReference):
     """The reference on one in `ONE_IN` of the voxels, drawn at random by their index, through all frames."""
 
     def _pixels(self, frame: Frame) -> Mask:
-        chosen = super()._pixels(frame).copy()
-        chosen[chosen] = in_sample(voxel_index(back_project(frame, chosen), self.voxel_size, frame))
-        return chosen
+        return pixels_held(frame, super()._pixels(frame), self.voxel_size, in_sample)
 
 
 def in_sample(index: Int64) -> Mask:

@@ -30,6 +30,10 @@ class ConfigError(SemstabError, ValueError):
     """A setting or an argument that cannot be used."""
 
 
+class OutgrownError(ConfigError):
+    """A map that turned out larger than the memory for it."""
+
+
 class DataError(SemstabError, ValueError):
     """Data that is missing, damaged, or that contradicts itself."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -119,6 +120,21 @@ class Several(InProcess):
     def run(self, jobs, observers) -> Generator:
         for job, outcomes in super().run(jobs, observers):
             self.done += [request.portion and request.portion.name for request in job.requests]
+            yield job, outcomes
+            self.left -= 1
+            if not self.left:
+                raise KeyboardInterrupt
+
+
+class Told(InProcess):
+    """In this process; remembers the portions, and which of them outgrew the memory."""
+
+    def __init__(self, stop_after: int = 1000) -> None:
+        self.left, self.done = stop_after, []
+
+    def run(self, jobs, observers) -> Generator:
+        for job, outcomes in super().run(jobs, observers):
+            self.done += [(outcome.portion, outcome.outgrown) for outcome in outcomes]
             yield job, outcomes
             self.left -= 1
             if not self.left:
@@ -376,6 +392,51 @@ def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> Non
     assert_same_bits(result.records[0].table(), whole.records[0].table())
     again = semstab.engine.run(config, out=out)
     assert again.manifest["units"]["kept"] == 1
+
+
+@pytest.fixture
+def few_said(monkeypatch):
+    """The index says that there are a twentieth of the voxels; of the process's memory, maps alone count."""
+
+    def fewer(*arguments) -> Sights:
+        found = look_at(*arguments)
+        return dataclasses.replace(found, voxels=found.voxels / 20, observations=found.observations / 20)
+
+    monkeypatch.setattr("semstab.engine.survey.look_at", fewer)
+    monkeypatch.setattr("semstab.engine.work.room.resident_bytes", lambda: 0)
+
+
+def test_parts_that_outgrow_the_memory_are_cut_in_two_and_nothing_finished_is_lost(
+    wall, both, few_said, tmp_path
+) -> None:
+    """Also where the run is interrupted between the halves; and once one fits, it tells how the others are cut."""
+    config, out = configure(wall, **SETTINGS, tile_size=8, memory_gb=12e-6), tmp_path / "tiles"
+    first, second = Told(stop_after=7), Told()
+    with pytest.raises(KeyboardInterrupt):
+        semstab.engine.run(config, out=out, executor=first)
+    kept = {path.stem for path in out.glob("parts/*/*.npz")}
+    semstab.engine.run(config, out=out, executor=second)
+    assert kept.isdisjoint(name for name, _ in second.done)
+    assert [outgrown for name, outgrown in first.done if name.startswith("tiles")] == [True, True, True, False, False]
+    assert not any(outgrown for _, outgrown in second.done)
+    assert_same_run(both[0], out)
+
+
+def test_a_tile_that_outgrows_the_memory_is_told_in_one_line(wall, few_said, tmp_path) -> None:
+    config = configure(wall, **SETTINGS, tile_size=8, memory_gb=3e-6)
+    with pytest.raises(
+        ConfigError, match=r"million voxels.*or set a smaller --tile-size: part tiles8_\S+ is a single tile$"
+    ):
+        semstab.engine.run(config, out=tmp_path / "tiles")
+
+
+def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_path) -> None:
+    """A part is named by its corners in tiles, which are others where tiles are larger."""
+    for size, executor in ((8, Several(stop_after=4)), (16, Several())):
+        config = configure(wall, **SETTINGS, tile_size=size)
+        with contextlib.suppress(KeyboardInterrupt):
+            semstab.engine.run(config, out=tmp_path / "tiles", executor=executor)
+    assert_same_bits(semstab.load(tmp_path / "tiles").table(), semstab.load(both[0]).table())
 
 
 def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path) -> None:

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,15 @@ from test_recording import config_of, grid, notes, read, read_blueprints, series
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
+from semstab.engine import InProcess
 from semstab.engine.units import make_plan
+from semstab.engine.work.passes import run_job
 from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import SBD_MAX
 from semstab.model.palette import GLOW
+from semstab.model.records import RECORDING_PARTS
 from semstab.outputs.recording import Recording, camera
 from semstab.outputs.recording.entities import Clock
 from semstab.outputs.recording.maps import drift_colors, flips, voxel_maps
@@ -496,3 +500,46 @@ semstab.engine.run(config, observers=[Recording({str(path)!r}), Killing()])
     subprocess.run([rerun, "rrd", "optimize", path, "-o", whole], capture_output=True, check=True)
     verify(whole)
     assert set(series(read(whole), "/wall/series/map_vss/a/numba")) == {0, 1, 2}
+
+
+class Elsewhere(InProcess):
+    """In this process, but as if jobs were done in others: each records a part, which are merged."""
+
+    elsewhere = True
+
+    def run(self, jobs: Any, observers: Any) -> Generator:
+        for job in jobs:
+            yield job, run_job(job)
+
+
+@pytest.fixture(scope="module")
+def tiles(compared):
+    """The same run in tiles: recorded in this process, and in parts that are merged."""
+    config, out = compared
+    config = config.model_copy(update={"backends": config.backends[:1], "tile_size": 8})
+    for name, executor in (("one", InProcess()), ("merged", Elsewhere())):
+        at = out.parent / name
+        recording = Recording(at / "recording.rrd", run=at)
+        semstab.engine.run(config, out=at, executor=executor, observers=[recording])
+        assert len(list((at / "voxels").glob("*/*.parquet"))) > 1
+        assert not (at / RECORDING_PARTS).exists()
+    return out.parent / "one", out.parent / "merged"
+
+
+def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles) -> None:
+    entity = "/wall/camera/a/drift"
+
+    def drawn(folder: Path) -> dict[int, bytes]:
+        rows = read(folder / "recording.rrd")[entity]
+        rows = [row for row in rows if "SegmentationImage:buffer" in row]
+        return {row["frame"]: image(row, "SegmentationImage").tobytes() for row in rows}
+
+    expected = drawn(compared[1])
+    assert len(expected) == tiny_scene.FRAMES
+    assert drawn(tiles[0]) == drawn(tiles[1]) == expected
+
+
+def test_a_merged_recording_has_one_layout_and_its_maps_are_looked_at(tiles) -> None:
+    """Of two, the viewer would show the one that comes last in the file, in which they lie in no order."""
+    (layout,) = read_blueprints(tiles[1] / "recording.rrd")
+    assert any("EyeControls3D:position" in row for row in layout)

@@ -6,6 +6,7 @@ Paper, Semantic Evidence and World-Space Association, and Persistent Voxel Evide
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,9 @@ LOOKED_AT = 2**12
 
 FAR, DISTINCT = 100.0, 8
 """Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
+
+FEW = 1 << 19
+"""Pixels that are looked at together, about."""
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -110,15 +114,30 @@ def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
 
     The order of operations is the protocol's, so that every backend decides alike at a voxel's face.
     """
+    return np.concatenate([*_points(frame, frame.valid if pixels is None else pixels)], axis=1)
+
+
+def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[Int64], Mask]) -> Mask:
+    """Those of the pixels (H, W) whose voxels, by their index (3, n), are held."""
+    held = [holds(voxel_index(points, voxel_size, frame)) for points in _points(frame, pixels)]
+    chosen = np.zeros_like(pixels)
+    chosen[pixels] = np.concatenate(held)
+    return chosen
+
+
+def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
+    """World coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
     H, W = frame.shape
     K, R, t = frame.intrinsics, frame.T_wc[:3, :3], frame.T_wc[:3, 3]
-    d = frame.depth.astype(np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        x = ((np.arange(W) - K.cx) / K.fx) * d
-        y = (((np.arange(H) - K.cy) / K.fy)[:, None]) * d
-    valid = frame.valid if pixels is None else pixels
-    x, y, z = x[valid], y[valid], d[valid]
-    return np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
+    across, down = (np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy
+    step = max(1, FEW // W)
+    for rows in (slice(first, first + step) for first in range(0, H, step)):
+        wanted = pixels[rows]
+        d = frame.depth[rows].astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            x, y = (across * d)[wanted], (down[rows, None] * d)[wanted]
+        z = d[wanted]
+        yield np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
 
 
 def voxel_index(points: Float64, voxel_size: float, frame: Frame) -> Int64:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from semstab.backends.shared.association import Mask, back_project, voxel_index
+from semstab.backends.shared.association import Mask, pixels_held
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
@@ -43,6 +43,5 @@ class Restricted:
 
 def falling_into(within: Extent, frame: Frame, voxel_size: float) -> Mask:
     """The pixels (H, W) with depth whose voxels are in the extent."""
-    chosen: Mask = np.isfinite(frame.depth) & (frame.depth > 0)
-    chosen[chosen] = within.holds(voxel_index(back_project(frame, chosen), voxel_size, frame))
-    return chosen
+    there: Mask = np.isfinite(frame.depth) & (frame.depth > 0)
+    return pixels_held(frame, there, voxel_size, within.holds)

@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
@@ -27,6 +27,7 @@ from semstab.engine.work.passes import lend
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result, UnitContent
 from semstab.model.results import VoxelAdvice
+from semstab.runtime.process import give_back
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 
@@ -121,6 +122,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
     with folder.started() as start, lend(start, plan.scenes):
         with watch("sizing"):
             sizing = sized(plan.config, missing, Survey(executor, folder, start))
+            give_back()
         for line in sizing.remarks:
             told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         _refuse(sizing, missing, found, executor, told)
@@ -157,19 +159,22 @@ def _work_off(
         if isinstance(each, PlannedUnit) and each.identity in tilings
     }
     factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
-    requests = [request for tiled in in_tiles.values() for request in tiled.missing()]
     jobs = split(_jobs(plan.config, folder.path, start, whole, factories), executor.width)
-    jobs += _portion_jobs(plan.config, folder.path, start, requests, units, factories)
+
+    def portions() -> Iterator[Job]:
+        return _portion_jobs(plan.config, folder.path, start, in_tiles.values(), factories)
+
     kept = (tiled.take(None) for tiled in in_tiles.values())
-    with contextlib.closing(executor.run(jobs, told)) as finished:
-        done = (outcome for _, outcomes in finished for outcome in outcomes)
+    done = _outcomes(executor, itertools.chain(jobs, portions()), portions, told)
+    with contextlib.closing(done):
         for outcome in itertools.chain((outcome for outcome in kept if outcome is not None), done):
             each, tiled = units[outcome.identity], in_tiles.get(outcome.identity)
             ended: Outcome | None = outcome
             for stage, seconds in outcome.seconds.items():
                 found.watch.seconds[stage] += seconds
             if tiled is not None and outcome.portion is not None:
-                told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
+                if outcome.error is None:
+                    told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
                 with found.watch("assemble"):
                     ended = tiled.take(outcome)
             if ended is not None and ended.identity not in found.errors:
@@ -177,6 +182,17 @@ def _work_off(
                 if tiled is not None and ended.content is not None:
                     _tell_assembled(tiled, ended.content, told)
                 _tell_done(each, ended.error, executor, told, counted=tiled is not None)
+
+
+def _outcomes(
+    executor: Executor, jobs: Iterable[Job], further: Callable[[], Iterator[Job]], told: Observers
+) -> Generator[Outcome, None, None]:
+    """Those of the jobs, then of further ones that have come up meanwhile, until there are none."""
+    while (first := next(waiting := iter(jobs), None)) is not None:
+        with contextlib.closing(executor.run(itertools.chain([first], waiting), told)) as finished:
+            for _, outcomes in finished:
+                yield from outcomes
+        jobs = further()
 
 
 def _keep(folder: Folder, found: Found, each: Planned, outcome: Outcome) -> None:
@@ -255,20 +271,16 @@ def _jobs(
 
 
 def _portion_jobs(
-    config: Config,
-    folder: Path,
-    start: str,
-    requests: Sequence[Request],
-    units: Mapping[str, Planned],
-    observers: Sequence[Factory],
-) -> list[Job]:
-    """A job each, so that no two maps are in memory at once; a frame is shown to observers of one of them."""
+    config: Config, folder: Path, start: str, tiled: Iterable[TiledUnit], observers: Sequence[Factory]
+) -> Iterator[Job]:
+    """A job each, so that no two maps are in memory at once; a frame by itself is shown to observers of one of them."""
     memory = None if config.memory_gb is None else config.memory_gb * GB
-    jobs, shown = [], set()
-    for request in requests:
-        unit = units[request.identity].unit
-        frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
-        own = tuple(observers) if request.shown and frames not in shown else ()
-        shown.add(frames)
-        jobs.append(Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own))
-    return jobs
+    shown = set()
+    for each in tiled:
+        unit = each.planned.unit
+        for request in each.waiting():
+            frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
+            seen = request.part is not None or (request.shown and frames not in shown)
+            own = tuple(observers) if seen else ()
+            shown.add(frames)
+            yield Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own)

@@ -130,6 +130,10 @@ class Folder:
             with atomic_path(self.path / name) as temporary:
                 temporary.write_bytes(file)
 
+    def portions(self, key: str) -> set[str]:
+        """Names of what earlier starts left of a unit's portions."""
+        return {path.stem for path in (self.path / PORTIONS / key).glob("*.npz")}
+
     def portion(self, key: str, name: str) -> Finished | None:
         """What an earlier start left of a portion, if its files are there as they were."""
         try:

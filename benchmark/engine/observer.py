@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from semstab.check import Verdict
     from semstab.config import Config
     from semstab.engine.series import FrameRow
+    from semstab.engine.tiling.partition import Part
     from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
     from semstab.model.frames import Frame
     from semstab.model.records import Result
@@ -54,6 +55,15 @@ class Observer:
 
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """A frame of a map in tiles was looked at; the tiles are fused by themselves."""
+
+    def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
+        """The frames that see this part of the map in tiles of the task's unit go into it from now on."""
+
+    def part_fused(self, frame: Frame) -> None:
+        """A frame went into that part of a map."""
+
+    def part_finished(self) -> None:
+        """All frames that see it went into it; its map is measured and written next."""
 
     def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
         """All tiles of a unit's map are in the folder, and measured."""

@@ -14,7 +14,7 @@ from semstab.engine.survey import Survey
 from semstab.engine.tiling.partition import Tiling, tiled
 from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.memory import GB, Kind, limit, most_voxels, takes, too_large
+from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
@@ -61,21 +61,23 @@ def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
 def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: Sizing) -> None:
     task, settings, width = group[0].task, group[0].config, survey.executor.width
     forced = isinstance(config.tile_size, int)
-    own = limit(config) / width  # of the process that a unit is fused in
-    if not forced and _surely_fits(own, group):
+    first = _first(task, settings)
+    if not forced and _surely_fits(config, width, group, first):
         return
+    soft = _is_soft(task)
     size = config.tile_size if isinstance(config.tile_size, int) else None
     sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
-    kinds = _kinds(group, soft=_is_soft(task))
+    kinds, load = _kinds(group, soft=soft), _load(group, first, soft=soft)
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
+    own = room(config, width, load.beside(voxels, needed))
     if not forced and needed <= own:
         return
     if (why := _cannot_be_tiled(config, group)) is not None:
         if forced:
             raise ConfigError(f"tile_size = {config.tile_size}: {why}")
         names = [each.unit.backend for each in group]
-        line = too_large(task, names, settings, voxels, needed, f" ({why})")
+        line = too_large(task, names, settings, voxels, needed, own, f" ({why})")
         found.refused |= {each.identity: line for each in group}
         return
     budget = SHARE * own
@@ -90,14 +92,22 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
     )
 
 
-def _surely_fits(memory: float, group: Sequence[PlannedUnit]) -> bool:
+def _surely_fits(config: Config, width: int, group: Sequence[PlannedUnit], first: Frame) -> bool:
+    """Without a look at labels, which may be a network's, where that will do."""
     task, settings = group[0].task, group[0].config
-    voxels = most_voxels(task, settings, _first(task, settings))
+    voxels = most_voxels(task, settings, first)
 
     def fits(*, soft: bool) -> bool:
-        return sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft)) <= memory
+        needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft))
+        return needed <= room(config, width, _load(group, first, soft=soft).beside(voxels, needed))
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
+
+
+def _load(group: Sequence[PlannedUnit], first: Frame, *, soft: bool) -> Load:
+    """Of the process that these units are fused in."""
+    task, settings = group[0].task, group[0].config
+    return Load(first, len(task.indices), len(task.mapping.target), soft, settings.threads)
 
 
 def _first(task: Task, settings: Config) -> Frame:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import sys
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -29,14 +30,23 @@ def settle() -> None:
     """
     os.environ.setdefault("RUST_LOG", "off")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    if sys.platform != "linux":
-        return
-    import ctypes
-
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "gnu_get_libc_version"):
+    if hasattr(libc := _libc(), "gnu_get_libc_version"):
         for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, KEPT), (ARENA_MAX, 1)):
             libc.mallopt(parameter, value)
+
+
+def give_back() -> None:
+    """Return freed memory to the system at once: what `settle` has kept for the next images (glibc)."""
+    if hasattr(libc := _libc(), "malloc_trim"):
+        libc.malloc_trim(0)
+
+
+@functools.cache
+def _libc() -> Any:
+    """The C library; nothing where its memory cannot be settled."""
+    import ctypes
+
+    return ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
 def follow_parent(listening: Connection) -> None:

@@ -61,7 +61,12 @@ def krippendorff_alpha(table: VoxelTable) -> float:
     1 - (1 - A) / (1 - A_e): A is the mean of PSA weighted by OP, and A_e is the same agreement between all
     observations, as if they were of one voxel. NaN where no two frames saw one place, or only one class was predicted.
     """
-    return float(alpha_of(_sums(alpha_columns, table)))
+    return float(alpha_of(alpha_sums(table)))
+
+
+def alpha_sums(table: VoxelTable) -> Float64:
+    """(3 + K,) what Krippendorff's alpha of a map is a function of; those of its parts add up."""
+    return _sums(alpha_columns, table)
 
 
 def _sums(columns: Callable[[VoxelTable], Float64], table: VoxelTable) -> Float64:

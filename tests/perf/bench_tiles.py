@@ -74,6 +74,7 @@ def same(whole: Path, tiles: Path) -> bool:
     """Whether both runs found the same, to the last bit of every column."""
     for file in (whole / "voxels").glob("*.parquet"):
         folder = tiles / "voxels" / file.stem
+        folder = folder if folder.is_dir() else folder.with_suffix(".parquet")  # that fitted at once
         for name in COLUMNS:
             a, b = (VoxelTable.columns(path, [name])[name] for path in (file, folder))
             if a.tobytes() != b.tobytes():

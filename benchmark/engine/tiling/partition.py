@@ -39,28 +39,55 @@ class Part:
 
     @property
     def name(self) -> str:
-        """Its corners in tiles: X_Y, or X_Y-X_Y of the first and the last one."""
+        """The size of its tiles, and its corners in them: X_Y, or X_Y-X_Y of the first and the last one."""
         (x0, y0), (x1, y1) = ((x // self.size, y // self.size) for x, y in (self.extent.low, self.extent.high))
         first, last = f"{x0}_{y0}", f"{x1 - 1}_{y1 - 1}"
-        return first if first == last else f"{first}-{last}"
+        return f"tiles{self.size}_" + (first if first == last else f"{first}-{last}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tiling:
     """All parts of a unit's map.
 
-    size    of its tiles, voxels
-    origin  voxel of the first camera
+    tiles   what frames see of each tile, weight (c,) bytes that each is expected to take
+    budget  bytes that a part may take
+    parts   of tiles
     """
 
-    size: int
+    tiles: Sights
+    weight: npt.NDArray[np.float64]
+    budget: float
     parts: tuple[Part, ...]
-    origin: tuple[int, int, int]
+
+    @property
+    def size(self) -> int:
+        """Edge of a tile, voxels."""
+        return self.tiles.size
+
+    @property
+    def origin(self) -> tuple[int, int, int]:
+        """Voxel of the first camera."""
+        x, y, z = self.tiles.origin.tolist()
+        return x, y, z
 
     @property
     def decodes(self) -> int:
         """How many frames the parts will read together."""
         return sum(len(part.frames) for part in self.parts)
+
+    def bytes(self, part: Part) -> float:
+        """That a part is expected to take."""
+        return float(self.weight[self._rows(part)].sum())
+
+    def halves(self, part: Part) -> tuple[Part, ...]:
+        """A part in two, always the same ones; none where it is a single tile."""
+        rows = self._rows(part)
+        weight = self.weight[rows] + 1  # more may have come of a tile for which nothing was expected
+        cut = _best_cut(self.tiles, rows, 2 * weight / weight.sum())
+        return () if cut is None else tuple(_part(self.tiles, some) for some in cut.sides(self.tiles, rows))
+
+    def _rows(self, part: Part) -> npt.NDArray[np.int64]:
+        return np.flatnonzero(part.extent.holds(self.tiles.place.T * self.size))
 
 
 def tiled(sights: Sights, cost: Cost, budget: float, size: int | None = None, least: int = 1) -> Tiling:
@@ -74,9 +101,9 @@ def tiled(sights: Sights, cost: Cost, budget: float, size: int | None = None, le
     tiles = sights.in_tiles(max(size, sights.size))
     total = cost(float(tiles.voxels.sum()), float(tiles.observations.sum()))
     budget = min(budget, 1.1 * total / least)
-    parts = [_part(tiles, rows) for rows in _split(tiles, cost, budget)]
-    x, y, z = tiles.origin.tolist()
-    return Tiling(tiles.size, tuple(part for part in parts if part.frames), (x, y, z))
+    weight = np.array([cost(*own) for own in zip(tiles.voxels, tiles.observations, strict=True)], dtype=np.float64)
+    parts = (_part(tiles, rows) for rows in _split(tiles, weight, budget))
+    return Tiling(tiles, weight, budget, tuple(part for part in parts if part.frames))
 
 
 def tile_size(sights: Sights, cost: Cost, budget: float) -> int:
@@ -91,17 +118,15 @@ def tile_size(sights: Sights, cost: Cost, budget: float) -> int:
     return size
 
 
-def _split(tiles: Sights, cost: Cost, budget: float) -> Iterator[npt.NDArray[np.int64]]:
+def _split(tiles: Sights, weight: npt.NDArray[np.float64], budget: float) -> Iterator[npt.NDArray[np.int64]]:
     """Rows of tiles by rectangle, each within the budget as far as there is something to cut."""
-    weight = np.array([cost(*own) for own in zip(tiles.voxels, tiles.observations, strict=True)])
     waiting = [np.arange(len(tiles.place))]
     while waiting:
         rows = waiting.pop()
         if weight[rows].sum() <= budget or (cut := _best_cut(tiles, rows, weight[rows] / budget)) is None:
             yield rows
         else:
-            below = tiles.place[rows, cut.axis] < cut.at
-            waiting += [rows[~below], rows[below]]
+            waiting += reversed(cut.sides(tiles, rows))
 
 
 @dataclass(frozen=True, order=True)
@@ -118,6 +143,11 @@ class _Cut:
     imbalance: float
     axis: int
     at: int
+
+    def sides(self, tiles: Sights, rows: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], ...]:
+        """Rows of the tiles below, and of those above."""
+        below = tiles.place[rows, self.axis] < self.at
+        return rows[below], rows[~below]
 
 
 def _best_cut(tiles: Sights, rows: npt.NDArray[np.int64], weight: npt.NDArray[np.float64]) -> _Cut | None:

@@ -91,12 +91,14 @@ class About:
 
     kind     see `Portion.kind`
     files    digests of its files, by their path in the folder
+    voxels   of the part, as they came
     checked  how far it agrees with the reference on a sample of its voxels
     sizes, quality  of the frames
     """
 
     kind: str
     files: Mapping[str, str] = field(default_factory=dict)
+    voxels: int = 0
     checked: Agreement | None = None
     sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None

@@ -9,7 +9,7 @@ import importlib
 import importlib.metadata
 import multiprocessing
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
@@ -43,8 +43,10 @@ class Executor(Protocol):
     elsewhere: bool
     remote: bool
 
-    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
         """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest.
+
+        Jobs are taken when there is somebody to do them: the next one may be told by those that are finished.
 
         `observers` are told of the work that is done in this very process.
         """
@@ -63,7 +65,7 @@ class InProcess:
     elsewhere = False
     remote = False
 
-    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
+    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
         """In order."""
         for job in jobs:
             yield job, run_job(job, observers)
@@ -84,8 +86,8 @@ class LocalProcesses:
         self.width = jobs
         self.name = f"{jobs} local processes"
 
-    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """As they finish.
+    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """As they finish, all begun at once.
 
         Where a process dies, nobody knows of which job: what is left is tried again, then once more one by one. The job
         whose process dies then fails, and the others finish.
@@ -100,7 +102,7 @@ class LocalProcesses:
             except BrokenProcessPool:
                 job = left.pop(min(left))
                 text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
-                yield job, tuple(failed(job.requests, text))
+                yield job, tuple(failed(job.requests, text, outgrown=True))
 
     def _run(self, left: dict[int, Job], width: int) -> Generator[Finished, None, None]:
         """Run the jobs that are left, in order; take away those that are finished."""
@@ -172,8 +174,8 @@ class DaskCluster:
         self.width = max(1, sum(self._client.nthreads().values()))
         self.name = f"Dask, {self.width} threads"
 
-    def run(self, jobs: Sequence[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """As they finish. The scheduler gives the job of a worker that died to another one."""
+    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
+        """As they finish, all begun at once. The scheduler gives the job of a worker that died to another one."""
         self._require_same_version()
         futures = {self._client.submit(_run_settled, job, pure=False): job for job in jobs}
         try:

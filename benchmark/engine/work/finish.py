@@ -48,6 +48,7 @@ from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import Events, VoxelTable
 from semstab.model.voxels.parquet import Tile, names_in
 from semstab.runtime.files import atomic_path, write_text
+from semstab.runtime.process import give_back
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
@@ -73,8 +74,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         _require_voxels(task, config, table)
         if not (config.statistics or config.events):
             one.backend = NoMap()  # what comes next has its memory
+        give_back()
     with watch("voxel sizes"):
         sizes = () if one.sizes is None else one.sizes.alphas()
+        give_back()
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_fused(unit, table))
@@ -82,6 +85,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         truth = None if one.truth is None else _table(one.truth, task)
         events = one.backend.events() if config.statistics else None
         found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
+        give_back()
     with watch("measure"):
         summary = _summary(one, table, found, sizes)
     with watch("write"):
@@ -225,8 +229,9 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
     with watch("write"):
         saved, returned = written(job, _portion_savers(stream, one, portion, found))
         rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
+        sizes, voxels = () if one.sizes is None else one.sizes.alphas(), 0 if table is None else len(table)
         finished = Finished(
-            About(portion.kind, saved, checked, () if one.sizes is None else one.sizes.alphas(), _quality(stream)),
+            About(portion.kind, saved, voxels, checked, sizes, _quality(stream)),
             series_array(one.rows),
             {} if found is None else found.sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
@@ -253,6 +258,7 @@ def _looked_at(one: UnitMap, table: VoxelTable, *, judged: bool) -> _Part:
     log = one.backend.events() if config.statistics or config.events else None
     events = None if log is None else dataclasses.replace(log, classes=table.classes)
     one.backend = NoMap()  # what comes next has its memory
+    give_back()
     if not judged:
         return _Part(table, TableSums.of(table, config.strata).arrays(), events=events)
     if not config.statistics:

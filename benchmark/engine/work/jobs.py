@@ -10,14 +10,14 @@ from pathlib import Path
 from semstab.check.views import evenly
 from semstab.config import Config, FrameSelection
 from semstab.engine.observer import Factory
-from semstab.engine.tiling.partition import Tiling
+from semstab.engine.tiling.partition import Part, Tiling
 from semstab.engine.tiling.portion import SIZES, Portion
 from semstab.engine.tiling.sights import Looking
 from semstab.engine.tiling.stretches import Stretch, stretches_of
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work.image_space import CLIPS
 from semstab.engine.work.sizes import FRAMES
-from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
+from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
 from semstab.model.records import UnitContent
 from semstab.model.voxels.extent import Extent
 from semstab.runtime.files import TEMPORARY
@@ -61,6 +61,11 @@ class Request:
         return self.stretch is not None and self.portion is not None and self.portion.kept
 
     @property
+    def part(self) -> Part | None:
+        """The part of the map in tiles that is fused, where observers are told of it."""
+        return self.portion.part if self.portion is not None and self.portion.kept else None
+
+    @property
     def stretch(self) -> Stretch | None:
         """The frames that are looked at without a map."""
         return None if self.portion is None else self.portion.stretch
@@ -94,6 +99,11 @@ class Request:
             portion = Portion(key, part, None, planned.kept, planned.judged, planned.image_space)
             found.append(fused._of(portion, part.frames))
         return found
+
+    def of_part(self, part: Part) -> Request:
+        """Another part of the same unit."""
+        assert self.portion is not None
+        return self._of(replace(self.portion, part=part), part.frames)
 
     def looking_at(self, frames: Sequence[int], looking: Looking) -> Request:
         """What these frames see."""
@@ -142,7 +152,8 @@ class Job:
 class Outcome:
     """What became of a unit: what its file holds, or the one line that says why there is none.
 
-    portion  the name of what was computed of it, where that is not all
+    portion  the name of what was computed of it, or could not be, where that is not all
+    outgrown whether it failed for want of memory
     files    further files of it by their path in the folder, where the worker does not see that folder
     cause    the exception, where the unit failed in this very process
     trace    where it was raised, if it is not semstab's own
@@ -153,6 +164,7 @@ class Outcome:
     content: UnitContent | None = None
     portion: str | None = None
     error: str | None = None
+    outgrown: bool = False
     files: Mapping[str, bytes] = field(default_factory=dict)
     cause: BaseException | None = field(default=None, compare=False)
     trace: str = ""
@@ -163,12 +175,27 @@ class Outcome:
         return {**self.__dict__, "cause": None}
 
 
-def failed(requests: Iterable[Request], error: str | Exception) -> list[Outcome]:
-    """The outcomes of units that could not be computed."""
+def failed(requests: Iterable[Request], error: str | Exception, *, outgrown: bool = False) -> list[Outcome]:
+    """The outcomes of units, or portions of them, that could not be computed."""
     if isinstance(error, str):
-        return [Outcome(request.identity, error=error) for request in requests]
+        return [Outcome(each.identity, portion=_portion(each), error=error, outgrown=outgrown) for each in requests]
     trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
-    return [Outcome(request.identity, error=message(error), cause=error, trace=trace) for request in requests]
+    outgrown = isinstance(error, (OutgrownError, MemoryError))
+    return [
+        Outcome(
+            each.identity,
+            portion=_portion(each),
+            error=message(error),
+            outgrown=outgrown,
+            cause=error,
+            trace=trace,
+        )
+        for each in requests
+    ]
+
+
+def _portion(request: Request) -> str | None:
+    return None if request.portion is None else request.portion.name
 
 
 def message(error: Exception) -> str:

@@ -8,13 +8,21 @@ from dataclasses import dataclass
 from semstab.backends import expected_bytes
 from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
+from semstab.engine.work.sizes import sizes_bytes
+from semstab.model.evidence import STRETCH
 from semstab.model.frames import Frame
 from semstab.runtime.memory import available_bytes
+from semstab.runtime.prefetch import default_threads
 from semstab.task import Task
 
 GB = 1e9
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first, all new, is not looked at closer."""
+
+LOADED, LOADED_FOR_SCORES = 190e6, 30e6
+"""Bytes of what a run loads once it is planned (compiled loops, formats of files), and of the sample of looks."""
+FRAMES_AT_WORK = 3
+"""Frames that are in memory beside those which are read ahead."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +53,47 @@ class Kind:
         return fused + truth + logs + followed + reduced + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
 
 
-def limit(config: Config) -> int:
-    """Bytes that maps may take: `memory_gb` where it is set, else what is free."""
-    return available_bytes() if config.memory_gb is None else int(config.memory_gb * GB)
+@dataclass(frozen=True)
+class Load:
+    """What the bytes depend on that a process takes beside its maps.
+
+    first    frame, as it is fused
+    frames   how many there are
+    K        number of classes
+    soft     whether frames have scores
+    threads  that read ahead; None: as many as there are for it
+    """
+
+    first: Frame
+    frames: int
+    K: int
+    soft: bool
+    threads: int | None
+
+    def beside(self, voxels: float, maps: float) -> float:
+        """Beside maps of so many voxels and bytes: what is loaded, and frames.
+
+        And dense rows of statistics, when a map is but its table, or some frames fused once more, before the last third
+        of what is loaded comes; as far as they are more than what is gone by then, or not yet there.
+        """
+        pixels = self.first.shape[0] * self.first.shape[1]
+        threads = default_threads() if self.threads is None else self.threads
+        frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
+        dense = 2 * 8 * self.K * min(voxels, STRETCH)
+        sizes = sizes_bytes(self.first, self.frames, self.K, soft=self.soft)
+        loaded = LOADED + self.soft * LOADED_FOR_SCORES
+        return loaded + frames + max(0.0, dense - maps / 2, sizes - LOADED / 3 - maps)
+
+
+def room(config: Config, width: int, taken: float) -> float:
+    """Bytes that maps of a process may take: its share of `memory_gb`, else of what is free, less what it takes beside.
+
+    Where hardly anything is free, a quarter of it is for maps all the same.
+    """
+    if config.memory_gb is not None:
+        return config.memory_gb * GB / width
+    free = available_bytes() / width
+    return max(free - taken, free / 4)
 
 
 def most_voxels(task: Task, config: Config, first: Frame) -> int:
@@ -58,12 +104,13 @@ def most_voxels(task: Task, config: Config, first: Frame) -> int:
     return DOUBT * len(task.indices) * len(seen.key)
 
 
-def too_large(task: Task, backends: Iterable[str], config: Config, voxels: float, needed: float, why: str = "") -> str:
+def too_large(
+    task: Task, backends: Iterable[str], config: Config, voxels: float, needed: float, own: float, why: str = ""
+) -> str:
     """That a map does not fit, by how much, and which settings change it."""
-    free = limit(config)
-    room = f"{free / GB:.2g} GB " + ("are free" if config.memory_gb is None else "is memory_gb")
+    there = f"{own / GB:.2g} GB " + ("are free for it" if config.memory_gb is None else "is memory_gb")
     return (
-        f"{takes(task, config, voxels, needed)}, and {room}; use larger voxels (voxel_size), fewer frames (frames), a"
+        f"{takes(task, config, voxels, needed)}, and {there}; use larger voxels (voxel_size), fewer frames (frames), a"
         f" larger pixel_stride{_without(backends, config)}; or set memory_gb to try all the same{why}"
     )
 

@@ -24,7 +24,7 @@ from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
-from semstab.errors import ConfigError, DataError
+from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.voxels.extent import Extent
 from semstab.runtime.memory import available_bytes, resident_bytes
@@ -119,6 +119,12 @@ class Pass:
             self.observers.tell(lambda observer: observer.group_started(task, watched[0].request.config))
         for one in (one for one in watched if one.request.kept):
             self.observers.tell(lambda observer, one=one: observer.unit_started(one.task.units[0], one.backend))  # type: ignore[misc]
+        for one in self._parts():
+            self.observers.tell(
+                lambda observer, one=one: observer.part_started(  # type: ignore[misc]
+                    one.task, one.request.config, one.request.part, one.backend
+                )
+            )
         with contextlib.closing(decode) as frames:
             for index, fetched in zip(order, frames, strict=True):
                 self._watch.seconds["read"] += fetched.waited
@@ -134,6 +140,10 @@ class Pass:
         if self._outcomes:
             self._outcomes[0] = dataclasses.replace(self._outcomes[0], seconds=dict(self._watch.seconds))
         return self._outcomes
+
+    def _parts(self) -> list[UnitMap]:
+        """Of maps in tiles; a job fuses no more than one."""
+        return [one for stream in self._streams for one in stream.maps if one.request.part is not None]
 
     def _created(self, request: Request) -> list[UnitMap]:
         """An empty map for a unit; none where it fails."""
@@ -185,6 +195,8 @@ class Pass:
                     one.soft = one.soft or now.frame.scores is not None
             if watched:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
+            for _ in (one for one in stream.maps if one.request.part is not None):
+                self.observers.tell(lambda observer: observer.part_fused(now.frame))
             for one in (one for one in stream.maps if one.request.shown):
                 self.observers.tell(lambda observer, one=one: observer.frame_seen(one.task, now.frame))  # type: ignore[misc]
         lost = {outcome.identity for outcome in self._outcomes}
@@ -245,6 +257,8 @@ class Pass:
 
     def _ended(self, stream: Stream, one: UnitMap) -> Outcome:
         if one.request.portion is not None:
+            if one.request.part is not None:
+                self.observers.tell(lambda observer: observer.part_finished())
             return finish_portion(self.job, stream, one, self._watch)
         return finish(self.job, stream, one, self.observers, self._watch)
 
@@ -266,7 +280,7 @@ class Pass:
         if largest is None:
             return
         with self._failing([largest.request]):
-            raise ConfigError(self._room.text(largest))
+            raise self._room.outgrown(largest)
         for stream in self._streams:
             stream.maps = [one for one in stream.maps if one is not largest]
 

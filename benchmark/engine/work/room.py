@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from semstab.backends import expected_bytes
 from semstab.engine.work.memory import GB, log_bytes, result_bytes
 from semstab.engine.work.stream import UnitMap
+from semstab.errors import OutgrownError
 from semstab.runtime.memory import available_bytes, resident_bytes
+from semstab.runtime.process import give_back
 
 STEP = 32e6
 """Bytes by which the process may grow before it is looked at closer."""
@@ -32,26 +34,31 @@ class Room:
 
         A hash map that is full doubles: the next step may be twice the largest one so far.
         """
-        resident, expected = resident_bytes(), sum(map(_bytes, maps))
+        expected = sum(map(_bytes, maps))
         if self._before is None:
-            self._before = resident - expected
-        taken = max(resident - self._before, expected)  # a map may take what was freed before
-        step = taken - self._seen
+            self._before = resident_bytes() - expected
+        step = self._taken(expected) - self._seen
         if step < min(STEP, (self._limit or STEP) / 8):
             return None
-        self._seen, self._largest_step = taken, max(self._largest_step, step)
+        give_back()  # else what was freed would count
+        taken = self._taken(expected)
+        self._seen, self._largest_step = taken, max(self._largest_step, taken - self._seen)
         free = available_bytes() / self._width
         self._left = free if self._limit is None else min(free, self._limit - taken)
         if self._left >= max(map(end_bytes, maps)) + 2 * self._largest_step:
             return None
         return max(maps, key=_bytes)
 
-    def text(self, one: UnitMap) -> str:
+    def _taken(self, expected: int) -> int:
+        """By the maps; one may take what was freed before."""
+        return max(resident_bytes() - (self._before or 0), expected)
+
+    def outgrown(self, one: UnitMap) -> OutgrownError:
         """Why a map is given up."""
         unit, config = one.task.units[0], one.request.config
         voxels = one.rows[-1].report.map_voxels
         which = "are free" if self._limit is None else "is left of memory_gb"
-        return (
+        return OutgrownError(
             f"{unit.scene}, {unit.backbone}, {unit.backend}: after {len(one.rows)} of {len(one.task.indices)} frames"
             f" the map has {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m, of which its table"
             f" {'and statistics' if config.statistics else 'alone'} would take {end_bytes(one) / GB:.2g} GB, and"

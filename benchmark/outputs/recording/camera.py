@@ -25,6 +25,9 @@ from semstab.outputs.recording.entities import path
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""
 
+SAMPLING = 2
+"""In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
+
 JPEG_QUALITY = 80
 COLOR_BYTES = 400_000_000
 """Of a scene's colour, where its frames' files are JPEG: those within their share go into the recording as they are."""
@@ -33,6 +36,17 @@ COLOR_BYTES = 400_000_000
 def stride_of(shape: tuple[int, int]) -> int:
     """Every how many pixels a picture of a frame of that shape (H, W) is sampled: a power of 2, as JPEG decodes to."""
     return int(2 ** max(0, math.ceil(math.log2(max(shape) / IMAGE_SIDE))))
+
+
+def coarse_stride(shape: tuple[int, int]) -> int:
+    """The same of pictures whose pixels are looked up: of large ones every second one on each axis."""
+    stride = stride_of(shape)
+    return stride * sampling(tuple(-(-side // stride) for side in shape))
+
+
+def sampling(shape: tuple[int, ...]) -> int:
+    """Every how many pixels of each axis a picture of that shape is looked up."""
+    return SAMPLING if max(shape) > IMAGE_SIDE // SAMPLING else 1
 
 
 class Overlay:

@@ -18,10 +18,12 @@ from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import series
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
-    IMAGE_SIDE,
     Overlay,
+    coarse_stride,
+    sampling,
     stride_of,
 )
+from semstab.outputs.recording.drift_parts import Picture
 from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.layout import drawn, is_pointwise
 from semstab.outputs.recording.maps import drift_colors
@@ -30,9 +32,6 @@ from semstab.outputs.recording.maps.flips import FlipLog
 from semstab.outputs.recording.maps.tracker import FrameDrift, Tracker
 from semstab.outputs.recording.maps.voxel_maps import MapLog
 from semstab.task import Task
-
-SAMPLING = 2
-"""In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
 
 
 class GroupLog:
@@ -141,27 +140,31 @@ class GroupLog:
         stream.log(path(scene, "difference_report", backbone, f"{first} and {second}"), report, static=True)
 
     def _log_pictures(self, stream: rr.RecordingStream, caused: FrameDrift) -> None:
-        shape = self._log_labels(stream, caused.frame)
-        coarse = stride_of(caused.frame.shape) * _sampling(shape)
-        self._log_picture(stream, caused.frame, "drift", drift_colors.levels_of(*caused.at(coarse)), coarse)
+        self._log_labels(stream, caused.frame)
+        coarse = coarse_stride(caused.frame.shape)
+        self._log_picture(stream, caused.frame.shape, "drift", drift_colors.levels_of(*caused.at(coarse)), coarse)
 
-    def _log_labels(self, stream: rr.RecordingStream, frame: Frame) -> tuple[int, ...]:
-        """The shape of the picture."""
+    def _log_labels(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stride = stride_of(frame.shape)
         labels = np.ascontiguousarray(frame.predicted[::stride, ::stride])
-        self._log_picture(stream, frame, "labels", labels, stride)
-        return labels.shape
+        self._log_picture(stream, frame.shape, "labels", labels, stride)
 
-    def _log_picture(self, stream: rr.RecordingStream, frame: Frame, name: str, picture: Any, stride: int) -> None:
+    def log_drift(self, stream: rr.RecordingStream, found: Picture) -> None:
+        """Log what parts of a map in tiles say of a frame's drift."""
+        self._log_picture(stream, (found.height, found.width), "drift", found.levels, found.stride)
+
+    def _log_picture(
+        self, stream: rr.RecordingStream, shape: tuple[int, int], name: str, picture: Any, stride: int
+    ) -> None:
         entity = f"{self._entity}/{name}"
-        self._overlay.log(stream, entity, frame.shape, picture.shape, stride)
+        self._overlay.log(stream, entity, shape, picture.shape, stride)
         stream.log(entity, rr.SegmentationImage(picture, draw_order=-10))
 
     def _log_flicker(self, stream: rr.RecordingStream, previous: Frame, frame: Frame) -> None:
         """Motion-compensated flicker: of a sample of the frame's pixels, looked up in the whole frame before."""
         stride = stride_of(frame.shape)
         sample = frame.every(stride)
-        flicker = compensated_flicker(previous, sample.every(_sampling(sample.shape))).flicker_percent
+        flicker = compensated_flicker(previous, sample.every(sampling(sample.shape))).flicker_percent
         if math.isfinite(flicker):
             stream.log(series.entity("compensated_flicker", self.task.units[0]), rr.Scalars(flicker))
 
@@ -170,8 +173,3 @@ class GroupLog:
             entity = path(self.task.scene.name, "map", self.task.backbone, backend)
             self._maps[backend] = MapLog(entity, self._classes, self.origin, len(self.task.indices))
         return self._maps[backend]
-
-
-def _sampling(shape: tuple[int, ...]) -> int:
-    """Every how many pixels a picture of that shape is sampled."""
-    return SAMPLING if max(shape) > IMAGE_SIDE // SAMPLING else 1

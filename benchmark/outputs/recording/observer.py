@@ -20,6 +20,7 @@ from semstab.backends import FusionBackend, GrowingMap
 from semstab.config import Config
 from semstab.engine.observer import Factory, Observer
 from semstab.engine.series import FrameRow
+from semstab.engine.tiling.partition import Part
 from semstab.engine.units import Plan, Planned, PlannedUnit
 from semstab.errors import ConfigError, one_line
 from semstab.metrics import dominant
@@ -34,6 +35,7 @@ from semstab.outputs.recording.camera import (
     CameraLog,
     label_context,
 )
+from semstab.outputs.recording.drift_parts import DriftParts
 from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.eye import Scenery
 from semstab.outputs.recording.group import GroupLog
@@ -86,6 +88,7 @@ class Recording(Observer):
         self._group: GroupLog | None = None  # the backbone on a scene that is being fused
         self._background: Background | None = None
         self._parts: Parts | None = None
+        self._drift = DriftParts(None if run is None else run / RECORDING_PARTS)
         self._cut = False  # whether there is no earlier recording that is whole
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
@@ -139,6 +142,18 @@ class Recording(Observer):
             self._group = GroupLog(task, self._plan.config.voxel_size, origin)
         self._group.see(stream, frame, background)
 
+    def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
+        """Follow the part's map: pictures of drift wait in the folder until the parts are all there."""
+        self._drift.start(task, config.voxel_size, part, backend)
+
+    def part_fused(self, frame: Frame) -> None:
+        """Keep the picture of its drift."""
+        self._drift.add(frame)
+
+    def part_finished(self) -> None:
+        """The part's pictures are all there."""
+        self._drift.finish()
+
     def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
         """Log the unit's series and voxels from the folder."""
         if self._parts is not None:  # all that is in the folder is logged at the end
@@ -147,6 +162,7 @@ class Recording(Observer):
         background.drain()
         self._kept.append((self._tasks[task.scene.name, task.backbone], [summary]))
         self._log_kept(stream)
+        self._log_drift(stream, task)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """Log the unit's voxels, while they are measured; the time is that of its last frame."""
@@ -210,7 +226,10 @@ class Recording(Observer):
             summaries = [run for run in result.runs if (run.unit.scene, run.unit.backbone) == place]
             if place not in logged and summaries:
                 self._kept.append((task, summaries))
-        self._opened()
+        stream, _ = self._opened()
+        for task in self._tasks.values():
+            self._log_drift(stream, task)
+        self._send_blueprint(stream, last=True)
         self.close()
         self.target = parts.merged(self.target)
 
@@ -225,9 +244,12 @@ class Recording(Observer):
 
     def close(self) -> None:
         """Write out what is pending and close the file; a second call does nothing."""
+        self._drift.end()
         stream, self._stream = self._stream, None
         if stream is None:
             return
+        if self._parts is None and not self.pictures_only:
+            self._drift.remove()
         try:
             if self._background is not None:
                 self._background.close()
@@ -292,7 +314,10 @@ class Recording(Observer):
             document = rr.TextDocument(looks_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
             stream.log(path(summary.unit.scene, "agreement", summary.unit.backbone), document, static=True)
 
-    def _send_blueprint(self, stream: rr.RecordingStream) -> None:
+    def _send_blueprint(self, stream: rr.RecordingStream, *, last: bool = False) -> None:
+        """Send the layout; into a part once: a merged file has layouts in no order, and the last one there is shown."""
+        if self._parts is not None and not last:
+            return
         layout = blueprint(self._plan, self._known)
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
         self._sent += 1
@@ -334,6 +359,14 @@ class Recording(Observer):
             if group is not None:
                 self._lay_out(stream, group, table)
 
+    def _log_drift(self, stream: rr.RecordingStream, task: Task) -> None:
+        """Log the pictures of drift that parts of a map in tiles have left."""
+        group: GroupLog | None = None
+        for picture in self._drift.pictures(task):
+            group = group or GroupLog(task, self._plan.config.voxel_size, self._origins[task.scene.name])
+            self._clock.set(stream, picture.frame, picture.timestamp)
+            group.log_drift(stream, picture)
+
     def _follow(self, stream: rr.RecordingStream, task: Task, *, log: bool) -> None:
         """Know where the camera was in frames that are not logged here, and log the track where nobody else does."""
         times, camera = task.scene.timestamps, self._cameras[task.scene.name]
@@ -363,7 +396,7 @@ class PictureRecording(Recording):
 
     def __init__(self, parts: Parts) -> None:
         super().__init__(parts.folder / "unknown.rrd")
-        self._parts_of = parts
+        self._parts_of, self._drift = parts, DriftParts(parts.folder)
 
     def group_started(self, task: Task, config: Config) -> None:
         """The job's backbone on a scene: it is all of this recording's plan."""

@@ -21,6 +21,9 @@ from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
 
+PIECE = 1 << 20
+"""Scores that are looked at together, about: each takes some 40 bytes meanwhile."""
+
 SIDE = 640
 """Of frames with more pixels on a side every n-th of each axis is looked at."""
 
@@ -71,13 +74,24 @@ class Sampler:
             (np.arange(H) - camera.cy) / camera.fy, fixed(frame.T_wc), self.voxel_size, self._origin, REACH,
             self._share, cell, drawn, pixel,
         )  # fmt: skip
-        entries_of = self._labels if frame.scores is None else self._scores
-        key, label, weight, first = entries_of(frame, cell[:n], pixel[:n])
-        when_seen = np.full(len(key), len(self._views) - 1, dtype=np.int32)
-        self._parts.append((key, when_seen, label.astype(np.uint16), weight, drawn[:n][first]))
-        self._entries += len(key)
-        while self._entries > self.budget:
-            self._halve()
+        for piece in self._pieces(frame, cell[:n]):
+            some = piece[drawn[piece] < self._share]  # less than before, where the pieces before it were too many
+            entries_of = self._labels if frame.scores is None else self._scores
+            key, label, weight, first = entries_of(frame, cell[some], pixel[some])
+            when_seen = np.full(len(key), len(self._views) - 1, dtype=np.int32)
+            self._parts.append((key, when_seen, label.astype(np.uint16), weight, drawn[some][first]))
+            self._entries += len(key)
+            while self._entries > self.budget:
+                self._halve()
+
+    def _pieces(self, frame: Frame, cell: Int64) -> list[Int64]:
+        """Pixels of whole cells, in their order, so few at a time that their scores take little memory."""
+        if frame.scores is None:
+            return [np.arange(len(cell))]
+        order = np.argsort(cell, kind="stable")
+        first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+        cuts = np.searchsorted(first, np.arange(PIECE // self.K, len(cell), max(1, PIECE // self.K)))
+        return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
 
     def sample(self) -> Sample:
         """What is there so far, as observations of the sampled voxels."""

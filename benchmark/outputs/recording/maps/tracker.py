@@ -10,14 +10,19 @@ import numpy.typing as npt
 from semstab.backends import GrowingMap
 from semstab.backends.numba_hash import NumbaHash
 from semstab.model.frames import Frame
+from semstab.model.voxels.extent import Extent
 from semstab.outputs.recording.kernels import find_voxels
 
 
 class Tracker:
     """Follows a map voxel by voxel: one of the run, which fuses each frame anyway, or else one of its own."""
 
-    def __init__(self, voxel_size: float, num_classes: int, of_the_run: GrowingMap | None = None) -> None:
-        self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if of_the_run is None else of_the_run
+    def __init__(
+        self, voxel_size: float, num_classes: int, of_the_run: GrowingMap | None = None, within: Extent | None = None
+    ) -> None:
+        self.map: GrowingMap = (
+            of_the_run if of_the_run is not None else NumbaHash(voxel_size, num_classes, within=within)
+        )
         """The map that is followed."""
         self._is_own = of_the_run is None
 
