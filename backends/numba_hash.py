@@ -136,7 +136,7 @@ class NumbaHash:
         self.changes = changes = Changes.room(row, seen.key)
         report = sums, changes.drift, changes.before, changes.after
         if isinstance(seen, ObservedScores):
-            dense_base = self._make_dense(seen, row)
+            dense_base = self._make_dense(seen, row, new)
             update_dense(
                 seen.key, seen.pixels, seen.row, seen.sums, seen.bounds, frame, row, slot, base, dense_base,
                 self._slots, self._records, self._nodes, self._dense, *report,
@@ -229,10 +229,11 @@ class NumbaHash:
         slots["key"][partition, at], slots["row"][partition, at] = keys[row], row
         return slots
 
-    def _make_dense(self, seen: ObservedScores, row: Int64) -> Int64:
+    def _make_dense(self, seen: ObservedScores, row: Int64, new: Int64) -> Int64:
         """Room for a dense row for each of the frame's voxels; where those of each partition begin."""
-        needed = np.zeros(PARTITIONS, dtype=np.int64)
-        count_rows(row, seen.bounds, self._records, needed)
+        needed = new.copy()
+        if self._dense_used < len(self):  # else only the frame's new voxels have none
+            count_rows(row, seen.bounds, self._records, needed)
         base = self._dense_used + np.concatenate([[0], np.cumsum(needed)])
         self._dense_used = int(base[-1])
         used, stride = self._dense_used, self._dense.shape[1]

@@ -76,7 +76,7 @@ def _touch_ahead(v, last, row, records, flat, stride, seen, seen_sums):
     later = max(row[min(v + AHEAD, last)], 0)
     touch(records, later)
     touch(records, later + 1)
-    soon = min(v + AHEAD // 4, last)
+    soon = min(v + AHEAD // 2, last)
     place = max(DENSE - np.int64(records[max(row[soon], 0)].next), 0) * stride
     for k in range(0, stride, 8):
         touch(seen_sums, seen[soon] + k)

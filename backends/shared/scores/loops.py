@@ -14,13 +14,13 @@ from semstab.backends.shared.hashing import PARTITIONS, mix, partition_of
 from semstab.backends.shared.pixels.pixel_keys import keep_columns, keys_of_row
 from semstab.backends.shared.pixels.run_vectors import runs_of_eight
 from semstab.backends.shared.prefetch import touch
-from semstab.backends.shared.scores.vectors import LANES, add_four, add_one, add_two, scale_eight
+from semstab.backends.shared.scores.vectors import LANES, add_two, scale_eight
 from semstab.runtime.compiled import parallel, serial
 
-ROWS, COLUMNS = 16, 128
-"""Pixels of a tile at most; its rows are those of a band."""
+ROWS, COLUMNS = 16, 512
+"""Pixels of a tile; its rows are those of a band."""
 
-TABLE_BITS = 11
+TABLE_BITS = 13
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
 
@@ -36,7 +36,7 @@ SOON = 8
 
 @parallel
 def sum_scores(
-    depth, labels, scores, ending, columns, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys,
+    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys,
     tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
@@ -46,7 +46,6 @@ def sum_scores(
     labels   (W,) 0 wherever there is depth: scores have no ignore id
     scores   (H * W * K,), see `vectors`
     ending   the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
-    columns  of a tile
     within   see `keep_columns`
     key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
     lost     (bands,) whether a pixel with depth is out of reach
@@ -55,7 +54,7 @@ def sum_scores(
     H, W = depth.shape
     stride = -(-K // LANES) * LANES
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
-    elsewhere = scores.shape[0] + (columns + LANES) * K - ending.shape[0]
+    elsewhere = scores.shape[0] + (COLUMNS + LANES) * K - ending.shape[0]
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
         keys, table = row_keys[thread], tables[thread]
@@ -70,8 +69,8 @@ def sum_scores(
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]
         n = np.int64(0)
-        for start in range(0, W, columns):
-            stop = min(W, start + columns)
+        for start in range(0, W, COLUMNS):
+            stop = min(W, start + COLUMNS)
             words = stretches[thread, 0, : -(-(stop - start) // LANES) * LANES + LANES]
             for v in range(first, last):
                 if n >= 0:
@@ -121,16 +120,10 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
                 n += 1
             e = np.int64(table_row[slot])
             count[e] += end - begin
-            while begin + 4 <= end:
-                add_four(scores, at + begin * K, K, scale, begin, sums, e * stride, fresh)
-                begin += 4
-                fresh = False
-            if begin + 2 <= end:
-                add_two(scores, at + begin * K, K, scale, begin, sums, e * stride, fresh)
+            while begin < end:
+                add_two(scores, at, K, scale, begin, end, sums, e * stride, fresh)
                 begin += 2
                 fresh = False
-            if begin < end:
-                add_one(scores, at + begin * K, K, scale, begin, sums, e * stride, fresh)
         begin = end
     return n
 

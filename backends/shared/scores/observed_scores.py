@@ -22,9 +22,6 @@ Int64 = npt.NDArray[np.int64]
 FIRST_ROOM = 1 << 12
 """Voxels that a band has room for at first."""
 
-STRETCH = 1 << 14
-"""Scores of a tile's row at most."""
-
 SAMPLE = 1 << 10
 """Voxels, about, that are looked at to tell whether a frame's voxels have most classes."""
 
@@ -53,9 +50,8 @@ class Scores:
         bands, threads = -(-H // ROWS), nb.get_num_threads()
         stride = -(-K // LANES) * LANES
         scores = _flat(frame.scores)
-        columns = min(COLUMNS, max(LANES, STRETCH // K // LANES * LANES))
-        room = (columns + LANES) * K
-        ending = fixed(np.concatenate([scores[-room:], np.zeros(room, dtype=scores.dtype)]))
+        behind = (COLUMNS + LANES) * K
+        ending = fixed(np.concatenate([scores[-behind:], np.zeros(behind, dtype=scores.dtype)]))
         while True:
             room = min(self._band_room, ROWS * W)
             key, count = space.room("key", bands * room), space.room("count", bands * room, dtype=np.int32)
@@ -63,7 +59,7 @@ class Scores:
             entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             sum_scores(
-                fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, columns, K, ray_x, ray_y,
+                fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, K, ray_x, ray_y,
                 fixed(frame.T_wc), self.voxel_size, origin, columns_of(None, origin), rays, margin, room,
                 space.room("keys", threads, ROWS, W), space.room("table", threads, 1 << TABLE_BITS),
                 space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32),

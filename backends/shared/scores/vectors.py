@@ -50,44 +50,43 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
     return types.void(scores, number, number, keys, scale, number), generate
 
 
-def _adding(pixels: int) -> Any:
-    """The function `add_scaled` for that many pixels."""
+@intrinsic
+def add_two(
+    _typing: Any, scores: Any, _at: Any, _K: Any, scale: Any, _u: Any, _end: Any, sums: Any, _to: Any, _fresh: Any
+) -> Any:
+    """add_two(scores, at, K, scale, u, end, sums, to, fresh): add u's scores and the next pixel's to their voxel.
 
-    def add_scaled(
-        _typing: Any, scores: Any, _at: Any, _K: Any, scale: Any, _u: Any, sums: Any, _to: Any, _fresh: Any
-    ) -> Any:
-        """add_scaled(scores, at, K, scale, u, sums, to, fresh): add pixels' scores, from scores[at] on, to their voxel.
+    sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
+    that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
 
-        sums[to : to + K] += scale[u] * scores[at : at + K] and so on, or = where `fresh`.
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
+    """
 
-        `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
-        """
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, at, K, _, u, end, _, to, fresh = arguments
+        pixels = [u, builder.add(u, INT(1))]
+        places = [builder.add(at, builder.mul(K, pixel)) for pixel in pixels]
+        counted = [builder.icmp_signed("<", pixel, end) for pixel in pixels]
+        scales = _data(context, builder, signature, arguments, 3)
+        factors = [
+            spread(builder, builder.select(counts, builder.load(builder.gep(scales, [pixel])), DOUBLE(0.0)), DOUBLES)
+            for pixel, counts in zip(pixels, counted, strict=True)
+        ]
+        row = builder.gep(_data(context, builder, signature, arguments, 6), [to])
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            array, at, K, _, u, _, to, fresh = arguments
-            places = [builder.add(at, builder.mul(K, INT(pixel))) for pixel in range(pixels)]
-            scales = builder.gep(_data(context, builder, signature, arguments, 3), [u])
-            factors = [spread(builder, builder.load(builder.gep(scales, [INT(i)])), DOUBLES) for i in range(pixels)]
-            row = builder.gep(_data(context, builder, signature, arguments, 5), [to])
+        def add(values: list[Any], k: Any) -> None:
+            place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
+            total = builder.select(fresh, ZEROS, builder.load(place, align=8))
+            for value, factor, counts in zip(values, factors, counted, strict=True):
+                scaled = builder.fmul(builder.select(counts, value, ZEROS), factor, flags=["contract"])
+                total = builder.fadd(total, scaled, flags=["contract"])
+            builder.store(total, place, align=8)
 
-            def add(values: list[Any], k: Any) -> None:
-                place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
-                total = builder.select(fresh, ZEROS, builder.load(place, align=8))
-                for value, factor in zip(values, factors, strict=True):
-                    scaled = builder.fmul(value, factor, flags=["contract"])
-                    total = builder.fadd(total, scaled, flags=["contract"])
-                builder.store(total, place, align=8)
+        _by_eights(context, builder, signature.args[0], array, places, K, add)
+        return context.get_dummy_value()
 
-            _by_eights(context, builder, signature.args[0], array, places, K, add)
-            return context.get_dummy_value()
-
-        number = types.intp
-        return types.void(scores, number, number, scale, number, sums, number, types.boolean), generate
-
-    return intrinsic(add_scaled)
-
-
-add_one, add_two, add_four = _adding(1), _adding(2), _adding(4)
+    number = types.intp
+    return types.void(scores, number, number, scale, number, number, sums, number, types.boolean), generate
 
 
 def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
