@@ -72,3 +72,6 @@ if [ "$installed" != "$wanted $extras" ] && [ "$installed" != "$wanted [dev]" ];
     echo "$wanted $extras" >.venv/semstab-setup
 fi
 link_folders
+
+# As pip does for what it copies: Python itself does not where PYTHONDONTWRITEBYTECODE is set, and each start would compile.
+.venv/bin/python -m compileall -q benchmark backends backbones datasets configs conformance

@@ -15,19 +15,27 @@ def environment(columns: int, **more: str) -> dict[str, str]:
     return {**os.environ, "COLUMNS": str(columns), "NO_COLOR": "1", **more}
 
 
-def command(words: Sequence[object], report: bool = False) -> list[str]:
-    """The command of these words; runs and studies draw no report unless a test looks at it: most of their time."""
+def command(words: Sequence[object], report: bool = False, recording: bool = False) -> list[str]:
+    """The command of these words; runs and studies draw and record nothing unless a test looks: most of their time."""
+    said = {*map(str, words)}
     fuses = bool(words) and (str(words[0]) in ("run", "study") or str(words[0]).startswith("-"))
-    plain = fuses and not report and not {"--report", "--help", "--version"}.intersection(map(str, words))
-    return [COMMAND, *map(str, words), *(("--report", "off") if plain else ())]
+    fuses = fuses and not {"--help", "--version"} & said
+    off = [name for name, wanted in (("--report", report), ("--rerun", recording)) if not wanted and name not in said]
+    return [COMMAND, *map(str, words), *(word for name in off if fuses for word in (name, "off"))]
 
 
 def bench(
-    *words: object, cwd: Path, code: int = 0, columns: int = 160, report: bool = False, **more: str
+    *words: object,
+    cwd: Path,
+    code: int = 0,
+    columns: int = 160,
+    report: bool = False,
+    recording: bool = False,
+    **more: str,
 ) -> subprocess.CompletedProcess[str]:
     """What it did, in a terminal of so many columns; it ends with this code. `more` is of its environment."""
     done = subprocess.run(
-        command(words, report),
+        command(words, report, recording),
         cwd=cwd, env=environment(columns, **more), capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == code, done.stderr

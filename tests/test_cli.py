@@ -55,7 +55,9 @@ def test_list_names_what_there_is(tmp_path) -> None:
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:
-    result = bench("--backend", "open3d", "--data", wall, "--voxel-size", "0.25", "--out", "run", cwd=tmp_path)
+    result = bench(
+        "--backend", "open3d", "--data", wall, "--voxel-size", "0.25", "--out", "run", cwd=tmp_path, recording=True
+    )
     for word in (
         "wall",
         "OP=1",

@@ -99,7 +99,7 @@ def test_a_run_in_several_processes_is_the_same_run(root, tmp_path) -> None:
 
 def test_the_command_takes_jobs_and_says_what_does_not_go_together(root, tmp_path) -> None:
     data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--report", "off")
-    bench(*data, "--jobs", "2", "--out", "run", "-q", cwd=tmp_path)
+    bench(*data, "--jobs", "2", "--out", "run", "-q", cwd=tmp_path, recording=True)
     assert (tmp_path / "run/recording.rrd").exists()
     assert not (tmp_path / "run/recording").exists()
     refused = bench(*data, "--jobs", "2", "--rerun", "spawn", "--out", "live", cwd=tmp_path, code=2)

@@ -203,13 +203,13 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
 
 def _with_p_value(found: Interval) -> Interval:
     """That the number is 0, by its interval."""
-    from scipy import stats
+    from scipy import special
 
     error = standard_error(found)
     if not error > 0:
         return found
     degrees = found.degrees if found.degrees > 0 else math.inf
-    return dataclasses.replace(found, p_value=float(2 * stats.t.sf(abs(found.value) / error, degrees)))
+    return dataclasses.replace(found, p_value=float(2 * special.stdtr(degrees, -abs(found.value) / error)))
 
 
 # --- By class ---------------------------------------------------------------------------------------------------------

@@ -159,7 +159,7 @@ class Evidence(NDArrayOperatorsMixin):
     def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
         """Dense rows from the first to before the last."""
         starts = self.starts[first : (len(self) if last is None else max(first, last)) + 1]
-        dense = np.zeros((len(starts) - 1, self.K))
+        dense = np.zeros((self.K, len(starts) - 1)).T  # class by class: what is summed over classes is so many vectors
         entries = slice(starts[0], starts[-1])
         dense[np.repeat(np.arange(len(dense)), np.diff(starts)), self.label[entries]] = self.weight[entries]
         return dense

@@ -30,6 +30,16 @@ def added(key: Int64, weight: Float64) -> tuple[Int64, Float64]:
     return found.astype(np.int64), np.bincount(of, weights=weight, minlength=len(found)).astype(np.float64)
 
 
+def numbered(values: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
+    """The distinct values, ascending, and which of them each is: np.unique, by a table where they are dense."""
+    if not len(values) or values.min() < 0 or values.max() >= SPARSE * len(values):
+        found, of = np.unique(values, return_inverse=True)
+        return found.astype(np.int64), of.astype(np.int64)
+    there = np.zeros(int(values.max()) + 1, np.bool_)
+    there[values] = True
+    return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
+
+
 def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
     """Each row of whole numbers (n, C) once, ascending, and which of them each is: np.unique by one number a row."""
     low = rows.min(axis=0, initial=0).astype(np.int64)

@@ -1,30 +1,47 @@
-"""CPU time of the statistics beside that of the fusion whose log they read, and the memory that both take.
+"""CPU time of the statistics beside that of the loop whose log they read, and the memory that both take.
 
     python tests/perf/bench_statistics.py [--frames 200] [--size 640x480] [--voxel-size 0.05] [--classes 7] [--rooms 1]
+    python tests/perf/bench_statistics.py --flight --frames 50 --voxel-size 0.2
 
 A camera walks round a furnished room and sees each place again and again (room.py); with --rooms it goes on to the next
-one. Time is user and system time of all threads; compiled code is loaded before. Memory is the most that the process
-took since the step before, above what it took with its modules loaded.
+one; with --flight it flies over a field and sees most places twice (flight.py). The frames are read from PNG, as the
+loop of a run does, whose other parts are flicker and fusion. Time is user and system time of all threads; compiled code
+is loaded before. Memory is the most that the process took since the step before, above what it took with its modules
+loaded.
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
+import sys
+import tempfile
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import flight
+import numpy as np
 import room
 
-from semstab import statistics
+from semstab import Frame, statistics
 from semstab.backends import create
-from semstab.metrics import summarise
+from semstab.datasets import open_dataset
+from semstab.metrics import flicker_percent, summarise
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.files import write_json
+from semstab.statistics.order.fusion_rules import fuse_all
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from posed_writer import write_posed
 
 PAGE = resource.getpagesize()
+LEG, BESIDE, STEP = 10, 40.0, 30.0
+UNITS = 500  # of depth in a metre
+LOOP = ("reading", "flicker", "fusion")
 
 
 class Watch:
@@ -65,12 +82,37 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def fused(watch: Watch, frames: int, size: tuple[int, int], voxel_size: float, K: int, rooms: int) -> Any:
-    """The map of the walk, with its history."""
+def walked(frames: int, size: tuple[int, int], K: int, rooms: int) -> list[Frame]:
+    """Frames of the walk."""
+    return [room.frame(index, *size, K=K, step=frames // rooms) for index in range(frames)]
+
+
+def flown(frames: int, size: tuple[int, int], K: int) -> list[Frame]:
+    """Frames of the flight, to and fro."""
+    legs = [divmod(index, LEG) for index in range(frames)]
+    places = [(BESIDE * leg, STEP * (LEG - 1 - along if leg % 2 else along)) for leg, along in legs]
+    return [flight.frame(index, *size, K, place) for index, place in enumerate(places)]
+
+
+def written(folder: Path, frames: list[Frame], K: int) -> Path:
+    """The frames as PNGs in a folder."""
+    frames = [replace(frame, depth=(np.round(frame.depth * UNITS) / UNITS).astype(np.float32)) for frame in frames]
+    names, classes = [f"{frame.index:05d}" for frame in frames], [f"class{k}" for k in range(K)]
+    write_posed(folder / "scene", names, {"a": frames}, scale=UNITS, classes=classes)
+    return folder
+
+
+def fused(watch: Watch, folder: Path, voxel_size: float, K: int) -> Any:
+    """The map of the frames of a folder, with its history."""
     fusion = create("numba", voxel_size=voxel_size, num_classes=K, history=True)
-    for index in range(frames):
-        frame = room.frame(index, *size, K=K, step=frames // rooms)
+    scene = open_dataset("posed_folder", {"root": str(folder)}).scene("scene")
+    before = None
+    for index in range(len(scene)):
+        frame = watch("reading", lambda index=index: scene.frame(index, "a"))
+        if before is not None:
+            watch("flicker", lambda one=before, other=frame: flicker_percent(one, other))
         watch("fusion", lambda frame=frame: fusion.integrate(frame))
+        before = frame
     return fusion
 
 
@@ -80,7 +122,7 @@ def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
     return {
         "drift of each voxel": lambda: statistics.voxel_drift(table, events),
         "drift of the scene": lambda: statistics.scene_drift(table, events, drift),
-        "fusion rules": lambda: [statistics.fuse(events, rule) for rule in statistics.RULES],
+        "fusion rules": lambda: fuse_all(events, statistics.RULES, evidence=table.evidence),
         "flips": lambda: statistics.flips(events),
         "agreement by class": lambda: statistics.class_agreement(table, events),
     }
@@ -89,11 +131,15 @@ def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Seconds and bytes of each step, with the number of voxels and observations."""
     width, height = (int(side) for side in arguments.size.split("x"))
-    K, walk = arguments.classes, (arguments.voxel_size, arguments.classes, arguments.rooms)
-    warm = fused(Watch(), 8, (96, 72), 0.2, K, 1)
-    statistics.describe(warm.table(), warm.events(), warm.table())
-    watch = Watch()
-    fusion = fused(watch, arguments.frames, (width, height), *walk)
+    K, size = arguments.classes, (width, height)
+    with tempfile.TemporaryDirectory() as there:
+        few = flown(8, (96, 72), K) if arguments.flight else walked(8, (96, 72), K, 1)
+        warm = fused(Watch(), written(Path(there) / "few", few, K), 4 * arguments.voxel_size, K)
+        statistics.describe(warm.table(), warm.events(), warm.table())
+        count, rooms = arguments.frames, arguments.rooms
+        folder = written(Path(there), flown(count, size, K) if arguments.flight else walked(count, size, K, rooms), K)
+        watch = Watch()
+        fusion = fused(watch, folder, arguments.voxel_size, K)
     table = watch("table", fusion.table)
     watch("summary", lambda: summarise(table))
     events = watch("log", fusion.events)
@@ -113,13 +159,15 @@ def main() -> None:
     parser.add_argument("--voxel-size", type=float, default=0.05, help="metres")
     parser.add_argument("--classes", type=int, default=7)
     parser.add_argument("--rooms", type=int, default=1)
+    parser.add_argument("--flight", action="store_true")
     arguments = parser.parse_args()
     found = measure(arguments)
     n, m, fusion = found["voxels"], found["observations"], found["seconds"]["fusion"]
+    loop = sum(found["seconds"][name] for name in LOOP)
     print(f"{found['frames']} frames, {m:,} observations of {n:,} voxels ({m / n:.1f} looks each), K = {found['K']}")
-    print(f"{'step':<24}{'CPU s':>9}{'us/observation':>16}{'of fusion':>11}{'peak bytes/voxel':>18}")
+    print(f"{'step':<24}{'CPU s':>9}{'us/observation':>16}{'of fusion':>11}{'of loop':>9}{'peak bytes/voxel':>18}")
     for name, seconds in found["seconds"].items():
-        row = f"{name:<24}{seconds:9.2f}{1e6 * seconds / m:16.3f}{seconds / fusion:11.2f}"
+        row = f"{name:<24}{seconds:9.2f}{1e6 * seconds / m:16.3f}{seconds / fusion:11.2f}{seconds / loop:9.2f}"
         print(f"{row}{found['peak'][name] / n:18,.0f}")
     if arguments.json:
         write_json(arguments.json, found)

@@ -229,12 +229,12 @@ def _of_few(sums: Float64, error: float) -> tuple[float, float]:
 
     Cubes, of one size, count as right or wrong as a whole (Clopper and Pearson 1934).
     """
-    from scipy import stats
+    from scipy import special
 
     right, size = sums.sum(axis=0)
     cubes = size**2 / float((sums[:, 1] ** 2).sum())
     wrong = max(np.count_nonzero(sums[:, 0] < sums[:, 1]), cubes * (1 - right / size))
-    low = float(stats.beta.ppf(error, cubes - wrong, wrong + 1)) if cubes > wrong else 0.0
+    low = float(special.betaincinv(cubes - wrong, wrong + 1, error)) if cubes > wrong else 0.0
     return float(right / size), low
 
 

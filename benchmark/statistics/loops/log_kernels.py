@@ -25,7 +25,10 @@ def count_flips(chunk, starts, frame, log, K, changes, differing, since):
 
     starts (n + 1,) bounds its observations. since is left as it is where the class never changed.
     """
-    votes = np.zeros(K, np.int64)
+    votes, longest = np.zeros(K, np.int64), 0
+    for i in range(chunk, changes.shape[0], CHUNKS):
+        longest = max(longest, starts[i + 1] - starts[i])
+    voted = np.empty(longest, np.int64)
     for i in range(chunk, changes.shape[0], CHUNKS):
         before, last, same = np.int64(-1), np.int64(-1), np.int64(0)
         for row in range(starts[i], starts[i + 1]):
@@ -35,13 +38,13 @@ def count_flips(chunk, starts, frame, log, K, changes, differing, since):
                 last = row
             same += votes[k]
             votes[k] += 1
-            before = k
+            before = voted[row - starts[i]] = k
         T = starts[i + 1] - starts[i]
         differing[i] = T * (T - 1) // 2 - same
         if last >= 0:
             since[i] = frame[starts[i + 1] - 1] - frame[last]
-        for row in range(starts[i], starts[i + 1]):
-            votes[argmax(log, row)] = 0
+        for t in range(T):
+            votes[voted[t]] = 0
 
 
 @serial

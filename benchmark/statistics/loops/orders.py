@@ -20,6 +20,12 @@ ENUMERATED = 5
 LANES = 128
 """Orders that go side by side, at most."""
 
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+"""What the states of splitmix64 are apart."""
+
+TURNS = 8
+"""A random order begins at so many places, as far apart as can be, and goes round: what comes first differs."""
+
 ROUNDING = 1e-9
 """Sums of the same terms in another order differ by less."""
 
@@ -32,22 +38,22 @@ def drifts(x, A, T, order, lanes, work, drift):
     """The sum of drifts, bits, in each of `lanes` orders, to drift (LANES,).
 
     x (A, T) are the observations, order (T, LANES) the number of the observation that comes at each step; work space is
-    (A + 1, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
+    (2 A, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
     each belief but the first and last is one after, then one before.
     """
-    work[: A + 1, :lanes] = 0.0
+    work[:A, :lanes] = 0.0
     drift[:lanes] = 0.0
-    share = work[A]
     for t in range(T):
         whole = 0.5 if t == 0 or t == T - 1 else 1.0
         mixed = 1.0 if t > 0 else 0.0
         before, after = 1.0 / max(t, 1), 1.0 / (t + 1)
+        for a in range(A):  # well before they are read: what was stored as numbers is not at hand as a vector
+            for lane in range(lanes):
+                work[A + a, lane] = x[a, order[t, lane]]
         for a in range(A):
             for lane in range(lanes):
-                share[lane] = x[a, order[t, lane]]
-            for lane in range(lanes):
                 n = work[a, lane]
-                more = n + share[lane]
+                more = n + work[A + a, lane]
                 work[a, lane] = more
                 p, q = n * before, more * after
                 drift[lane] += whole * plogp_fast(q) - mixed * plogp_fast(0.5 * (p + q))
@@ -99,7 +105,7 @@ def room(T, entries, K):
     longest, classes = 1, max(1, min(K, entries))
     for i in range(T.shape[0]):
         longest = max(longest, T[i])
-    x, work, number = np.empty((classes, longest)), np.empty((classes + 1, LANES)), np.full(K, -1)
+    x, work, number = np.empty((classes, longest)), np.empty((2 * classes, LANES)), np.full(K, -1)
     return x, work, number, np.empty((longest, LANES), np.int64), np.empty((longest, LANES)), np.empty(LANES)
 
 
@@ -119,7 +125,7 @@ def draw_streams(index, seed, streams):
 @serial
 def _below(state, n):
     """A random integer in [0, n) from the stream (splitmix64) whose state (1,) it moves on."""
-    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    state[0] += GOLDEN
     return np.int64(((mix(state[0]) >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32))
 
 
@@ -133,12 +139,17 @@ def _shuffle(order, T, state):
 
 
 @serial
-def _draw_orders(order, age, T, lanes, state):
-    """Random orders (T, lanes), and t - mean t of each observation in random orders: the inverse of one is one."""
-    for lane in range(lanes):
-        _shuffle(order[:, lane], T, state)
+def _draw_orders(order, age, T, seed, other):
+    """Random orders (T, LANES), and t - mean t of each observation in random orders: the inverse of one is one."""
     for t in range(T):
-        for lane in range(lanes):
+        for lane in range(LANES):
+            drawn = mix(seed + np.uint64(t * LANES + lane) * GOLDEN) >> np.uint64(32)
+            other[lane] = np.int64((drawn * np.uint64(t + 1)) >> np.uint64(32))
+        for lane in range(LANES):
+            order[t, lane] = order[other[lane], lane]
+            order[other[lane], lane] = t
+    for t in range(T):
+        for lane in range(LANES):
             age[t, lane] = order[t, lane] - 0.5 * (T - 1)
 
 
@@ -201,16 +212,36 @@ def _trend(x, A, T, at):
 
 
 @serial
-def _tail(hits, tried, extreme, lanes, enough):
-    """The p-value, NaN until there are `enough` hits, and the hits, after `lanes` more orders.
+def _tail(hits, tried, value, least, lanes, enough):
+    """The p-value, NaN until there are `enough` hits, and the hits, values >= least, after `lanes` more orders.
 
     Enough of them settle it: as the share of the orders until then (Besag and Clifford 1991, Biometrika 78).
     """
+    more = 0
     for lane in range(lanes):
-        hits += 1 if extreme[lane] else 0
-        if hits == enough:
-            return enough / (tried + lane + 1), hits
-    return np.nan, hits
+        more += value[lane] >= least
+    if hits + more < enough:
+        return np.nan, hits + more
+    lane = -1
+    while hits < enough:
+        lane += 1
+        hits += value[lane] >= least
+    return enough / (tried + lane + 1), hits
+
+
+@serial
+def _mean_drift(x, A, log, first, T, number, at, own, turned, draws, work, value):
+    """The mean sum of drifts over turns of the order in which x has the observations, and of further random ones."""
+    total = 0.0
+    for drawn in range(0, draws, TURNS):
+        if drawn:
+            _shuffle(at, T, own)
+            dense(log, first, T, number, at, x)
+        lanes = min(TURNS, draws - drawn)
+        drifts(x, A, T, turned, lanes, work, value)
+        for lane in range(lanes):
+            total += value[lane]
+    return total / draws
 
 
 @serial
@@ -220,11 +251,13 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
     rank (n,) sorts the voxels by OP; first, T (n,) are their rows of the log, seeds (n,) their random streams, and
     `entries` is the most that one has. Where T <= ENUMERATED all orders are gone through: null (n,) takes their mean
     sum of drifts, p (n, 3) the share of those with a sum as low, one as high, a trend as high. Else null is the mean
-    of `draws` random orders, unless it is `known` (n,), and p[:, 2] comes from random orders until `enough` of them
-    have a trend as high, or from the `most` that there are. trend (n,) takes what was seen.
+    of `draws` random orders, TURNS of which are turns of one, unless it is `known` (n,), and p[:, 2] comes from random
+    orders until `enough` of them have a trend as high, or from the `most` that there are. trend (n,) takes what was
+    seen.
     """
     x, work, number, order, age, value = room(T, entries, K)
-    at, own, state = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(1, np.uint64)
+    at, own, other = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(LANES, np.int64)
+    turned = np.empty((x.shape[1], TURNS), np.int64)
     for voxels in _groups(chunk, rank, T):
         steps = T[voxels[0]]
         if steps <= ENUMERATED:
@@ -241,32 +274,31 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
                 trend[i] = _trend(x, A, steps, at)
                 p[i, 2] = (value[:lanes] >= trend[i] - ROUNDING * (1.0 + trend[i])).mean()
             continue
-        state[0], left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
+        base, left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
         hits = np.zeros(left, np.int64)
+        for t in range(steps):
+            for turn in range(TURNS):
+                turned[t, turn] = (t + turn * steps // TURNS) % steps
         while left:
-            lanes = min(LANES, most - tried) if tried < most else 0
-            _draw_orders(order, age, steps, LANES, state)
+            lanes = min(LANES, most - tried)
+            _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
             open_ = 0
             for j in range(left):
                 i = voxels[j]
                 _own_order(at, steps, seeds[i], own)
                 A = dense(log, first[i], steps, number, at, x)
                 if tried == 0:
-                    trend[i], p[i, 2] = _trend(x, A, steps, at), np.nan
-                if tried < draws and not known[i]:
-                    some = min(LANES, draws - tried)
-                    drifts(x, A, steps, order, some, work, value)
-                    null[i] += value[:some].sum() / draws
+                    trend[i] = _trend(x, A, steps, at)
+                trends(x, A, steps, age, lanes, work, value)
+                least = trend[i] - ROUNDING * (1.0 + trend[i])
+                p[i, 2], hits[j] = _tail(hits[j], tried, value, least, lanes, enough)
                 if np.isnan(p[i, 2]):
-                    trends(x, A, steps, age, lanes, work, value)
-                    extreme = value >= trend[i] - ROUNDING * (1.0 + trend[i])
-                    p[i, 2], hits[j] = _tail(hits[j], tried, extreme, lanes, enough)
-                    if np.isnan(p[i, 2]) and tried + lanes >= most:
-                        p[i, 2] = (hits[j] + 1) / (most + 1)
-                if np.isnan(p[i, 2]) or (tried + LANES < draws and not known[i]):
+                    p[i, 2] = (hits[j] + 1) / (tried + lanes + 1)
                     voxels[open_], hits[open_] = i, hits[j]
                     open_ += 1
-            left, tried = open_, tried + LANES
+                if tried == 0 and not known[i]:
+                    null[i] = _mean_drift(x, A, log, first[i], steps, number, at, own, turned, draws, work, value)
+            left, tried = open_ if tried + lanes < most else 0, tried + lanes
 
 
 @serial
@@ -276,15 +308,15 @@ def test_drifts(chunk, rank, first, T, log, K, entries, seeds, seed, most, enoug
     Each tail is settled by `enough` orders, and the smaller one counts twice.
     """
     x, work, number, order, age, value = room(T, entries, K)
-    at, own, state = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(1, np.uint64)
+    at, own, other = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(LANES, np.int64)
     for voxels in _groups(chunk, rank, T):
         steps = T[voxels[0]]
-        state[0], left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
+        base, left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
         hits, tails, seen = np.zeros((left, 2), np.int64), np.full((left, 2), np.nan), np.empty(left)
         number_of = np.arange(left)
         while left:
             lanes = min(LANES // 2, most - tried)
-            _draw_orders(order, age, steps, lanes, state)
+            _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
             open_ = 0
             for j in number_of[:left]:
                 i = voxels[j]
@@ -295,9 +327,11 @@ def test_drifts(chunk, rank, first, T, log, K, entries, seeds, seed, most, enoug
                     seen[j] = value[0]
                 drifts(x, A, steps, order, lanes, work, value)
                 for side in range(2):
+                    if side:
+                        value[:lanes] = -value[:lanes]
                     if np.isnan(tails[j, side]):
-                        extreme = value <= seen[j] + ROUNDING if side == 0 else value >= seen[j] - ROUNDING
-                        tails[j, side], hits[j, side] = _tail(hits[j, side], tried, extreme, lanes, enough)
+                        least = (-seen[j] if side else seen[j]) - ROUNDING
+                        tails[j, side], hits[j, side] = _tail(hits[j, side], tried, value, least, lanes, enough)
                         if np.isnan(tails[j, side]) and tried + lanes >= most:
                             tails[j, side] = (hits[j, side] + 1) / (most + 1)
                 p[i] = min(1.0, 2.0 * tails[j].min())

@@ -15,6 +15,7 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
+from semstab.statistics.ranks import numbered, ranked
 from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
@@ -81,7 +82,7 @@ def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float
     at, of = cells_of(index[again], events.voxel_size, edge)
     K = int(events.evidence.shape[1])
     step = _step(events.frame, K)
-    frames, group = np.unique(events.frame // step, return_inverse=True)
+    frames, group = numbered(events.frame // step)
     sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
@@ -185,7 +186,7 @@ def _distinct(cells: Int64) -> Int64:
 
 
 def _step(frame: npt.NDArray[np.int32], K: int) -> int:
-    step, distinct = 1, np.unique(frame)
+    step, distinct = 1, numbered(frame)[0]
     while len(distinct) > most_groups(K):
         step, distinct = 2 * step, np.unique(distinct // 2)
     return step
@@ -209,7 +210,7 @@ def _sums_of_log(
 
     K = int(events.evidence.shape[1])
     sums = np.zeros((cells, groups, width(K, truth=true_label is not None)))
-    order = again[np.argsort(of, kind="stable")]
+    order = again[ranked(of)]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
     truth = np.full(len(op), -1) if true_label is None else true_label
     options = (K <= MOST_CLASSES, true_label is not None)
@@ -225,7 +226,8 @@ def _sums_of_log(
         truth,
         likely,
         *options,
-        sums,
+        groups,
+        sums.reshape(cells * groups, sums.shape[2]),
     )
     return sums
 

@@ -136,11 +136,11 @@ class TwoWay:
 
     def half(self, level: float) -> float:
         """Half the width of the interval."""
-        from scipy import stats
+        from scipy import special
 
         if not self.degrees > 0:
             return math.nan
-        return float(stats.t.ppf((1 + level) / 2, self.degrees)) * math.sqrt(self.total)
+        return float(special.stdtrit(self.degrees, (1 + level) / 2)) * math.sqrt(self.total)
 
 
 NO_FRAMES = Spread(0.0, math.inf, 1.0)

@@ -198,16 +198,16 @@ def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
 
 def _share_ends(p: float, spread: TwoWay, units: int, level: float) -> tuple[float, float]:
     """Of a share, or of a mean of numbers from 0 to 1, by the looks that it is worth (Korn and Graubard 1998)."""
-    from scipy import stats
+    from scipy import special
 
     p = min(max(p, 0.0), 1.0)
     looks: float = units
     if spread.total > TINY and 0 < p < 1:
-        quantile = stats.t.ppf((1 + level) / 2, [max(units - 1, 1), spread.degrees])
+        quantile = special.stdtrit([max(units - 1, 1), spread.degrees], (1 + level) / 2)
         looks = p * (1 - p) / spread.total * (quantile[0] / quantile[1]) ** 2
     tail, hits = (1 - level) / 2, looks * p
-    low = stats.beta.ppf(tail, hits, looks - hits + 1) if hits > 0 else 0.0
-    high = stats.beta.ppf(1 - tail, hits + 1, looks - hits) if hits < looks else 1.0
+    low = special.betaincinv(hits, looks - hits + 1, tail) if hits > 0 else 0.0
+    high = special.betaincinv(hits + 1, looks - hits, 1 - tail) if hits < looks else 1.0
     return float(low), float(high)
 
 
@@ -224,11 +224,11 @@ def _ends(found: float, spread: TwoWay, unseen: float, scale: Scale, level: floa
 
 def _p_value(found: float, spread: TwoWay) -> float:
     """That a number of that spread is 0, two-sided, by Student's t."""
-    from scipy import stats
+    from scipy import special
 
     if spread.total <= TINY:
         return math.nan
-    return float(2 * stats.t.sf(abs(found) / math.sqrt(spread.total), spread.degrees))
+    return float(2 * special.stdtr(spread.degrees, -abs(found) / math.sqrt(spread.total)))
 
 
 def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay, question: Question) -> Interval:
@@ -278,13 +278,13 @@ def _combined(
     value: float, low: float, high: float, parts: Sequence[Interval], weight: float, level: float
 ) -> Interval:
     """The p-value by the variances that the parts' intervals stand for, each with its degrees of freedom."""
-    from scipy import stats
+    from scipy import special
 
     variances = [(weight * standard_error(own, level)) ** 2 for own in parts]
     spread = sum(v**2 / own.degrees for v, own in zip(variances, parts, strict=True) if v > 0 and own.degrees > 0)
     total = sum(variances)
     degrees = max(total**2 / spread, 1.0) if spread > 0 else math.inf
-    p = float(2 * stats.t.sf(abs(value) / math.sqrt(total), degrees)) if total > 0 else math.nan
+    p = float(2 * special.stdtr(degrees, -abs(value) / math.sqrt(total))) if total > 0 else math.nan
     questions = {own.question for own in parts}
     return Interval(
         value,
@@ -302,8 +302,8 @@ def _combined(
 
 def standard_error(found: Interval, level: float = LEVEL) -> float:
     """That which an interval by Student's t stands for."""
-    from scipy import stats
+    from scipy import special
 
     if not found.degrees > 0:
-        return (found.high - found.low) / 2 / float(stats.norm.ppf((1 + level) / 2))
-    return (found.high - found.low) / 2 / float(stats.t.ppf((1 + level) / 2, found.degrees))
+        return (found.high - found.low) / 2 / float(special.ndtri((1 + level) / 2))
+    return (found.high - found.low) / 2 / float(special.stdtrit(found.degrees, (1 + level) / 2))

@@ -76,7 +76,7 @@ def _label_without(total, row, active, A):
 
 
 @serial
-def _add_truth(out, rows, first, T, group, truth, likely, total, active, A, without, mean, column, K):
+def _add_truth(sums, base, rows, first, T, group, truth, likely, total, active, A, without, mean, column, K):
     """What is right: of the fused label by leaving a frame out, of each look by itself; mean (K,) is room."""
     label = _label(total, active, A)
     right = 1.0 if label == truth else 0.0
@@ -87,26 +87,26 @@ def _add_truth(out, rows, first, T, group, truth, likely, total, active, A, with
         without[t] = _label_without(total, rows[t], active, A)
         mean[without[t]] += 1.0 / T
     for t in range(T):
-        sums = out[group[first + t]]
+        r = base + group[first + t]
         own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) / T
-        sums[column + KNOWN] += 1.0 / T
-        sums[column + RIGHT] += own
-        sums[column + LOOKS] += 1.0
-        sums[column + LOOKS_RIGHT] += rows[t, truth]
+        sums[r, column + KNOWN] += 1.0 / T
+        sums[r, column + RIGHT] += own
+        sums[r, column + LOOKS] += 1.0
+        sums[r, column + LOOKS_RIGHT] += rows[t, truth]
         if T > 2:
-            sums[column + STABLE] += likely / T
-            sums[column + STABLE_WRONG] += likely * (1.0 - right) / T
+            sums[r, column + STABLE] += likely / T
+            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) / T
         if K:
-            sums[column + 6 + truth] += 1.0 / T
-            sums[column + 6 + K + truth] += own
+            sums[r, column + 6 + truth] += 1.0 / T
+            sums[r, column + 6 + K + truth] += own
             for j in range(A):
                 k = active[j]
-                sums[column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) / T
+                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) / T
 
 
 @serial
-def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likely, by_class, with_truth, sums):
-    """Add the observations of the voxels with T >= 2 to `sums` (cells, groups, C).
+def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likely, by_class, with_truth, groups, sums):
+    """Add the observations of the voxels with T >= 2 to `sums` (cells * groups, C).
 
     order (n,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts, op (n,) are a voxel's rows
     of the log and of group (m,), truth (n,) its true class or -1, likely (n,) how likely it is
@@ -119,11 +119,12 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
     rows = np.zeros((longest, K))
     total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
     own, without, mean = np.empty(longest), np.empty(longest, np.int64), np.empty(K)
+    surprise, apart = np.empty(K), np.empty(K)
     scale = 1.0 / np.log(K)
     first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
-        out = sums[cell]
-        for i in order[bounds[cell] : bounds[cell + 1]]:
+        for at in range(bounds[cell], bounds[cell + 1]):
+            i = order[at]
             first, T = starts[i], op[i]
             if T < 2:
                 continue
@@ -131,42 +132,43 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
             best = _label(total, active, A)
             agreed = 0.0
             for j in range(A):
-                agreed += total[active[j]] ** 2 - squares[active[j]]
+                k = active[j]
+                pairs = total[k] ** 2 - squares[k]
+                agreed += pairs
+                surprise[k] = -np.log(total[k] / T) * scale / T if total[k] > 0.0 else 0.0
+                apart[k] = 2.0 * (total[k] / T - pairs / (T * (T - 1.0)))
             agreed /= T * (T - 1.0)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             for t in range(T):
-                s, add = rows[t], out[group[first + t]]
-                with_others = surprise = 0.0
+                r = cell * groups + group[first + t]
+                with_others = surprised = 0.0
                 for j in range(A):
                     k = active[j]
-                    with_others += s[k] * total[k]
-                    add[ENTROPY + 1 + k] += s[k]
-                    if s[k] > 0.0:
-                        surprise -= s[k] * np.log(total[k] / T)
+                    s = rows[t, k]
+                    with_others += s * total[k]
+                    sums[r, ENTROPY + 1 + k] += s
+                    surprised += s * surprise[k]
+                    if by_class:
+                        others = (total[k] - s) / (T - 1.0)
+                        differs = s + others - 2.0 * s * others
+                        sums[r, ENTROPY + 1 + K + k] += apart[k] + spread * (differs - apart[k])
+                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2
                 share = agreed + spread * ((with_others - own[t]) / (T - 1.0) - agreed)
-                add[VOXELS] += 1.0 / T
-                add[PSA] += share / T
-                add[OBSERVATIONS] += 1.0
-                add[AGREEING] += share
-                add[OWN] += own[t]
-                add[ENTROPY] += surprise * scale / T
+                sums[r, VOXELS] += 1.0 / T
+                sums[r, PSA] += share / T
+                sums[r, OBSERVATIONS] += 1.0
+                sums[r, AGREEING] += share
+                sums[r, OWN] += own[t]
+                sums[r, ENTROPY] += surprised
                 if T == 2:
-                    add[TWICE] += 1.0
-                    add[TWICE_AGREEING] += agreed
+                    sums[r, TWICE] += 1.0
+                    sums[r, TWICE_AGREEING] += agreed
                 else:
-                    add[RECURRENT] += 1.0 / T
-                    add[VSS] += s[best] / T
-                if by_class:
-                    for j in range(A):
-                        k = active[j]
-                        others = (total[k] - s[k]) / (T - 1.0)
-                        apart = 2.0 * (total[k] / T - (total[k] ** 2 - squares[k]) / (T * (T - 1.0)))
-                        differs = s[k] + others - 2.0 * s[k] * others
-                        add[ENTROPY + 1 + K + k] += apart + spread * (differs - apart)
-                        add[ENTROPY + 1 + 2 * K + k] += s[k] ** 2
+                    sums[r, RECURRENT] += 1.0 / T
+                    sums[r, VSS] += rows[t, best] / T
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    out, rows, first, T, group, truth[i], likely[i], total, active, A, without, mean,
+                    sums, cell * groups, rows, first, T, group, truth[i], likely[i], total, active, A, without, mean,
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
             _cleared(log, first, T, rows)

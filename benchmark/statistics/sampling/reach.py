@@ -35,6 +35,9 @@ UNLIKELY = 1e-3
 ROUNDING = 1e-13
 """Influences below are rounding's."""
 
+SINGULAR = 1e-9
+"""What is added to the variance of each cell, so that smooth correlations have an inverse."""
+
 BLOCK = 4.0
 """The edge of a block, in reaches."""
 
@@ -97,14 +100,12 @@ class Spread:
         return sum(part.weight for part in self.parts if part.alike > times)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class _Correlation:
-    """Correlations of cells of a reach: Gaussian or exponential, their eigenvalues (G,) and eigenvectors (G, G)."""
+    """Correlations of cells of a reach: Gaussian or exponential."""
 
     reach: float
     gaussian: bool
-    values: Float64
-    vectors: Float64
 
     def __call__(self, distance: Float64) -> Float64:
         """(G, G) of cells that are so far apart."""
@@ -142,14 +143,9 @@ class Arrangement:
 
     @functools.cached_property
     def _correlations(self) -> list[_Correlation]:
-        found = [_Correlation(0.0, True, np.ones(self.count), np.eye(self.count))]
         far = max(self._distance.max(initial=0.0), REACHES[0])
-        for reach in (reach for reach in REACHES if reach <= far):
-            for gaussian in (False, True):
-                of = _Correlation(reach, gaussian, np.zeros(0), np.zeros(0))
-                values, vectors = np.linalg.eigh(of(self._distance))
-                found.append(_Correlation(reach, gaussian, np.maximum(values, 1e-9), vectors))
-        return found
+        reaches = [reach for reach in REACHES if reach <= far]
+        return [_Correlation(0.0, True), *(_Correlation(reach, form) for reach in reaches for form in (False, True))]
 
     def kernel(self, block: float) -> Float64:
         """(G, G) in how many of the shifted grids of blocks of that edge, in cells, two cells share a block."""
@@ -234,10 +230,10 @@ class Arrangement:
         """How likely each correlation is (REML)."""
         scale = size**GROWTH
         seen, mean = influence / scale, size / scale
-        number, alone, vectors, v, logs, before = self._alternatives
-        a, b = np.moveaxis(vectors @ np.stack([seen, mean], axis=1), -1, 0)[:, number]
-        within = (b * b / v).sum(axis=1)
-        left = (a * a / v).sum(axis=1) - (a * b / v).sum(axis=1) ** 2 / within
+        number, alone, whitens, logs, before = self._alternatives
+        a, b = np.moveaxis(whitens @ np.stack([seen, mean], axis=1), -1, 0)
+        within = (b * b).sum(axis=1)
+        left = (a * a).sum(axis=1) - (a * b).sum(axis=1) ** 2 / within
         some = np.flatnonzero(left > 0)
         log = logs[some] + np.log(within[some]) + (self.count - 1) * np.log(left[some])
         likely = before[some] - 0.5 * log
@@ -247,24 +243,30 @@ class Arrangement:
         return [_Likely(int(k), float(own), float(w), float(scatter)) for k, own, w, scatter in found if w > 0]
 
     @functools.cached_property
-    def _alternatives(self) -> tuple[npt.NDArray[np.int64], Float64, Float64, Float64, Float64, Float64]:
+    def _alternatives(self) -> tuple[npt.NDArray[np.int64], Float64, Float64, Float64, Float64]:
         """Numbers of correlations (A,), with what a cell has for itself (A,).
 
-        Then the transposed eigenvectors (C, G, G) of all correlations, the eigenvalues (A, G), the sum of their
-        logarithms (A,) and what counts besides (A,).
+        Then what makes cells that correlate so independent (A, G, G), the logarithms of the determinants of their
+        covariances (A,) and what counts besides (A,).
         """
+        from scipy.linalg.lapack import dtrtri
+
         pairs = [
             (number, alone)
             for number, correlation in enumerate(self._correlations)
             for alone in (ALONE if correlation.reach else (0.0,))
         ]
         number, alone = np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
-        values = np.stack([of.values for of in self._correlations])[number]
+        whitens, logs = np.empty((len(pairs), self.count, self.count)), np.empty(len(pairs))
+        for own, (k, part) in enumerate(pairs):
+            covariance = (1 - part) * self._correlations[k](self._distance)
+            covariance[np.diag_indices(self.count)] += part + SINGULAR
+            factor = np.linalg.cholesky(covariance)
+            logs[own] = 2 * np.log(np.diag(factor)).sum()
+            whitens[own] = dtrtri(factor, lower=1)[0]
         reach = np.array([of.reach for of in self._correlations])[number]
-        v = (1 - alone)[:, None] * values + alone[:, None]
         before = self._far * np.log(np.maximum(reach, REACHES[0])) - np.where(alone > 0, DOUBT, 0.0)
-        vectors = np.stack([of.vectors.T for of in self._correlations])
-        return number, alone, vectors, v, np.log(v).sum(axis=1), before
+        return number, alone, whitens, logs, before
 
 
 @functools.lru_cache(maxsize=4)
