@@ -79,7 +79,7 @@ class Load:
         pixels = self.first.shape[0] * self.first.shape[1]
         threads = default_threads() if self.threads is None else self.threads
         frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
-        dense = 2 * 8 * self.K * min(voxels, STRETCH)
+        dense = 8 * self.K * min(voxels, STRETCH)
         sizes = sizes_bytes(self.first, self.frames, self.K, soft=self.soft)
         loaded = LOADED + self.soft * LOADED_FOR_SCORES
         return loaded + frames + max(0.0, dense - maps / 2, sizes - LOADED / 2 - maps)
