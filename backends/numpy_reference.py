@@ -64,7 +64,7 @@ class NumpyReference:
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
         """A dictionary's entry and the evidence a voxel; an observation is in the history, and sorted for a table."""
-        return voxels * (300 + 9 * num_classes) + observations * (140 + (30 * num_classes if soft else 0))
+        return voxels * (240 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""

@@ -83,7 +83,7 @@ class Open3DBlocks(FusionBackend):
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
         """The attributes of a voxel; a quarter of a block is seen, the grid doubles, an empty one has blocks."""
-        return max(10 * voxels, LEAST_BLOCKS * 4**3) * (8 * num_classes + 48)
+        return max(11 * voxels, LEAST_BLOCKS * 4**3) * (8 * num_classes + 48)
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""

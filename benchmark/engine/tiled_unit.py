@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Collection, Iterator
 
@@ -9,7 +10,7 @@ from semstab.engine.folder import Folder, unit_key
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.tiling.portion import Finished
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.assembly import assembled
+from semstab.engine.work.assembly import Sampled, assembled
 from semstab.engine.work.jobs import Outcome, Request, failed
 from semstab.errors import OutgrownError, SemstabError
 
@@ -36,6 +37,7 @@ class TiledUnit:
             if (found := folder.portion(self._key, name)) is not None:
                 self._there[name] = found
         self._failed = False
+        self._sampled: Sampled | None = None
         self._waiting = [request for name, request in self._requests.items() if name not in self._there]
         folder.clear(planned, {name for each in self._there.values() for name in each.about.files})
         shares = itertools.pairwise(k * planned.frames // len(self._requests) for k in range(len(self._requests) + 1))
@@ -73,7 +75,20 @@ class TiledUnit:
         elif outcome is not None:
             self._failed = True
             return outcome
-        return self._assembled() if len(self._there) == len(self._requests) else None
+        if len(self._there) == len(self._requests):
+            return self._assembled()
+        self._look_ahead()
+        return None
+
+    def _look_ahead(self) -> None:
+        """Prepare what all frames tell, once they are looked at, while others fuse the parts."""
+        portions = {name: request.portion for name, request in self._requests.items()}
+        frames = {name for name, portion in portions.items() if portion is not None and portion.stretch is not None}
+        if self._sampled is None and frames <= self._there.keys():
+            with contextlib.suppress(SemstabError):  # raised again where the unit is put together
+                self._sampled = Sampled.of(
+                    [self._there[name] for name in portions if name in frames], self._folder.path
+                )
 
     def _as_cut(self, request: Request, names: Collection[str]) -> list[Request]:
         """A part as an earlier start cut it, where something of that is there."""
@@ -110,7 +125,7 @@ class TiledUnit:
         identity = self.planned.identity
         finished = {name: self._there[name] for name in self._requests}  # sums do not hang on who was first
         try:
-            return Outcome(identity, assembled(self.planned, finished, self._folder.path))
+            return Outcome(identity, assembled(self.planned, finished, self._folder.path, self._sampled))
         except SemstabError as error:
             return failed([*self._requests.values()][:1], error)[0]
 

@@ -107,9 +107,11 @@ def main() -> None:
     parser.add_argument("--backends", nargs="+", default=["numba", "open3d", "numpy"])
     parser.add_argument("--classes", nargs="+", type=int, default=[7, 41, 150])
     parser.add_argument("--kinds", nargs="+", default=["labels", "scores"])
+    parser.add_argument("--frames", type=int, help="so many; else 24 with labels and 8 with scores")
     parser.add_argument("--most-gb", type=float, default=4.0, help="leave out maps that are said to take more")
     parser.add_argument("--json", help="also write the figures there")
     arguments = parser.parse_args()
+    FRAMES.update(dict.fromkeys(FRAMES, arguments.frames) if arguments.frames else {})
     print(f"{'backend':>8} {'K':>4} {'':>7} {'voxels':>10} {'':>6} {'MB':>7} {'estimate':>9} {'ratio':>6} stage")
     rows = []
     for kind in arguments.kinds:

@@ -1,8 +1,9 @@
 """Compiled loops from the scores of a frame to the sums of its voxels, by tiles of the image.
 
 The image is cut into bands of `ROWS` rows, and each band into tiles so narrow that the sums of their voxels stay in a
-core's cache. Scores are read once, in the order in which they lie in memory; invalid pixels' are not. A voxel's pixels
-are added up band by band, in an order that depends on the image only: the same numbers for any number of threads.
+core's cache. Scores are read from memory once, in the order in which they lie there; those of eight invalid pixels are
+not. A voxel's pixels are added up band by band, in an order that depends on the image only: the same numbers for any
+number of threads.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from semstab.backends.shared.hashing import PARTITIONS, mix, partition_of
 from semstab.backends.shared.pixels.pixel_keys import keep_columns, keys_of_row
 from semstab.backends.shared.pixels.run_vectors import runs_of_eight
 from semstab.backends.shared.prefetch import touch
-from semstab.backends.shared.scores.vectors import LANES, add_two, scale_eight
+from semstab.backends.shared.scores.vectors import LANES, SOON, add_two, scale_eight
 from semstab.runtime.compiled import parallel, serial
 
 ROWS, COLUMNS = 16, 512
@@ -28,10 +29,7 @@ AHEAD = 512
 """Scores that are asked for before their turn comes."""
 
 LINE = 16
-"""Of them, as many as a line of the cache holds, or less."""
-
-SOON = 8
-"""Rows of sums likewise."""
+"""Of them, as many as a line of the cache holds in float32."""
 
 
 @parallel

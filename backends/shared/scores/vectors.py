@@ -14,7 +14,13 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from semstab.backends.shared.prefetch import ask_for
+
 LANES = 8
+
+SOON = 8
+"""Rows of sums that are asked for before their turn comes."""
+
 NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.uint16: ir.HalfType()}
 
 INT, INT32, DOUBLE = ir.IntType(64), ir.IntType(32), ir.DoubleType()
@@ -59,7 +65,8 @@ def add_two(
     sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
     that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
 
-    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added. Rows of
+    as many lie one behind the other, and a later one, which may not have been written to yet, is asked for.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -73,6 +80,7 @@ def add_two(
             for pixel, counts in zip(pixels, counted, strict=True)
         ]
         row = builder.gep(_data(context, builder, signature, arguments, 6), [to])
+        ahead = builder.mul(builder.and_(builder.add(K, INT(LANES - 1)), INT(-LANES)), INT(SOON))
 
         def add(values: list[Any], k: Any) -> None:
             place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
@@ -81,6 +89,7 @@ def add_two(
                 scaled = builder.fmul(builder.select(counts, value, ZEROS), factor, flags=["contract"])
                 total = builder.fadd(total, scaled, flags=["contract"])
             builder.store(total, place, align=8)
+            ask_for(builder, builder.gep(row, [builder.add(k, ahead)]))
 
         _by_eights(context, builder, signature.args[0], array, places, K, add)
         return context.get_dummy_value()

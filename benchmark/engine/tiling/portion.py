@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.engine.series import FrameRow
+from semstab.engine.series import NUMBERS, Series
 from semstab.engine.tiling.partition import Part
 from semstab.engine.tiling.stretches import Stretch
 from semstab.model.records import FrameQuality
-from semstab.model.results import Agreement, FrameReport, SizeAlpha
+from semstab.model.results import Agreement, SizeAlpha
 from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.runtime.files import parse_json
 from semstab.runtime.json_form import from_json, to_json
@@ -30,12 +30,7 @@ TRUE_LOOKS = ".truth.parquet"
 PART, STRETCH, SIZES = "part", "stretch", "sizes"
 """Kinds of portions; the last one tells how the map hangs on the voxel size."""
 
-REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
-          "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
-ROW = ("timestamp", "flicker_percent", "decode_seconds", "wait_seconds", "flicker_seconds", "left_out",
-       "scores_left_out", "most_scores_left_out")  # fmt: skip
 MEANS = ("map_vss", "map_entropy", "map_recurrent")
-INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
 
 Float64 = npt.NDArray[np.float64]
 
@@ -108,7 +103,7 @@ class About:
 class Finished:
     """What is left of a portion.
 
-    series   (F, C) a row a frame: REPORT, then ROW
+    series   (F, C) a row a frame, its NUMBERS
     sums     over the voxels, by name: those of `TableSums`, or of `FirstSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     poses    (F, 4, 4) of the frames, where it is of these
@@ -134,25 +129,19 @@ class Finished:
     def load(cls, path: Path) -> Finished | None:
         """What `save` wrote; None where it is not there, or damaged. Raises DataError for that of another version."""
         arrays = read_arrays(path)
-        if arrays is None:
+        if arrays is None or arrays["series"].shape[1:] != (len(NUMBERS),):
             return None
         about = from_json(About, parse_json(arrays["about"].tobytes()), path)
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
         return cls(about, arrays["series"], sums, arrays["reduced"], arrays["poses"], arrays["image"])
 
 
-def series_array(rows: Sequence[FrameRow]) -> Float64:
-    """(F, C) of the rows of a time series, an undefined number as NaN."""
-    values = [[*(getattr(row.report, name) for name in REPORT), *(getattr(row, name) for name in ROW)] for row in rows]
-    return np.array(values, dtype=np.float64).reshape(len(rows), len(REPORT) + len(ROW))
-
-
-def joined_series(frames: Float64, parts: Sequence[Float64]) -> list[FrameRow]:
+def joined_series(frames: Float64, parts: Sequence[Float64]) -> Series:
     """The time series of a unit (F rows) from that of its frames without a map, and those of the parts of its map."""
-    columns = {name: frames[:, k].copy() for k, name in enumerate((*REPORT, *ROW))}
+    columns = {name: frames[:, k].copy() for k, name in enumerate(NUMBERS)}
     state = {name: np.zeros(len(frames)) for name in ("map_voxels", *MEANS)}
     for part in parts:
-        own = {name: part[:, k] for k, name in enumerate((*REPORT, *ROW))}
+        own = {name: part[:, k] for k, name in enumerate(NUMBERS)}
         at = np.searchsorted(columns["frame"], own["frame"])
         for name in ("points", "voxels", "new_voxels", "drift_sum", "seconds"):
             columns[name][at] += own[name]
@@ -165,11 +154,4 @@ def joined_series(frames: Float64, parts: Sequence[Float64]) -> list[FrameRow]:
             state[name] += np.where(voxels > 0, voxels * own[name][last], 0.0)
     n = np.where(state["map_voxels"] > 0, state["map_voxels"], math.nan)
     columns |= {"map_voxels": state["map_voxels"], **{name: state[name] / n for name in MEANS}}
-    return [_row({name: float(values[k]) for name, values in columns.items()}) for k in range(len(frames))]
-
-
-def _row(values: Mapping[str, float]) -> FrameRow:
-    report: dict[str, Any] = {name: int(values[name]) if name in INTEGERS else values[name] for name in REPORT}
-    row: dict[str, Any] = {name: values[name] for name in ROW} | {"left_out": int(values["left_out"])}
-    row["timestamp"] = None if math.isnan(values["timestamp"]) else values["timestamp"]
-    return FrameRow(FrameReport(**report), **row)
+    return Series(np.stack([columns[name] for name in NUMBERS], axis=1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,8 +39,30 @@ UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
 
 
-def assembled(planned: PlannedUnit, finished: Mapping[str, Finished], folder: Path) -> UnitContent:
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """What was sampled of the frames of a unit, cell by cell and as observations; None where nothing was."""
+
+    looks: Looks | None
+    sample: Sample | None
+
+    @classmethod
+    def of(cls, finished: Iterable[Finished], folder: Path) -> Sampled:
+        """From the stretches of frames among these portions."""
+        stretches = [each for each in finished if each.about.kind == STRETCH]
+        looks, true_looks = (_looks(stretches, folder, true=true) for true in (False, True))
+        sample = None if looks is None else looks.sample()
+        if sample is not None and true_looks is not None:
+            sample = sample.against(true_looks.sample())
+        return cls(looks, sample)
+
+
+def assembled(
+    planned: PlannedUnit, finished: Mapping[str, Finished], folder: Path, sampled: Sampled | None = None
+) -> UnitContent:
     """The unit's content, from its portions by name, in order; its series is written.
+
+    sampled  of its frames, where that is known already
 
     Raises DataError where no pixel was valid.
     """
@@ -51,10 +73,8 @@ def assembled(planned: PlannedUnit, finished: Mapping[str, Finished], folder: Pa
     if not sums.total[2]:
         raise no_voxels(task, config)
     files = {name: digest for each in finished.values() for name, digest in each.about.files.items()}
-    looks, true_looks = (_looks(stretches, folder, true=true) for true in (False, True))
-    sample = None if looks is None else looks.sample()
-    if sample is not None and true_looks is not None:
-        sample = sample.against(true_looks.sample())
+    sampled = sampled or Sampled.of(stretches, folder)
+    looks, sample = sampled.looks, sampled.sample
     found = _statistics(planned, parts, sample, folder, files) if planned.judged and sample is not None else None
     rows = joined_series(np.concatenate([each.series for each in stretches]), [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]

@@ -21,7 +21,7 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, to_csv
-from semstab.engine.tiling.portion import About, Finished, Portion, series_array
+from semstab.engine.tiling.portion import About, Finished, Portion
 from semstab.engine.work.image_space import COLUMNS
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import NoMap, Stream, UnitMap
@@ -167,7 +167,8 @@ def unit_summary(
     sizes: tuple[SizeAlpha, ...],
 ) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
-    stages = [row.stage_ms() for row in rows]
+    each_row = np.dtype((np.float64, len(STAGES)))
+    stages = np.fromiter(([*row.stage_ms().values()] for row in rows), each_row, len(rows)).T.tolist()
     return UnitSummary(
         unit=task.units[0],
         taxonomy=task.mapping.target.name,
@@ -175,7 +176,7 @@ def unit_summary(
         table=table,
         flicker_percent=macro_mean([row.flicker_percent for row in rows]),
         fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
-        stages_ms={stage: macro_mean([row[stage] for row in stages]) for stage in STAGES},
+        stages_ms={stage: macro_mean(values) for stage, values in zip(STAGES, stages, strict=True)},
         left_out=sum(row.left_out for row in rows),
         frames_left_out=task.left_out,
         frames_empty=sum(row.report.points == 0 for row in rows),
@@ -232,7 +233,7 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
         sizes, voxels = () if one.sizes is None else one.sizes.alphas(), 0 if table is None else len(table)
         finished = Finished(
             About(portion.kind, saved, voxels, checked, sizes, _quality(stream)),
-            series_array(one.rows),
+            one.rows.numbers,
             {} if found is None else found.sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
             np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),

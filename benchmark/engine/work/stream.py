@@ -13,7 +13,7 @@ import numpy as np
 from semstab.backends import FusionBackend
 from semstab.backends.numpy_reference import NumpySample
 from semstab.engine.evaluation import truth_task
-from semstab.engine.series import FrameRow
+from semstab.engine.series import Series
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
 from semstab.engine.work.sizes import SizeMaps
@@ -64,7 +64,7 @@ class UnitMap:
     reference: NumpySample | None = None
     sizes: SizeMaps | None = None
     hard: FusionBackend | None = None
-    rows: list[FrameRow] = field(default_factory=list)
+    rows: Series = field(default_factory=Series)
     observations: int = 0
     soft: bool = False
 
