@@ -16,6 +16,9 @@ Int64 = npt.NDArray[np.int64]
 CHUNK_VALUES = 1 << 18
 """Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
 
+PAIRWISE = 8
+"""From so many classes on NumPy's sum over them depends on their layout; below, class by class is the faster one."""
+
 STRETCH = 1 << 17
 """So many voxels are looked at together, where sums over all of them are wanted."""
 
@@ -159,7 +162,7 @@ class Evidence(NDArrayOperatorsMixin):
     def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
         """Dense rows from the first to before the last."""
         starts = self.starts[first : (len(self) if last is None else max(first, last)) + 1]
-        dense = np.zeros((self.K, len(starts) - 1)).T  # class by class: what is summed over classes is so many vectors
+        dense = np.zeros((len(starts) - 1, self.K), order="F" if self.K < PAIRWISE else "C")
         entries = slice(starts[0], starts[-1])
         dense[np.repeat(np.arange(len(dense)), np.diff(starts)), self.label[entries]] = self.weight[entries]
         return dense

@@ -162,8 +162,11 @@ def entropy(table: Rows) -> Float64:
 @by_chunk
 def margin(table: Rows) -> Float64:
     """How far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
-    second, first = np.partition(normalise(table.evidence), -2, axis=1)[:, -2:].T
-    lead: Float64 = first - second
+    belief = normalise(table.evidence)
+    top = np.arange(len(belief)), belief.argmax(axis=1)
+    first = belief[top]
+    belief[top] = -np.inf
+    lead: Float64 = first - belief.max(axis=1)
     return lead
 
 

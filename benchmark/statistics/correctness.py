@@ -13,7 +13,7 @@ from semstab.metrics import strata
 from semstab.metrics.matching import shared_rows
 from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import normalise
-from semstab.model.measures import MeasureMeans, Quantity, dominant, measures, vss
+from semstab.model.measures import Beliefs, MeasureMeans, Quantity, dominant, measures, vss
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
@@ -150,7 +150,7 @@ def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     return rule_means_of(rule_sums(fused, where, truth))
 
 
-def rule_sums(fused: Fused | VoxelTable, where: Mask, truth: Truth | None) -> Float64:
+def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`."""
     rows: list[float] = []
     for measure in measures():

@@ -15,7 +15,7 @@ from semstab.metrics.summary import STRATA, TableSums
 from semstab.model.evidence import stretches
 from semstab.model.measures import sbd, vss
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.agreement import alpha_columns, class_sums, disagreement, kappa_columns, psa
+from semstab.statistics.agreement import class_sums, disagreement, psa
 from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
 from semstab.statistics.uncertainty import decompose
@@ -150,7 +150,6 @@ def mean_columns(values: Float64) -> Float64:
 def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
     """Over the cubes of the voxels with OP >= 2: what means and agreement beyond chance are functions of."""
     again = table.op >= 2
-    rows = np.flatnonzero(again)
     own = {name: values[again] for name, values in maps.items()}
     T, known, op = table.op[again].astype(np.float64), ~np.isnan(own["sbd_null"]), table.op[again]
     means = {
@@ -168,13 +167,16 @@ def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
     columns |= {name: np.stack([T * own[f"disagreement_{name}"], T], axis=1) for name in ("within", "between")}
     coin = [np.stack([own["psa"] * where, where], axis=1) for where in (op == 2, op > 2)]
     columns["coin"] = np.concatenate(coin, axis=1)
-    formulas = {
-        "kappa": kappa_columns,
-        "alpha": alpha_columns,
-        "each_place": lambda some: alpha_columns(some, np.ones(len(some))),
-    }
     sums = {name: places.sums(values) for name, values in columns.items()}
-    sums |= {name: places.sums_of(table, rows, formula) for name, formula in formulas.items()}
+    evidence, every, self_sum = table.evidence.take(again), np.ones(len(T)), table.self_sum[again]
+    by_look, by_place = places.sums_by_class(evidence, every), places.sums_by_class(evidence, 1 / T)
+    further = {
+        "kappa": ([own["psa"], every], by_place),  # as of `kappa_columns`, and of `alpha_columns` twice
+        "alpha": ([T * own["psa"], T, self_sum], by_look),
+        "each_place": ([own["psa"], every, self_sum / T], by_place),
+    }
+    for name, (values, by_class) in further.items():
+        sums[name] = np.concatenate([places.sums(np.stack(values, axis=1)), by_class], axis=1)
     return PlaceSums(places.cell, places.edge, sums)
 
 

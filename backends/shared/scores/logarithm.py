@@ -40,7 +40,8 @@ INVERSE, LOGARITHM = _table()
 
 
 def plogp_of(context: Any, builder: Any, p: Any) -> Any:
-    """The vector of p log2 p of 0 <= p <= 2, 0 for 0, to a few units in the last place of the logarithm.
+    """The vector of p log2 p of 0 <= p <= 2, 0 for 0, to a few units in the last place of the logarithm (with fused
+    multiply-add, as machines have; else to 2^-52 beside them).
 
     p = 2^e m, m from `LOWEST` to twice that; m c = 1 + r with c by m's step, and log p = e - log c + log(1 + r).
     """

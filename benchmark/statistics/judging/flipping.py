@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import row_chunks, stretches
+from semstab.model.evidence import stretches
 from semstab.model.statistics import Flipping
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
@@ -70,9 +70,13 @@ class FlippingSums:
 
 def _together(table: VoxelTable, rows: npt.NDArray[np.int64], unsteady: Float64) -> Float64:
     """(K, K) of these rows (m,), which are unsteady with that probability (m,)."""
-    together = np.zeros((table.K, table.K))
-    for some in row_chunks(len(rows), table.K):
-        belief = table.evidence[rows[some]] / table.op[rows[some], None]
-        together += (unsteady[some, None] * belief).T @ belief
+    from scipy.sparse import csr_array
+
+    evidence = table.evidence.take(rows)
+    count, shape = np.diff(evidence.starts), evidence.shape
+    belief = evidence.weight / np.repeat(table.op[rows], count)
+    weighted = np.repeat(unsteady, count) * belief
+    left, right = (csr_array((own, evidence.label, evidence.starts), shape=shape) for own in (weighted, belief))
+    together = (left.T @ right).toarray()
     upper: Float64 = np.triu(together, 1)
     return upper

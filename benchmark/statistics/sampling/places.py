@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.model.evidence import Evidence
 from semstab.model.statistics import Interval
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.blocks import Blocks
 from semstab.statistics.sampling.collect import cell_edge, cells_of
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
@@ -35,11 +35,13 @@ class Places:
         """(G, C) over the voxels of each cube of columns (n, C)."""
         return self._blocks.sums(columns.astype(np.float64))
 
-    def sums_of(
-        self, table: VoxelTable, rows: npt.NDArray[np.int64], formula: Callable[[VoxelTable], Float64]
-    ) -> Float64:
-        """The same of the columns that a formula makes of these rows of a table, which are the voxels."""
-        return self._blocks.sums_of(table, rows, formula)
+    def sums_by_class(self, evidence: Evidence, weights: Float64) -> Float64:
+        """(G, K) over the voxels of each cube of their evidence (n, K), each by its weight (n,)."""
+        count = np.diff(evidence.starts)
+        at = np.repeat(self._blocks.of * evidence.K, count) + evidence.label
+        values, size = np.repeat(weights, count) * evidence.weight, self.count * evidence.K
+        sums: Float64 = np.bincount(at, weights=values, minlength=size).astype(np.float64).reshape(-1, evidence.K)
+        return sums
 
     def estimate(
         self,

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.model.evidence import row_chunks
+from semstab.model.measures import Beliefs, Rows
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
@@ -112,10 +114,16 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
 
 
 def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
+    """(R, 2 + C), of beliefs that are dense a few at a time."""
     again, usual, rows = table.op >= 2, fusion_rules.labels(table.evidence), []
     _, *others = fusion_rules.RULES  # the map's own rule is the first
-    fused_by: list[VoxelTable | fusion_rules.Fused] = [table]
-    for fused in [*fused_by, *fusion_rules.fuse_all(events, others, evidence=table.evidence)]:
-        relabelled = (fusion_rules.labels(fused.evidence) != usual)[again]
-        rows.append(np.concatenate([[relabelled.sum(), len(relabelled)], rule_sums(fused, again, truth)]))
+    by_rule: list[Beliefs] = [table, *fusion_rules.fuse_all(events, others, evidence=table.evidence)]
+    for fused in by_rule:
+        total = np.zeros(())
+        for some in row_chunks(*fused.evidence.shape):
+            dense, where = Rows(fused.op[some], fused.evidence[some], fused.drift_sum[some]), again[some]
+            relabelled = (fusion_rules.labels(dense.evidence) != usual[some])[where]
+            own = rule_sums(dense, where, None if truth is None else Truth(truth.known[some], truth.label[some]))
+            total = total + np.concatenate([[relabelled.sum(), len(relabelled)], own])
+        rows.append(total)
     return np.stack(rows)
