@@ -360,7 +360,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
 def test_a_map_of_the_run_is_followed_where_that_is_possible(tmp_path, monkeypatch, fused_by, own) -> None:
     """Else each backbone is fused a second time. The recorded drift is the same."""
     made = []
-    monkeypatch.setattr(tracker, "NumbaHash", lambda *settings: made.append(settings) or NumbaHash(*settings))
+    monkeypatch.setattr(tracker, "NumbaHash", lambda *settings, within: made.append(settings) or NumbaHash(*settings))
     config = config_of(tiny_scene.write(tmp_path / "wall"), fused_by)
     semstab.run(config, observers=[Recording(tmp_path / "x.rrd")])
     assert len(made) == own

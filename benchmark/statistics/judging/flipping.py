@@ -19,6 +19,9 @@ Float64 = npt.NDArray[np.float64]
 ENOUGH = 4
 """Looks from which on places that flip can be told from places that err now and then."""
 
+UNIT = 2.0**-32
+"""Of probabilities: sums of multiples of it are exact, in whatever order a map's tiles are added."""
+
 
 @dataclass(frozen=True, eq=False)
 class FlippingSums:
@@ -41,7 +44,7 @@ class FlippingSums:
     @classmethod
     def _of_few(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
         rows = np.flatnonzero(~np.isnan(stable))
-        unsteady = 1 - stable[rows]
+        unsteady = np.round((1 - stable[rows]) / UNIT) * UNIT
         places = Places(table.index[rows], table.voxel_size, edge)
         share = PlaceSums(places.cell, edge, {"": places.sums(np.stack([unsteady, np.ones(len(rows))], axis=1))})
         return cls(share, int(np.count_nonzero(table.op[rows] >= ENOUGH)), _together(table, rows, unsteady))
