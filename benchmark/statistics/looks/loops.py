@@ -17,33 +17,38 @@ def draw(depth, valid, ray_x, ray_y, T, size, origin, reach, share, cell, drawn,
     """
     n = 0
     H, W = depth.shape
-    at, q, before = np.empty(3), np.empty(3), np.full(3, np.nan)
-    key, sampled, hashed = np.int64(0), False, np.uint64(0)
+    at, hashed = np.empty((3, W)), np.empty(W, np.uint32)
     for v in range(H):
+        place_row(depth[v], valid[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2], hashed)
         for u in range(W):
-            if not valid[v, u]:
+            if not valid[v, u] or hashed[u] >= share:
                 continue
-            z = np.float64(depth[v, u])
-            x, y = ray_x[u] * z, ray_y[v] * z
+            key, child, inside = np.int64(0), np.int64(0), True
             for i in range(3):
-                at[i] = (((T[i, 0] * x + T[i, 1] * y) + T[i, 2] * z) + T[i, 3]) / size
-                q[i] = np.floor(at[i])
-            if q[0] != before[0] or q[1] != before[1] or q[2] != before[2]:
-                before[:] = q
-                key, inside, h = np.int64(0), True, np.uint64(0)
-                for i in range(3):
-                    relative = np.int64(q[i]) - origin[i] + reach
-                    inside = inside and relative >= 0 and relative < 2 * reach
-                    key = (key << np.int64(19)) | relative
-                    h = mix(h ^ np.uint64(np.int64(q[i])))
-                hashed = h >> np.uint64(32)
-                sampled = inside and hashed < share
-            if sampled:
-                child = np.int64(0)
-                for i in range(3):
-                    child = child * CELLS + min(np.int64((at[i] - q[i]) * CELLS), np.int64(CELLS - 1))
-                cell[n] = (key << np.int64(6)) | child
-                drawn[n] = hashed
-                pixel[n] = v * W + u
+                index = np.floor(at[i, u])
+                relative = np.int64(index) - origin[i] + reach
+                inside = inside and relative >= 0 and relative < 2 * reach
+                key = (key << np.int64(19)) | relative
+                child = child * CELLS + min(np.int64((at[i, u] - index) * CELLS), np.int64(CELLS - 1))
+            if inside:
+                cell[n], drawn[n], pixel[n] = (key << np.int64(6)) | child, hashed[u], v * W + u
                 n += 1
     return n
+
+
+@serial
+def place_row(depth, valid, ray_x, ray_y, T, size, at_x, at_y, at_z, hashed):
+    """Where a row's pixels lie, in voxels, and the hash of each one's voxel; without a branch, for vectors."""
+    x0, x1, x2, x3 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    y0, y1, y2, y3 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    z0, z1, z2, z3 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    for u in range(len(depth)):
+        z = np.float64(depth[u]) if valid[u] else 0.0
+        x, y = ray_x[u] * z, ray_y * z
+        at_x[u] = (((x0 * x + x1 * y) + x2 * z) + x3) / size
+        at_y[u] = (((y0 * x + y1 * y) + y2 * z) + y3) / size
+        at_z[u] = (((z0 * x + z1 * y) + z2 * z) + z3) / size
+        h = mix(np.uint64(np.int64(np.floor(at_x[u]))))
+        h = mix(h ^ np.uint64(np.int64(np.floor(at_y[u]))))
+        h = mix(h ^ np.uint64(np.int64(np.floor(at_z[u]))))
+        hashed[u] = h >> np.uint64(32)
