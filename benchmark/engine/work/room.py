@@ -14,6 +14,9 @@ from semstab.runtime.process import give_back
 STEP = 32e6
 """Bytes by which the process may grow before it is looked at closer."""
 
+AMPLE = 4
+"""Where that many times what maps take is left, freed memory is kept: the next images need not clear theirs again."""
+
 
 class Room:
     """Watches the memory of a pass, frame by frame, in a time that does not grow with the maps.
@@ -40,14 +43,20 @@ class Room:
         step = self._taken(expected) - self._seen
         if step < min(STEP, (self._limit or STEP) / 8):
             return None
+        end, taken = max(map(end_bytes, maps)), self._taken(expected)
+        if self._beyond(taken) >= AMPLE * (taken + end):
+            self._seen = taken
+            return None
         give_back()  # else what was freed would count
         taken = self._taken(expected)
         self._seen, self._largest_step = taken, max(self._largest_step, taken - self._seen)
+        self._left = self._beyond(taken)
+        return None if self._left >= end + 2 * self._largest_step else max(maps, key=_bytes)
+
+    def _beyond(self, taken: int) -> float:
+        """What is left for maps that take so much."""
         free = available_bytes() / self._width
-        self._left = free if self._limit is None else min(free, self._limit - taken)
-        if self._left >= max(map(end_bytes, maps)) + 2 * self._largest_step:
-            return None
-        return max(maps, key=_bytes)
+        return free if self._limit is None else min(free, self._limit - taken)
 
     def _taken(self, expected: int) -> int:
         """By the maps; one may take what was freed before."""
