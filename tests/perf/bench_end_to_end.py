@@ -96,7 +96,8 @@ def rendered(width: int, height: int, frames: int) -> list[Any]:
 def write_scene(root: Path, views: list[Any], size: tuple[int, int], noise: float, kind: str) -> None:
     for part in ("depth", "pose", "labels/net"):
         (root / part).mkdir(parents=True)
-    (root / "scene.yaml").write_text(f"taxonomy: uavid8\ndepth_scale: {DEPTH_SCALE}\n", encoding="utf-8")
+    scale = 1 if kind == "npy" else DEPTH_SCALE
+    (root / "scene.yaml").write_text(f"taxonomy: uavid8\ndepth_scale: {scale}\n", encoding="utf-8")
     camera = views[0].intrinsics.resized(views[0].shape[::-1], size).matrix
     np.savetxt(root / "intrinsics.txt", camera)
     rng = np.random.default_rng(0)
