@@ -16,6 +16,12 @@ BLOCK = 256
 
 
 @serial
+def in_voxels(r0, r1, r2, t, x, y, z, size):
+    """A coordinate of a point of the camera in the map, in voxels; the order of operations is the protocol's."""
+    return (((r0 * x + r1 * y) + r2 * z) + t) / size
+
+
+@serial
 def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, out):
     """Packed keys of a row of pixels, -1 where a pixel does not count; returns 1 where one is out of reach, else 0.
 
@@ -32,9 +38,9 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
         d = d if ok else 0.0
         x = ray_x[u] * d
         y = ray_y * d
-        a = np.floor((((r00 * x + r01 * y) + r02 * d) + t0) / size) - ox
-        b = np.floor((((r10 * x + r11 * y) + r12 * d) + t1) / size) - oy
-        c = np.floor((((r20 * x + r21 * y) + r22 * d) + t2) / size) - oz
+        a = np.floor(in_voxels(r00, r01, r02, t0, x, y, d, size)) - ox
+        b = np.floor(in_voxels(r10, r11, r12, t1, x, y, d, size)) - oy
+        c = np.floor(in_voxels(r20, r21, r22, t2, x, y, d, size)) - oz
         near = (a >= low) & (a <= high) & (b >= low) & (b <= high) & (c >= low) & (c <= high)
         lost |= 1 if ok & (not near) else 0
         good = ok & near

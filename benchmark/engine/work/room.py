@@ -40,10 +40,10 @@ class Room:
         expected = sum(map(_bytes, maps))
         if self._before is None:
             self._before = resident_bytes() - expected
-        step = self._taken(expected) - self._seen
-        if step < min(STEP, (self._limit or STEP) / 8):
+        taken = self._taken(expected)
+        if taken - self._seen < min(STEP, (self._limit or STEP) / 8):
             return None
-        end, taken = max(map(end_bytes, maps)), self._taken(expected)
+        end = max(map(end_bytes, maps))
         if self._beyond(taken) >= AMPLE * (taken + end):
             self._seen = taken
             return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.backends.shared.hashing import mix
+from semstab.backends.shared.pixels.pixel_keys import in_voxels
 from semstab.runtime.compiled import serial
 from semstab.statistics.looks.entries import CELLS
 
@@ -13,7 +14,7 @@ from semstab.statistics.looks.entries import CELLS
 def draw(depth, valid, ray_x, ray_y, T, size, origin, reach, share, cell, drawn, pixel):
     """The cell, hash and number of each pixel that shows a sampled voxel; returns how many there are.
 
-    The order of operations is the protocol's. A cell's key is its voxel's (19 bits an axis) with 2 bits an axis more.
+    A cell's key is its voxel's (19 bits an axis) with 2 bits an axis more.
     """
     n = 0
     H, W = depth.shape
@@ -45,9 +46,9 @@ def place_row(depth, valid, ray_x, ray_y, T, size, at_x, at_y, at_z, hashed):
     for u in range(len(depth)):
         z = np.float64(depth[u]) if valid[u] else 0.0
         x, y = ray_x[u] * z, ray_y * z
-        at_x[u] = (((x0 * x + x1 * y) + x2 * z) + x3) / size
-        at_y[u] = (((y0 * x + y1 * y) + y2 * z) + y3) / size
-        at_z[u] = (((z0 * x + z1 * y) + z2 * z) + z3) / size
+        at_x[u] = in_voxels(x0, x1, x2, x3, x, y, z, size)
+        at_y[u] = in_voxels(y0, y1, y2, y3, x, y, z, size)
+        at_z[u] = in_voxels(z0, z1, z2, z3, x, y, z, size)
         h = mix(np.uint64(np.int64(np.floor(at_x[u]))))
         h = mix(h ^ np.uint64(np.int64(np.floor(at_y[u]))))
         h = mix(h ^ np.uint64(np.int64(np.floor(at_z[u]))))
