@@ -39,11 +39,8 @@ def psa(table: VoxelTable) -> Float64:
     expectation is ||pi||^2 for every T >= 2.
     """
     T = table.op.astype(np.float64)
-    pairs = table.evidence.concentration.squares - table.self_sum
-    agreement = np.full(len(table), np.nan)
-    again = table.op >= 2
-    agreement[again] = np.clip(pairs[again] / (T * (T - 1))[again], 0.0, 1.0)
-    return agreement
+    agreeing = table.evidence.concentration.squares - table.self_sum
+    return np.where(T >= 2, np.clip(agreeing / np.maximum(T * (T - 1), 1), 0.0, 1.0), np.nan)
 
 
 def fleiss_kappa(table: VoxelTable) -> float:

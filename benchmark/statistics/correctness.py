@@ -168,7 +168,7 @@ def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`."""
     evidence = Evidence.of(fused.evidence).measured()
     fused = Voxels(fused.op, evidence, fused.drift_sum)
-    total, defined = by_group(where - np.int64(1), np.stack([measure.of(fused) for measure in measures()]), 1)
+    total, defined = by_group(where - np.int64(1), [measure.of(fused) for measure in measures()], 1)
     often = [np.count_nonzero(where & (fused.op >= measure.lowest_op)) for measure in measures()]
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:

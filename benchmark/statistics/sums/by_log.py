@@ -56,14 +56,14 @@ class LogSums:
         edge: float,
     ) -> LogSums:
         """Of a table, with cubes of that edge in metres."""
-        places, trend = Places.of(table, edge), trend_columns(table, drift)
+        places, (rows, trend) = Places.of(table, edge), trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
             "flip_null": changes.null,
             "flip_excess": changes.rate - changes.null,
             "frames_since": changes.since,
         }
-        trends = places.sums(trend)
+        trends = places.rows(rows).sums(trend)
         excess = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
         return cls(
             PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
