@@ -110,7 +110,7 @@ def analyse(
     """
     if events is not None:
         require_same_map(table, events)
-    known = None if truth is None else join_truth(table, truth)
+    table, known = table.measured(), None if truth is None else join_truth(table, truth)
     first, further, null = first_look(table, events, known, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
     second, more = second_look(table, whole, known, limit)

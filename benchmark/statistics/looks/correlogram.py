@@ -19,7 +19,7 @@ from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
 from semstab.statistics.looks.entries import Sample
-from semstab.statistics.sampling.collect import cell_edge, cells_of
+from semstab.statistics.sampling.cubes import cell_edge, cells_of
 from semstab.statistics.sampling.influence import MOST_GROUPS
 from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
 

@@ -1,4 +1,4 @@
-"""Compiled loops over the log of observations, voxel by voxel: its changes of class, its squares."""
+"""Compiled loops over the log of observations, voxel by voxel: its changes of class."""
 
 from __future__ import annotations
 
@@ -45,16 +45,3 @@ def count_flips(chunk, starts, frame, log, K, changes, differing, since):
             since[i] = frame[starts[i + 1] - 1] - frame[last]
         for t in range(T):
             votes[voted[t]] = 0
-
-
-@serial
-def sum_squares(chunk, starts, log, K, voxels, squares):
-    """For each entry of the voxels' evidence, given as the log is: the sum over frames of its share's square (m,)."""
-    place = np.full(K, -1)
-    at, label, weight = log
-    first, own, _ = voxels
-    for i in range(chunk, first.shape[0] - 1, CHUNKS):
-        for e in range(first[i], first[i + 1]):
-            place[own[e]] = e
-        for e in range(at[starts[i]], at[starts[i + 1]]):
-            squares[place[label[e]]] += weight[e] * weight[e]

@@ -271,7 +271,7 @@ def flips(events: Events) -> Flips:
 
 def variation(table: VoxelTable) -> Float64:
     """(n,) how far a voxel's observations are from their mean: sum over frames of ||s_t - mean||^2."""
-    squares: Float64 = table.self_sum - table.evidence.rowwise(lambda e: (e**2).sum(axis=1)) / table.op
+    squares: Float64 = table.self_sum - table.evidence.concentration.squares / table.op
     return np.maximum(squares, 0.0)
 
 

@@ -4,28 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.model.concentration import by_group
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import Interval
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.blocks import Blocks
-from semstab.statistics.sampling.collect import cell_edge, cells_of
+from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
 from semstab.statistics.sampling.intervals import answers, asked_of_places
 
 Float64 = npt.NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
 class Places:
-    """The cubes of voxels (n, 3), at most MOST_CELLS unless their edge is given, in metres."""
+    """The cubes of voxels, and sums over those in each.
 
-    def __init__(self, index: npt.NDArray[np.int32], voxel_size: float, edge: float | None = None) -> None:
-        self.edge = cell_edge(index, voxel_size) if edge is None else edge
-        self.cell, of = cells_of(index, voxel_size, self.edge)
-        self._blocks = Blocks(of, len(self.cell), self.edge)
+    cell  (G, 3) int32 the cubes, sorted
+    at    (n,) int64 which of them each voxel is in, -1 for those that are left out
+    edge  metres, a power of 2
+    """
+
+    cell: npt.NDArray[np.int32]
+    at: npt.NDArray[np.int64]
+    edge: float
+
+    @classmethod
+    def of(cls, table: VoxelTable, edge: float | None = None, *, where: npt.NDArray[np.bool_] | None = None) -> Places:
+        """Of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
+
+        There are at most MOST_CELLS cubes, unless their edge is given, in metres.
+        """
+        some = table.op >= 2 if where is None else where
+        return cls(*cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
 
     @property
     def count(self) -> int:
@@ -33,16 +49,21 @@ class Places:
         return len(self.cell)
 
     def sums(self, columns: Float64) -> Float64:
-        """(G, C) over the voxels of each cube of columns (n, C)."""
-        return self._blocks.sums(columns.astype(np.float64))
+        """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
+        return by_group(self.at, np.ascontiguousarray(columns.T, np.float64), self.count)[0]
 
-    def sums_by_class(self, evidence: Evidence, weights: Float64) -> Float64:
-        """(G, K) over the voxels of each cube of their evidence (n, K), each by its weight (n,)."""
-        count = np.diff(evidence.starts)
-        at = np.repeat(self._blocks.of * evidence.K, count) + evidence.label
-        values, size = np.repeat(weights, count) * evidence.weight, self.count * evidence.K
-        sums: Float64 = np.bincount(at, weights=values, minlength=size).astype(np.float64).reshape(-1, evidence.K)
-        return sums
+    def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
+        """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
+        both = by_group(self.at, np.stack([*values.values()]).astype(np.float64, copy=False), self.count)
+        return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
+
+    def sums_by_class(self, evidence: Evidence, op: npt.NDArray[np.int32]) -> tuple[Float64, Float64]:
+        """(G, K) over the voxels of each cube of their evidence (n, K), and of that / OP."""
+        from semstab.statistics.loops.rows import add_classes
+
+        by_look, by_place = (np.zeros((self.count, evidence.K)) for _ in range(2))
+        add_classes(self.at, evidence.entries, op, by_look, by_place)
+        return by_look, by_place
 
     def estimate(
         self,
