@@ -13,9 +13,10 @@ from semstab.model.concentration import by_group
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import Interval
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
-from semstab.statistics.sampling.intervals import of_places
+from semstab.statistics.sampling.intervals import answers, asked_of_places
 
 Float64 = npt.NDArray[np.float64]
 
@@ -82,6 +83,24 @@ class Places:
         return PlaceSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
 
 
+@dataclass(frozen=True)
+class Mean:
+    """A statistic of sums (..., C) by name, the second of which counts: a mean, or any other.
+
+    Where no scale is given, what goes from 0 to 1 is a share.
+    """
+
+    sums: str
+    of: Statistic = ratio_of
+    bounds: tuple[float, float] = (0.0, 1.0)
+    scale: Scale | None = None
+
+    @property
+    def kind(self) -> Scale:
+        """The scale of its interval."""
+        return self.scale or ("share" if self.bounds == (0.0, 1.0) else "plain")
+
+
 @dataclass(frozen=True, eq=False)
 class PlaceSums:
     """Sums by name over the voxels of cubes; those of a map in parts follow from the parts'.
@@ -109,12 +128,16 @@ class PlaceSums:
         bounds: tuple[float, float] = (0.0, 1.0),
         scale: Scale | None = None,
     ) -> Interval:
-        """The statistic of sums (..., C), the second of which counts, with its interval.
+        """The statistic of sums (..., C), the second of which counts, with its interval; see `Mean`."""
+        return self.estimates({name: Mean(name, statistic, bounds, scale)})[name]
 
-        Where no scale is given, what goes from 0 to 1 is a share.
-        """
-        kind: Scale = scale or ("share" if bounds == (0.0, 1.0) else "plain")
-        return of_places(self.cell, self.edge, self.sums[name], statistic, kind, bounds)
+    def estimates(self, means: Mapping[str, Mean]) -> dict[str, Interval]:
+        """Several of them, together."""
+        asked = (
+            asked_of_places(self.cell, self.edge, self.sums[own.sums], own.of, own.kind, own.bounds)
+            for own in means.values()
+        )
+        return dict(zip(means, answers(asked), strict=True))
 
     @classmethod
     def merged(cls, parts: Sequence[PlaceSums]) -> PlaceSums:
