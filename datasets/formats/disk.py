@@ -58,17 +58,19 @@ def subfolders(folder: Path) -> list[str]:
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
 
 
-def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, Path]:
-    """The files with one of these suffixes. Raises DataError for two of one stem, or a folder that cannot be listed."""
-    files: dict[str, Path] = {}
+def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
+    """Names of the files with one of these suffixes.
+
+    Raises DataError for two of one stem, or a folder that cannot be listed.
+    """
+    files: dict[str, str] = {}
     for entry in _entries(folder):
         stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122  of a hundred thousand names
         if suffix.lower() not in suffixes or not entry.is_file():
             continue
-        path = folder / entry.name
         if stem in files:
-            raise DataError(f"{path}: {files[stem].name} is the same frame; keep one of the two")
-        files[stem] = path
+            raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
+        files[stem] = entry.name
     return files
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.information import normalise
+from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
 from semstab.statistics.ranks import ranked
@@ -31,6 +30,11 @@ class Belief(Evidence):
     """Beliefs (n, K) by the classes that each voxel saw; `rest` (n,) is that in each of the others."""
 
     rest: Float64
+
+    @property
+    def unseen(self) -> Float64:
+        """(n,) what each class without an entry has."""
+        return self.rest
 
     def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
         dense = super()._stretch(first, last)
@@ -75,11 +79,17 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
 
 
 def fuse_all(
-    events: Events, rules: Sequence[str], *, floor: float | None = None, evidence: Evidence | None = None
+    events: Events,
+    rules: Sequence[str],
+    *,
+    floor: float | None = None,
+    evidence: Evidence | None = None,
+    where: npt.NDArray[np.bool_] | None = None,
 ) -> list[Fused]:
     """What `fuse` makes of a log by each of some rules, in one pass.
 
     evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
+    where     (n,) the voxels that count, all if not given; what is said of the others means nothing
     """
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
@@ -87,12 +97,19 @@ def fuse_all(
     K = events.evidence.K
     bounds, log = np.append(events.starts, len(events)), events.evidence.entries
     first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
-    belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(first) - 1, len(first) - 1))
+    belief = np.ones((len(rules), len(label)))
+    rest, drift_sum = (np.zeros((len(rules), len(first) - 1)) for _ in range(2))
     op, count = np.diff(bounds), np.diff(first)
+    rows = np.arange(len(op)) if where is None else np.flatnonzero(where)
+    if evidence is not None:
+        rows, alike = _one_of_each(rows, op, evidence)
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
-    rank = ranked(op * (most + 1) + count)
+    rank = rows[ranked((op * (most + 1) + count)[rows])]
     chunks.in_chunks(loops.fuse_by_rules, rank, bounds, log, K, *seen, *how, belief, rest, drift_sum)
+    if evidence is not None:
+        for own, (to, model) in ((belief, [first[rows] for rows in alike]), (rest, alike), (drift_sum, alike)):
+            own[:, to] = own[:, model]
     return [
         Fused(Belief(first, label, belief[r], K, rest[r]), op.astype(np.int32), drift_sum[r]) for r in range(len(rules))
     ]
@@ -112,12 +129,25 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     return first, label
 
 
+def _one_of_each(rows: Int64, op: Int64, evidence: Evidence) -> tuple[Int64, tuple[Int64, Int64]]:
+    """These rows without those that are like another one, and which those are, and like which.
+
+    Voxels of which all frames saw one class, and nothing else, are alike if as many frames saw them.
+    """
+    first = evidence.starts[:-1][rows]
+    same = (evidence.starts[1:][rows] - first == 1) & (evidence.weight[first] == op[rows])
+    alike, others = rows[same], rows[~same]
+    model = np.zeros(int(op.max(initial=0)) + 1, np.int64)
+    model[op[alike]] = alike
+    models = model[op[alike]]
+    return np.concatenate([others, alike[models == alike]]), (alike, models)
+
+
 def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:
     """Class (n,) of the largest belief of evidence (n, K), the lowest of those that tie: rounding decides none."""
-    return np.concatenate([_label(normalise(evidence[some])) for some in row_chunks(*evidence.shape)])
+    from semstab.statistics.loops.rows import label_near
 
-
-def _label(belief: Float64) -> npt.NDArray[np.int64]:
-    near: npt.NDArray[np.bool_] = belief >= belief.max(axis=1, keepdims=True) - ONE_HOT
-    highest: npt.NDArray[np.int64] = near.argmax(axis=1)
-    return highest
+    kept = Evidence.of(evidence)
+    rest, found = kept.unseen, np.empty(len(kept), np.int64)
+    label_near(kept.entries, np.zeros(0) if rest is None else rest, kept.K, ONE_HOT, found)
+    return found

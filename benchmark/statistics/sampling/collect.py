@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics.matching import voxel_keys
-from semstab.model.evidence import row_chunks, stretches
+from semstab.model.evidence import row_chunks
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
 from semstab.statistics.ranks import numbered, ranked
-from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
+from semstab.statistics.sampling.cubes import cell_edge, cells_of
+from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
 
@@ -148,41 +147,6 @@ def _with_places(
         frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
         columns=np.concatenate([sums.columns, columns[some]]),
     )
-
-
-def cells_of(
-    index: npt.NDArray[np.int32], voxel_size: float, edge: float
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """The cubes (G, 3) that hold voxels (n, 3), and which of them each is in."""
-    parts = [_distinct(_at(index[some], voxel_size, edge)) for some in stretches(len(index))]
-    cells, of = _distinct(np.concatenate(parts)), np.empty(len(index), dtype=np.int64)
-    for some in stretches(len(index)):
-        keys, sorted_keys = voxel_keys(_at(index[some], voxel_size, edge), cells)
-        of[some] = np.searchsorted(sorted_keys, keys)
-    return cells.astype(np.int32), of
-
-
-def cell_edge(index: npt.NDArray[np.int32], voxel_size: float) -> float:
-    """The smallest power of 2, in metres and no smaller than a voxel, that leaves at most MOST_CELLS cubes."""
-    edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
-    cells = np.zeros((0, 3), dtype=np.int64)
-    for some in stretches(len(index)):
-        cells = _distinct(np.concatenate([cells, _at(index[some], voxel_size, edge)]))
-        while len(cells) > MOST_CELLS:
-            cells, edge = _distinct(cells // 2), 2 * edge
-    return edge
-
-
-def _at(index: npt.NDArray[np.int32], voxel_size: float, edge: float) -> Int64:
-    """The cube (n, 3) that each voxel is in."""
-    cell: Int64 = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
-    return cell
-
-
-def _distinct(cells: Int64) -> Int64:
-    """Each of the cubes (n, 3) once, sorted."""
-    (key,) = voxel_keys(cells)
-    return cells[np.unique(key, return_index=True)[1]]
 
 
 def _step(frame: npt.NDArray[np.int32], K: int) -> int:

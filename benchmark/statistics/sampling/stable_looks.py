@@ -13,7 +13,7 @@ from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.ranks import added, distinct_rows
-from semstab.statistics.sampling.collect import cells_of
+from semstab.statistics.sampling.cubes import cells_of
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
 

@@ -10,13 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.summary import STRATA
-from semstab.model.measures import dominant
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.array_form import from_arrays, to_arrays
 from semstab.statistics.blocks import Occupied
-from semstab.statistics.correctness import Judged, Truth, judged_sums, stratum_sums
+from semstab.statistics.correctness import Judged, Truth, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
-from semstab.statistics.map_sums import Maps, MapSums, mean_columns
+from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.order.drift import flips, voxel_drift
 from semstab.statistics.sampling import Places, PlaceSums
 from semstab.statistics.sampling.stable_looks import StableLooks
@@ -46,13 +45,12 @@ class TruthSums:
         cls, table: VoxelTable, events: Events | None, truth: Truth, edges: Sequence[int], sums: MapSums
     ) -> TruthSums:
         """Of a table whose other sums these are."""
-        again, counted = table.op >= 2, truth.known & (table.op >= 2)
-        places = Places(table.index[again], table.voxel_size, sums.places.edge)
-        right = mean_columns(np.where(truth.known, dominant(table) == truth.label, np.nan))
+        places, judged = Places.of(table, sums.places.edge), Judged.of(table.evidence, truth.label)
+        right = {"right": np.where(truth.known, judged.right, np.nan)}
         return cls(
-            PlaceSums(places.cell, places.edge, {"right": places.sums(right[again])}),
-            stratum_sums(table, truth, edges),
-            judged_sums(Judged.of(table.evidence.take(counted), truth.label[counted])),
+            PlaceSums(places.cell, places.edge, places.means(right)),
+            judged_strata(judged, table.op, truth.known, edges),
+            judged_where(judged, truth.known & (table.op >= 2)),
             StableLooks.of(table, events, truth.label, sums.influence.edge, sums.influence.step),
         )
 
@@ -123,6 +121,7 @@ def first_look(
 
     See `analyse` for what it takes.
     """
+    table = table.measured()
     drift = None if events is None else voxel_drift(table, events, seed=seed, sample=0)
     label = None if truth is None else truth.label
     null = None if drift is None else drift.null

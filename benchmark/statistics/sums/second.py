@@ -12,7 +12,7 @@ from semstab.metrics.matching import shared_rows
 from semstab.model.statistics import DriftTests
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.correctness import Truth, quadrant_sums, stable_wrong
+from semstab.statistics.correctness import Truth, quadrant_sums, wrong_of_steady
 from semstab.statistics.judging.ceiling import loss_sums
 from semstab.statistics.judging.flipping import FlippingSums
 from semstab.statistics.map_sums import Maps
@@ -105,10 +105,11 @@ def second_look(
     table: VoxelTable, whole: Whole, truth: Truth | None = None, limit: VoxelTable | None = None
 ) -> tuple[SecondSums, Maps]:
     """The sums of a part, a table, and which of its voxels are stable, and wrong."""
+    table = table.measured()
     stable, edge = steady(table, whole.shares), whole.first.own.places.edge
     maps: Maps = {"stable": stable}
     if truth is not None:
-        maps["stable_wrong"] = stable_wrong(table, truth, whole.shares)
+        maps["stable_wrong"] = wrong_of_steady(table, truth, stable)
     found = SecondSums(
         FlippingSums.of(table, stable, edge),
         None if truth is None else quadrant_sums(table, truth, stable, edge),
