@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.series import to_csv
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
@@ -26,7 +25,6 @@ from semstab.metrics.summary import TableSums
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
 from semstab.model.results import Agreement
 from semstab.model.voxels import VoxelTable
-from semstab.runtime.files import write_text
 from semstab.statistics import Looks, Sample
 from semstab.statistics.description import concluded
 from semstab.statistics.looks.sampler import merged
@@ -99,7 +97,7 @@ def assembled(
     files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
     savers: Savers = {}
     if planned.kept:
-        savers[f"{FRAMES}/{unit.slug}.csv"] = lambda path: write_text(path, to_csv(rows))
+        savers[f"{FRAMES}/{unit.slug}.csv"] = rows.save_csv
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
             files |= {name: digest for each in again for name, digest in each.files.items()}

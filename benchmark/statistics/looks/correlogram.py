@@ -21,7 +21,7 @@ from semstab.statistics.agreement import between_of
 from semstab.statistics.looks.entries import Sample
 from semstab.statistics.sampling.cubes import cell_edge, cells_of
 from semstab.statistics.sampling.influence import MOST_GROUPS
-from semstab.statistics.sampling.intervals import of_looks
+from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -102,7 +102,11 @@ def correlogram(sample: Sample) -> Correlogram:
     for pairs in _pairs(sample, seen, limit, cells):
         for axis, into in bins.items():
             into.add(pairs.apart["angle" if axis == "standard" else axis], pairs)
-    found = {axis: tuple(into.found()) for axis, into in bins.items()}
+    there = [(axis, *own) for axis, into in bins.items() for own in into.found()]
+    alphas = answers(asked for _, _, asked in there)
+    found: dict[str, tuple[LagBin, ...]] = dict.fromkeys(bins, ())
+    for (axis, own, _), alpha in zip(there, alphas, strict=True):
+        found[axis] += (dataclasses.replace(own, alpha=alpha),)
     nothing = LagBin(*STANDARD, math.nan, 0, UNKNOWN, math.nan)
     (standard,) = found.pop("standard") or (nothing,)
     return Correlogram(**found, standard=standard)
@@ -173,8 +177,8 @@ class _Bins:
             for to, column in zip(self._looks, looks.T, strict=True):
                 to += np.bincount(cell, weights=column[inside], minlength=to.size).reshape(shape)  # noqa: PLW2901
 
-    def found(self) -> Iterator[LagBin]:
-        """The bins in which there is enough."""
+    def found(self) -> Iterator[tuple[LagBin, Asked]]:
+        """The bins in which there is enough, and what is asked of each."""
         for k in np.flatnonzero(self._pairs >= LEAST_PAIRS):
             columns = self._looks[:, k].transpose(1, 2, 0)
             cube, group = np.nonzero(columns[:, :, 1])
@@ -182,7 +186,7 @@ class _Bins:
                 continue
             own, looks = self.cells, columns[cube, group]
             whole = looks[:, :2]  # of its agreement with the other one, neither look has half for itself alone
-            alpha = of_looks(own.at[cube], own.frames[group], own.edge, own.step, looks, whole, between_of)
+            alpha = asked_of_looks(own.at[cube], own.frames[group], own.edge, own.step, looks, whole, between_of)
             low, high, pairs = float(self.edges[k]), float(self.edges[k + 1]), self._pairs[k]
             ceiling = float(between_of(self._limit[:, k]))
-            yield LagBin(low, high, float(self._apart[k] / pairs), int(pairs), alpha, ceiling)
+            yield LagBin(low, high, float(self._apart[k] / pairs), int(pairs), UNKNOWN, ceiling), alpha

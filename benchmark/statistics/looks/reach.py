@@ -14,7 +14,7 @@ import numpy.typing as npt
 from semstab.model.statistics import ClassReach, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.looks.entries import Sample
-from semstab.statistics.sampling import InfluenceSums, estimate, influence_sums, question_of, value
+from semstab.statistics.sampling import InfluenceSums, answers, asked_of, influence_sums, question_of, value
 
 SUPPORT = 100.0
 """Places from which on a class matters to the verdict, where no critical classes are named."""
@@ -54,12 +54,17 @@ def reach_from(
     question = question_of(sums)
     names = sums.classes or tuple(str(k) for k in range(len(places)))
     named = set(critical) & set(names)
+    parts = (sums.seen, "alpha_between", None), (sums.limit, "alpha_between", None), (sums, "reached", None)
+    by_class = ((sums, "reached", k) for k in range(len(names)))
+    alpha, ceiling, reached, *of_classes = answers(
+        asked_of(part, key, k, question) for part, key, k in (*parts, *by_class)
+    )
     return Reach(
         by=by,
         voxels=round(float(sums.seen["voxels"].sum())),
-        alpha=estimate(sums.seen, "alpha_between", question=question),
-        ceiling=estimate(sums.limit, "alpha_between", question=question),
-        reached=estimate(sums, "reached", question=question),
+        alpha=alpha,
+        ceiling=ceiling,
+        reached=reached,
         classes=tuple(
             ClassReach(
                 name,
@@ -67,7 +72,7 @@ def reach_from(
                 name in named if named else bool(places[k] >= least),
                 value(sums.seen, "alpha_between", k),
                 value(sums.limit, "alpha_between", k),
-                estimate(sums, "reached", k, question),
+                of_classes[k],
             )
             for k, name in enumerate(names)
         ),

@@ -1,28 +1,31 @@
 """What a map's numbers would be elsewhere, or in the next flight: sums by frame and cube of space, and intervals."""
 
 from semstab.statistics.sampling.collect import influence_sums, with_sample
+from semstab.statistics.sampling.combined import mean_of, standard_error, unpaired
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
 from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
+    answers,
+    asked_of,
     difference,
     estimate,
     identical,
     judged_of,
-    mean_of,
     none,
     question_of,
-    standard_error,
-    unpaired,
 )
 from semstab.statistics.sampling.paired import coverage, difference_over_frames, mean_over_frames, same_flight
-from semstab.statistics.sampling.places import Places, PlaceSums
+from semstab.statistics.sampling.places import Mean, Places, PlaceSums
 
 __all__ = [
     "LEAST_FRAMES",
     "InfluenceSums",
+    "Mean",
     "PlaceSums",
     "Places",
     "aligned",
+    "answers",
+    "asked_of",
     "coverage",
     "difference",
     "difference_over_frames",

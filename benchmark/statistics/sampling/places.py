@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ from semstab.model.concentration import by_group
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import Interval
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
-from semstab.statistics.sampling.intervals import of_places
+from semstab.statistics.sampling.intervals import answers, asked_of_places
 
 Float64 = npt.NDArray[np.float64]
 
@@ -42,6 +43,10 @@ class Places:
         some = table.op >= 2 if where is None else where
         return cls(*cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
 
+    def rows(self, rows: npt.NDArray[np.int64]) -> Places:
+        """The same cubes, for some of the voxels."""
+        return replace(self, at=self.at[rows])
+
     @property
     def count(self) -> int:
         """How many cubes there are."""
@@ -49,11 +54,11 @@ class Places:
 
     def sums(self, columns: Float64) -> Float64:
         """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
-        return by_group(self.at, np.ascontiguousarray(columns.T, np.float64), self.count)[0]
+        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
         """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
-        both = by_group(self.at, np.stack([*values.values()]).astype(np.float64, copy=False), self.count)
+        both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
     def sums_by_class(self, evidence: Evidence, op: npt.NDArray[np.int32]) -> tuple[Float64, Float64]:
@@ -76,6 +81,24 @@ class Places:
         Where no scale is given, what goes from 0 to 1 is a share.
         """
         return PlaceSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A statistic of sums (..., C) by name, the second of which counts: a mean, or any other.
+
+    Where no scale is given, what goes from 0 to 1 is a share.
+    """
+
+    sums: str
+    of: Statistic = ratio_of
+    bounds: tuple[float, float] = (0.0, 1.0)
+    scale: Scale | None = None
+
+    @property
+    def kind(self) -> Scale:
+        """The scale of its interval."""
+        return self.scale or ("share" if self.bounds == (0.0, 1.0) else "plain")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,12 +128,16 @@ class PlaceSums:
         bounds: tuple[float, float] = (0.0, 1.0),
         scale: Scale | None = None,
     ) -> Interval:
-        """The statistic of sums (..., C), the second of which counts, with its interval.
+        """The statistic of sums (..., C), the second of which counts, with its interval; see `Mean`."""
+        return self.estimates({name: Mean(name, statistic, bounds, scale)})[name]
 
-        Where no scale is given, what goes from 0 to 1 is a share.
-        """
-        kind: Scale = scale or ("share" if bounds == (0.0, 1.0) else "plain")
-        return of_places(self.cell, self.edge, self.sums[name], statistic, kind, bounds)
+    def estimates(self, means: Mapping[str, Mean]) -> dict[str, Interval]:
+        """Several of them, together."""
+        asked = (
+            asked_of_places(self.cell, self.edge, self.sums[own.sums], own.of, own.kind, own.bounds)
+            for own in means.values()
+        )
+        return dict(zip(means, answers(asked), strict=True))
 
     @classmethod
     def merged(cls, parts: Sequence[PlaceSums]) -> PlaceSums:
