@@ -130,11 +130,12 @@ class Told(InProcess):
     """In this process; remembers the portions, and which of them outgrew the memory."""
 
     def __init__(self, stop_after: int = 1000) -> None:
-        self.left, self.done = stop_after, []
+        self.left, self.done, self.causes = stop_after, [], []
 
     def run(self, jobs, observers) -> Generator:
         for job, outcomes in super().run(jobs, observers):
             self.done += [(outcome.portion, outcome.outgrown) for outcome in outcomes]
+            self.causes += [outcome.cause for outcome in outcomes if outcome.cause is not None]
             yield job, outcomes
             self.left -= 1
             if not self.left:
@@ -418,6 +419,8 @@ def test_parts_that_outgrow_the_memory_are_cut_in_two_and_nothing_finished_is_lo
     semstab.engine.run(config, out=out, executor=second)
     assert kept.isdisjoint(name for name, _ in second.done)
     assert [outgrown for name, outgrown in first.done if name.startswith("tiles")] == [True, True, True, False, False]
+    assert len(first.causes) == 3
+    assert not any(cause.__traceback__ for cause in first.causes), "frames of a traceback keep the map in memory"
     assert not any(outgrown for _, outgrown in second.done)
     assert_same_run(both[0], out)
 

@@ -8,13 +8,13 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from semstab.backends import restrictable
+from semstab.backends import frame_bytes, restrictable
 from semstab.config import Config
 from semstab.engine.survey import Survey
 from semstab.engine.tiling.partition import Tiling, tiled
 from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large
+from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large, voxels_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
@@ -68,7 +68,7 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
     size = config.tile_size if isinstance(config.tile_size, int) else None
     sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
-    kinds, load = _kinds(group, soft=soft), _load(group, first, soft=soft)
+    kinds, load = _kinds(group, first, soft=soft), _load(group, first, soft=soft)
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
     own = room(config, width, load.beside(voxels, needed))
     if not forced and needed <= own:
@@ -80,7 +80,7 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
         line = too_large(task, names, settings, voxels, needed, own, f" ({why})")
         found.refused |= {each.identity: line for each in group}
         return
-    budget = SHARE * own
+    budget = SHARE * room(config, width, load.beside(voxels, needed, in_tiles=True))
     for each, kind in zip(group, kinds, strict=True):
         found.tilings[each.identity] = tiled(sights, kind.bytes, budget, size, 2 * width if width > 1 else 1)
     tiling = found.tilings[group[0].identity]
@@ -98,7 +98,7 @@ def _surely_fits(config: Config, width: int, group: Sequence[PlannedUnit], first
     voxels = most_voxels(task, settings, first)
 
     def fits(*, soft: bool) -> bool:
-        needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft))
+        needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, first, soft=soft))
         return needed <= room(config, width, _load(group, first, soft=soft).beside(voxels, needed))
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
@@ -115,7 +115,10 @@ def _first(task: Task, settings: Config) -> Frame:
     return task.scene.geometry(task.indices[0]).every(settings.pixel_stride)
 
 
-def _kinds(group: Sequence[PlannedUnit], *, soft: bool) -> list[Kind]:
+def _kinds(group: Sequence[PlannedUnit], first: Frame, *, soft: bool) -> list[Kind]:
+    touched = 0
+    if any(frame_bytes(each.unit.backend, 1, 2) for each in group):
+        touched = voxels_of(first, group[0].config.voxel_size, len(group[0].task.mapping.target))
     return [
         Kind(
             each.unit.backend,
@@ -123,6 +126,7 @@ def _kinds(group: Sequence[PlannedUnit], *, soft: bool) -> list[Kind]:
             soft=soft,
             logged=each.config.statistics or each.config.events,
             sampled=each.sampled,
+            touched=touched,
         )
         for each in group
     ]

@@ -119,7 +119,7 @@ def _by_group(values: Sequence[Float64], op: Int32, group: npt.NDArray[np.int64]
     and how often OP is high enough for it."""
     levels = sorted({1, *(measure.lowest_op for measure in measures())})
     enough = [np.where(op >= level, 1.0, np.nan) for level in levels]
-    sums, defined = by_group(group, np.stack([*values, *enough]), groups)
+    sums, defined = by_group(group, [*values, *enough], groups)
     often = dict(zip(levels, defined.T[len(values) :], strict=True))
     rows = [often[1]]
     for measure, total, known in zip(measures(), sums.T, defined.T, strict=False):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -52,13 +52,16 @@ class Concentration:
         return Concentration(*(values[rows] for values in vars(self).values()))
 
 
-def by_group(group: npt.NDArray[Any], values: Float64, groups: int) -> tuple[Float64, Float64]:
-    """(groups, C) sums of values (C, n) by group (n,), and how often they are defined; -1 is no group."""
+def by_group(
+    group: npt.NDArray[Any], values: Sequence[npt.NDArray[Any]] | Float64, groups: int
+) -> tuple[Float64, Float64]:
+    """(groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group."""
     from semstab.model.row_kernel import add_by_group
 
     def of(some: slice) -> Float64:
         part = np.zeros((2, groups, len(values)))
-        add_by_group(group[some].astype(np.int64, copy=False), values[:, some], *part)
+        own = np.stack([column[some] for column in values], dtype=np.float64)
+        add_by_group(group[some].astype(np.int64, copy=False), own, *part)
         return part
 
     sums, defined = blockwise(of, len(group), groups)

@@ -178,10 +178,7 @@ def sbd(table: Beliefs) -> Float64:
 
 def mean_drift(drift_sum: Float64, op: Int32) -> Float64:
     """SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
-    drift = np.full(len(op), np.nan)
-    again = op >= 2
-    drift[again] = drift_sum[again] / (op[again] - 1)
-    return drift
+    return np.where(op >= 2, drift_sum / np.maximum(op - 1, 1), np.nan)
 
 
 def op(table: Beliefs) -> Int32:

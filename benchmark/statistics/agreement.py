@@ -39,11 +39,8 @@ def psa(table: VoxelTable) -> Float64:
     expectation is ||pi||^2 for every T >= 2.
     """
     T = table.op.astype(np.float64)
-    pairs = table.evidence.concentration.squares - table.self_sum
-    agreement = np.full(len(table), np.nan)
-    again = table.op >= 2
-    agreement[again] = np.clip(pairs[again] / (T * (T - 1))[again], 0.0, 1.0)
-    return agreement
+    agreeing = table.evidence.concentration.squares - table.self_sum
+    return np.where(T >= 2, np.clip(agreeing / np.maximum(T * (T - 1), 1), 0.0, 1.0), np.nan)
 
 
 def fleiss_kappa(table: VoxelTable) -> float:
@@ -193,7 +190,7 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
         one_hot, told = np.ones(len(table), np.bool_), one_hot_where(table, again)
         log, bounds = table.evidence.entries, np.zeros(len(table) + 1, np.int64)
     else:
-        log, bounds, told = events.evidence.entries, np.append(events.starts, len(events)), True
+        log, bounds, told = events.evidence.entries, events.bounds, True
     add_class_sums(table.evidence.entries, table.op, one_hot, bounds, log, sums[:5])
     if not told:
         sums[2:5, sums[0] > 0] = np.nan

@@ -182,8 +182,7 @@ def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
 
 def stratum_sums(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> Float64:
     """(2 * len(BY_STRATUM), strata) of maps: their sums, and how often each is defined."""
-    values = np.stack([maps[name] for name in BY_STRATUM])
-    both = by_group(groups_of(table.op, edges), values, len(edges) + 1)
+    both = by_group(groups_of(table.op, edges), [maps[name] for name in BY_STRATUM], len(edges) + 1)
     return np.stack(both, axis=-1).reshape(len(edges) + 1, -1).T
 
 

@@ -74,7 +74,7 @@ def scene_drift(
     `drift` is what `voxel_drift` says of the same map.
     """
     test = order_test(*sampled(table, events, seed), seed=seed, frame_orders=frame_orders)
-    one_way, by_chance, all_of_it = trend_columns(table, drift).sum(axis=0)
+    one_way, by_chance, all_of_it = trend_columns(table, drift)[1].sum(axis=0)
     return SceneDrift(
         sbd=mean(sbd(table)),
         null=mean(drift.null),

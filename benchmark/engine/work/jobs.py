@@ -180,7 +180,8 @@ def failed(requests: Iterable[Request], error: str | Exception, *, outgrown: boo
     if isinstance(error, str):
         return [Outcome(each.identity, portion=_portion(each), error=error, outgrown=outgrown) for each in requests]
     trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
-    outgrown = isinstance(error, (OutgrownError, MemoryError))
+    if outgrown := isinstance(error, (OutgrownError, MemoryError)):
+        error = error.with_traceback(None)  # it would keep the map, and what halves of it take comes on top
     return [
         Outcome(
             each.identity,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.backends import FusionBackend
 from semstab.backends.numpy_reference import NumpySample
@@ -21,9 +22,13 @@ from semstab.metrics import FrameJudge, flicker_percent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
+from semstab.runtime.rows import Rows
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Sampler
 from semstab.task import Task, prepare
+
+AXES = 9
+"""Numbers that tell where a camera is, which way it looks and how it is rolled."""
 
 SHOWN_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
@@ -115,13 +120,18 @@ class Stream:
         self.judge = FrameJudge(len(self.task.mapping.target)) if wanted else None
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
         self.truth_task = truth_task(self.task) if takes_truth else None
-        self.poses: list[Any] = []
+        self._poses = Rows(AXES) if self.image_space is not None and self.task.scene.up is None else None
         stretch = maps[0].request.stretch
         self.lead = 0 if stretch is None else stretch.lead
         self.ahead = frozenset(self.task.indices[: self.lead])  # seen for the sake of those after them
         middle = self.task.indices[len(self.task.indices) // 2]
         self.shown = None if self.image_space is None else middle if stretch is None else stretch.shown
         self.overview: dict[str, Any] = {}
+
+    @property
+    def poses(self) -> npt.NDArray[np.float64]:
+        """(F, 3, 3) down, forward and centre of each camera in the world; of none where up need not be estimated."""
+        return np.zeros((0, 3, 3)) if self._poses is None else self._poses.table().reshape(-1, 3, 3)
 
     def next_frame(self, decoded: Decoded, watch: Stopwatch, *, color: bool) -> Prepared:
         """The frame as the stream's units fuse it; with its colour only where somebody but the figures wants it."""
@@ -142,8 +152,8 @@ class Stream:
         if decoded.index == self.shown and decoded.index not in self.ahead:
             self.overview = _overview(self.task, decoded.frame)
             frame = frame if color else dataclasses.replace(frame, color=None)
-        if decoded.index not in self.ahead:
-            self.poses.append(frame.T_wc)
+        if self._poses is not None and decoded.index not in self.ahead:
+            self._poses.append(frame.T_wc[:3, 1:].ravel())
         self.previous = frame
         return Prepared(frame, truth, flicker, lap.seconds)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,10 @@ class Places:
         some = table.op >= 2 if where is None else where
         return cls(*cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
 
+    def rows(self, rows: npt.NDArray[np.int64]) -> Places:
+        """The same cubes, for some of the voxels."""
+        return replace(self, at=self.at[rows])
+
     @property
     def count(self) -> int:
         """How many cubes there are."""
@@ -52,11 +56,11 @@ class Places:
 
     def sums(self, columns: Float64) -> Float64:
         """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
-        return by_group(self.at, np.ascontiguousarray(columns.T, np.float64), self.count)[0]
+        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
         """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
-        both = by_group(self.at, np.stack([*values.values()]).astype(np.float64, copy=False), self.count)
+        both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
     def sums_by_class(self, evidence: Evidence, op: npt.NDArray[np.int32]) -> tuple[Float64, Float64]:
