@@ -35,9 +35,19 @@ def numbered(values: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
     if not len(values) or values.min() < 0 or values.max() >= SPARSE * len(values):
         found, of = np.unique(values, return_inverse=True)
         return found.astype(np.int64), of.astype(np.int64)
+    found = distinct(values)
+    number = np.empty(int(found[-1]) + 1, np.int64)
+    number[found] = np.arange(len(found))
+    return found, number[values]
+
+
+def distinct(values: npt.NDArray[np.integer]) -> Int64:
+    """The distinct values, ascending: np.unique, by a table where they are dense."""
+    if not len(values) or values.min() < 0 or values.max() >= SPARSE * len(values):
+        return np.unique(values).astype(np.int64)
     there = np.zeros(int(values.max()) + 1, np.bool_)
     there[values] = True
-    return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
+    return np.flatnonzero(there)
 
 
 def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:

@@ -89,3 +89,11 @@ def runs(ix, iy, iz, some, scale, cells, of):
             count += 1
         of[i] = count - 1
     return count
+
+
+@serial
+def renumber(of, number):
+    """Put the number of a run's cube in the place of the run's (n,)."""
+    for i in range(of.shape[0]):
+        if of[i] >= 0:
+            of[i] = number[of[i]]

@@ -13,7 +13,7 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ONE_HOT, psa
-from semstab.statistics.ranks import numbered, ranked
+from semstab.statistics.ranks import SPARSE, distinct, ranked
 from semstab.statistics.sampling.cubes import cell_edge, cells_of
 from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
@@ -80,8 +80,7 @@ def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float
     index = np.stack([events.ix, events.iy, events.iz], axis=1)
     at, of = cells_of(index[again], events.voxel_size, edge)
     K = int(events.evidence.shape[1])
-    step = _step(events.frame, K)
-    frames, group = numbered(events.frame // step)
+    frames, group, step = _groups(events.frame, K)
     sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
@@ -149,11 +148,16 @@ def _with_places(
     )
 
 
-def _step(frame: npt.NDArray[np.int32], K: int) -> int:
-    step, distinct = 1, numbered(frame)[0]
-    while len(distinct) > most_groups(K):
-        step, distinct = 2 * step, np.unique(distinct // 2)
-    return step
+def _groups(frame: npt.NDArray[np.int32], K: int) -> tuple[Int64, Int64, int]:
+    """The groups of frames, ascending, which one each frame (m,) is in, and how many frames a group has at most."""
+    step, seen = 1, distinct(frame)
+    while len(groups := np.unique(seen // step)) > most_groups(K):
+        step *= 2
+    if len(seen) and (seen[0] < 0 or seen[-1] > SPARSE * len(frame)):
+        return groups, np.searchsorted(groups, frame // step), step
+    of = np.zeros(int(seen.max(initial=0)) + 1, np.int64)
+    of[seen] = np.searchsorted(groups, seen // step)
+    return groups, of[frame], step
 
 
 def _sums_of_log(

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.ranks import added, distinct_rows
+from semstab.statistics.ranks import added, distinct_rows, numbered
 from semstab.statistics.sampling.cubes import cells_of
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
@@ -51,7 +51,7 @@ class StableLooks:
         T, wrong = some.op.astype(np.int64), dominant(some) != true_label[counted]
         longest = int(T.max(initial=0)) + 1
         packed = ((of * longest + T) * longest + np.rint(vss(some) * T).astype(np.int64)) * 2 + wrong
-        kinds, kind = np.unique(packed, return_inverse=True)
+        kinds, kind = numbered(packed)
         pairs, is_wrong = np.divmod(kinds, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
         keys = np.column_stack([cell[ofs], np.full(len(kinds), -1), *np.divmod(votes, longest), is_wrong])
