@@ -97,7 +97,7 @@ def require_same_grid(*tables: VoxelTable | Events) -> None:
 
 def require_same_map(table: VoxelTable, events: Events) -> None:
     """Raise DataError where the events are not the log behind the table."""
-    op = np.diff(np.append(events.starts, len(events)))
+    op = np.diff(events.bounds)
     if not (len(table) == len(events.ix) and np.array_equal(table.op, op)):
         raise DataError(
             f"events of {len(events.ix)} voxels and {len(events)} observations do not belong to a table of"

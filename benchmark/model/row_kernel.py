@@ -68,6 +68,6 @@ def add_by_group(group: Any, values: Any, sums: Any, defined: Any) -> None:
             continue
         for c in range(values.shape[0]):
             value = values[c, i]
-            if value == value:  # noqa: PLR0124 - NaN is not
-                sums[g, c] += value
-                defined[g, c] += 1.0
+            known = value == value  # noqa: PLR0124 - NaN is not
+            sums[g, c] += value if known else 0.0
+            defined[g, c] += 1.0 if known else 0.0

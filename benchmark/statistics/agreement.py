@@ -190,7 +190,7 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
         one_hot, told = np.ones(len(table), np.bool_), one_hot_where(table, again)
         log, bounds = table.evidence.entries, np.zeros(len(table) + 1, np.int64)
     else:
-        log, bounds, told = events.evidence.entries, np.append(events.starts, len(events)), True
+        log, bounds, told = events.evidence.entries, events.bounds, True
     add_class_sums(table.evidence.entries, table.op, one_hot, bounds, log, sums[:5])
     if not told:
         sums[2:5, sums[0] > 0] = np.nan

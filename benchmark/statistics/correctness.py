@@ -14,7 +14,7 @@ from semstab.metrics.matching import shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.model.concentration import blockwise, by_group
 from semstab.model.evidence import Evidence
-from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures, vss
+from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
@@ -56,9 +56,10 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
     Raises DataError where the maps differ in K or voxel size.
     """
     rows, true_rows = shared_rows(table, truth)
-    pure = vss(truth)[true_rows] > PURE
+    found = truth.evidence.concentration
+    pure = found.largest[true_rows] > PURE
     label = np.full(len(table), -1, dtype=np.int64)
-    label[rows[pure]] = dominant(truth)[true_rows[pure]]
+    label[rows[pure]] = found.label[true_rows[pure]]
     return Truth(label >= 0, label)
 
 

@@ -17,6 +17,7 @@ from semstab.model.evidence import stretches
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE
+from semstab.statistics.ranks import numbered
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -95,8 +96,8 @@ def _votes(table: VoxelTable) -> tuple[Votes, Int64]:
     T = table.op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1
     votes = np.rint(vss(table)[again] * T).astype(np.int64)
-    pairs, of, count = np.unique(votes + T * longest, return_inverse=True, return_counts=True)
-    return Votes(pairs // longest, pairs % longest, count.astype(np.int64)), of.astype(np.int64)
+    pairs, of = numbered(votes + T * longest)
+    return Votes(*np.divmod(pairs, longest), np.bincount(of, minlength=len(pairs)).astype(np.int64)), of
 
 
 def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:

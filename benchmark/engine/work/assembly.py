@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.series import to_csv
 from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduced_of, save_voxels, unit_summary
@@ -28,7 +27,6 @@ from semstab.model.results import Agreement
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.parquet import tile_of
-from semstab.runtime.files import write_text
 from semstab.statistics import Looks, Sample, Truth, join_truth
 from semstab.statistics.description import concluded
 from semstab.statistics.looks.sampler import merged
@@ -89,7 +87,7 @@ def assembled(
     files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
     savers: Savers = {}
     if planned.kept:
-        savers[f"{FRAMES}/{unit.slug}.csv"] = lambda path: write_text(path, to_csv(rows))
+        savers[f"{FRAMES}/{unit.slug}.csv"] = rows.save_csv
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
             files |= found[2]

@@ -243,9 +243,14 @@ class Events:
         return self.evidence.K
 
     @cached_property
+    def bounds(self) -> Int64:
+        """(n + 1,) first row of each voxel, then how many rows there are."""
+        return np.append(np.flatnonzero(np.diff(self.voxel, prepend=-1)), len(self))
+
+    @property
     def starts(self) -> Int64:
         """(n,) first row of each voxel."""
-        return np.flatnonzero(np.diff(self.voxel, prepend=-1))
+        return self.bounds[:-1]
 
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
@@ -273,16 +278,10 @@ class Events:
         edges = np.array([some.start for some in self.evidence.chunks()])
         cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
         for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
-            yield self.stretch(slice(first, last))
-
-    def stretch(self, voxels: slice) -> Events:
-        """The log of consecutive voxels, of which only their numbers are copied."""
-        first, last, _ = voxels.indices(len(self.ix))
-        bounds = np.append(self.starts, len(self))
-        own = slice(bounds[first], bounds[max(first, last)])
-        columns: dict[str, Any] = {name: getattr(self, name)[first:last] for name in _INDEX_TYPES}
-        columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
-        return replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
+            own, of = slice(self.bounds[first], self.bounds[last]), slice(first, last)
+            columns: dict[str, Any] = {name: getattr(self, name)[of] for name in _INDEX_TYPES}
+            columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
+            yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
 
     def beliefs(self) -> Float64:
         """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""

@@ -89,3 +89,20 @@ def runs(ix, iy, iz, some, scale, cells, of):
             count += 1
         of[i] = count - 1
     return count
+
+
+@serial
+def renumber(of, number):
+    """Put the number of a run's cube in the place of the run's (n,)."""
+    for i in range(of.shape[0]):
+        if of[i] >= 0:
+            of[i] = number[of[i]]
+
+
+@serial
+def add_looks(rows, kind, first, starts, ends, group, groups, total):
+    """Add 1 / T for each of the T looks at each of these voxels, at (kind - first) * groups + group."""
+    for i in rows:
+        share, at = 1.0 / (ends[i] - starts[i]), (kind[i] - first) * groups
+        for row in range(starts[i], ends[i]):
+            total[at + group[row]] += share

@@ -251,7 +251,7 @@ def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
     from semstab.statistics.loops import chunks, log_kernels
 
-    bounds = np.append(events.starts, len(events))
+    bounds = events.bounds
     rate, null, since = (np.empty(len(events.ix)) for _ in range(3))
     log = events.evidence
     chunks.in_chunks(log_kernels.count_flips, bounds, events.frame, log.entries, log.K, rate, null, since)

@@ -84,32 +84,29 @@ def fuse_all(
     *,
     floor: float | None = None,
     evidence: Evidence | None = None,
-    where: npt.NDArray[np.bool_] | None = None,
+    rows: Int64 | None = None,
 ) -> list[Fused]:
     """What `fuse` makes of a log by each of some rules, in one pass.
 
     evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
-    where     (n,) the voxels that count, all if not given; what is said of the others means nothing
+    rows      (n,) which voxels of the log these are, where they are not all
     """
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
 
-    K = events.evidence.K
-    bounds, log = np.append(events.starts, len(events)), events.evidence.entries
+    K, log = events.evidence.K, events.evidence.entries
     first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
-    belief = np.ones((len(rules), len(label)))
-    rest, drift_sum = (np.zeros((len(rules), len(first) - 1)) for _ in range(2))
-    op, count = np.diff(bounds), np.diff(first)
-    rows = np.arange(len(op)) if where is None else np.flatnonzero(where)
-    if evidence is not None:
-        rows, alike = _one_of_each(rows, op, evidence)
+    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.bounds[1:]))
+    belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(starts), len(starts)))
+    op, count = ends - starts, np.diff(first)
+    each, (alike, model) = np.arange(len(op)), _NONE_ALIKE if evidence is None else _alike(op, evidence)
+    each = np.concatenate([np.delete(each, alike), np.unique(model)])
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
-    rank = rows[ranked((op * (most + 1) + count)[rows])]
-    chunks.in_chunks(loops.fuse_by_rules, rank, bounds, log, K, *seen, *how, belief, rest, drift_sum)
-    if evidence is not None:
-        for own, (to, model) in ((belief, [first[rows] for rows in alike]), (rest, alike), (drift_sum, alike)):
-            own[:, to] = own[:, model]
+    rank = each[ranked((op * (most + 1) + count)[each])]
+    chunks.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, rest, drift_sum)
+    for own, to, by in ((belief, first[alike], first[model]), (rest, alike, model), (drift_sum, alike, model)):
+        own[:, to] = own[:, by]
     return [
         Fused(Belief(first, label, belief[r], K, rest[r]), op.astype(np.int32), drift_sum[r]) for r in range(len(rules))
     ]
@@ -120,7 +117,7 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
 
-    bounds, log = np.append(events.starts, len(events)), events.evidence.entries
+    bounds, log = events.bounds, events.evidence.entries
     count = np.zeros(len(bounds), np.int64)
     chunks.in_chunks(loops.count_classes, bounds, log, events.evidence.K, count)
     first: Int64 = np.cumsum(count)
@@ -129,18 +126,19 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     return first, label
 
 
-def _one_of_each(rows: Int64, op: Int64, evidence: Evidence) -> tuple[Int64, tuple[Int64, Int64]]:
-    """These rows without those that are like another one, and which those are, and like which.
+_NONE_ALIKE = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
-    Voxels of which all frames saw one class, and nothing else, are alike if as many frames saw them.
+
+def _alike(op: Int64, evidence: Evidence) -> tuple[Int64, Int64]:
+    """Voxels (a,) of which all frames saw one class, and nothing else, and one of as many frames (a,) for each.
+
+    What a rule says of such a voxel depends on its OP only.
     """
-    first = evidence.starts[:-1][rows]
-    same = (evidence.starts[1:][rows] - first == 1) & (evidence.weight[first] == op[rows])
-    alike, others = rows[same], rows[~same]
+    single = np.flatnonzero(np.diff(evidence.starts) == 1)
+    alike = single[evidence.weight[evidence.starts[single]] == op[single]]
     model = np.zeros(int(op.max(initial=0)) + 1, np.int64)
     model[op[alike]] = alike
-    models = model[op[alike]]
-    return np.concatenate([others, alike[models == alike]]), (alike, models)
+    return alike, model[op[alike]]
 
 
 def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:

@@ -38,7 +38,8 @@ def cubes(
         loops.runs(*index, some, scale, cells, of)
     (key,) = voxel_keys(cells[:count])
     _, first, number = np.unique(key, return_index=True, return_inverse=True)
-    return cells[first].astype(np.int32), np.append(number, -1)[of], edge
+    loops.renumber(of, number)
+    return cells[first].astype(np.int32), of, edge
 
 
 def cells_of(index: Int32, voxel_size: float, edge: float) -> tuple[Int32, Int64]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.model.evidence import stretches
-from semstab.model.measures import Beliefs
+from semstab.model.measures import Beliefs, Voxels
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
@@ -53,10 +53,10 @@ class LogSums:
         changes: Flips,
         truth: Truth | None,
         seed: int,
-        edge: float,
+        places: Places,
     ) -> LogSums:
-        """Of a table, with cubes of that edge in metres."""
-        places, (rows, trend) = Places.of(table, edge), trend_columns(table, drift)
+        """Of a table, with the cubes of its voxels with OP >= 2."""
+        rows, trend = trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
             "flip_null": changes.null,
@@ -112,21 +112,19 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
 
 
 def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
-    """(R, 2 + C), of beliefs that are dense a few at a time."""
+    """(R, 2 + C), over the voxels with OP >= 2, some after the others."""
     _, *others = fusion_rules.RULES  # the map's own rule is the first
-    total = np.zeros(())
-    for some in stretches(len(table)):
-        part = table.rows(some)
-        again, usual = part.op >= 2, fusion_rules.labels(part.evidence)
-        known = None if truth is None else Truth(truth.known[some], truth.label[some])
-        by_rule: list[Beliefs] = [
-            part,
-            *fusion_rules.fuse_all(events.stretch(some), others, evidence=part.evidence, where=again),
-        ]
+    total, seen = np.zeros(()), np.flatnonzero(table.op >= 2)
+    for some in stretches(len(seen)):
+        own = seen[some]
+        part = Voxels(table.op[own], table.evidence.take(own), table.drift_sum[own])
+        usual, every = fusion_rules.labels(part.evidence), np.ones(len(own), np.bool_)
+        known = None if truth is None else Truth(truth.known[own], truth.label[own])
+        by_rule: list[Beliefs] = [part]
+        by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
         rows = []
         for fused in by_rule:
-            relabelled = again & (fusion_rules.labels(fused.evidence) != usual)
-            counts = [np.count_nonzero(relabelled), np.count_nonzero(again)]
-            rows.append(np.concatenate([counts, rule_sums(fused, again, known)]))
+            relabelled = np.count_nonzero(fusion_rules.labels(fused.evidence) != usual)
+            rows.append(np.concatenate([[relabelled, len(own)], rule_sums(fused, every, known)]))
         total = total + np.stack(rows)
     return total
