@@ -174,6 +174,6 @@ def _sights(survey: Survey, planned: PlannedUnit, settings: Config, cell: int) -
     """What the frames see, kept from before or looked at now."""
     task = planned.task
     noise = None if task.perturbation is None else task.perturbation.model_dump()
-    content = [task.scene.name, task.digest, settings.voxel_size, settings.pixel_stride, noise, task.indices, cell]
+    content = [task.scene.name, task.digest, settings.voxel_size, settings.pixel_stride, noise, [*task.indices], cell]
     key = hashlib.blake2b(json.dumps(content).encode(), digest_size=12).hexdigest()
     return survey.sights(planned, settings, cell, key)

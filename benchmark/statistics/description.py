@@ -24,8 +24,10 @@ from semstab.model.statistics import (
     FlipRates,
     FrameAgreement,
     Interval,
+    Judged,
     Losses,
     MapStatistics,
+    Reach,
     Repeated,
     StratumStatistics,
 )
@@ -34,10 +36,10 @@ from semstab.statistics.agreement import alpha_of, between_of, class_agreement_o
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
 from semstab.statistics.judging.ceiling import losses_of
 from semstab.statistics.judging.verdict import verdict
-from semstab.statistics.looks import Sample, correlogram, reach_from
+from semstab.statistics.looks import Sample, correlogram, reach_by, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
 from semstab.statistics.order.drift import expected_sbd
-from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, judged_of, with_sample
+from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, answered, judged_by, with_sample
 from semstab.statistics.sums import SecondSums, Whole, first_look, second_look
 
 SCHEMA = 1
@@ -145,21 +147,25 @@ def concluded(
 ) -> tuple[MapStatistics, InfluenceSums]:
     """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts."""
     first, own = whole.first, whole.first.own
-    about = _About(name, whole.seed, critical, own.table.summary(voxel_size, classes, edges))
-    means = own.places.estimates(MEANS)
-    influence = whole.influence
+    table, influence = own.table.summary(voxel_size, classes, edges), whole.influence
     if sample is not None:
         influence = with_sample(influence, sample.shared(), logged=first.log is not None)
+    found, judged, reached = answered(
+        own.places.asked(MEANS), judged_by(influence), () if sample is None else reach_by(influence, table.K)
+    )
+    means = dict(zip(MEANS, found, strict=True))
+    reach = None
+    if sample is not None:
+        reach = reach_from(sample.by, own.places["kappa"][2:], influence, reached, critical=critical)
     summary = _concluded(
-        about,
+        _About(name, whole.seed, table, Judged(*judged), reach),
         means,
         own.places,
-        influence,
         sample,
         agreement=_agreement(means, class_agreement_of(own.classes, classes)),
         flipping=second.flipping.flipping(classes),
         drift=_drift(means, own.places, whole),
-        strata=_strata(about.table, own.strata),
+        strata=_strata(table, own.strata),
         geometry=_geometry(whole, second, voxel_size),
         correctness=_correctness(whole, second, edges),
         fusion_rules=None if first.log is None else first.log.rule_outcomes(),
@@ -172,12 +178,13 @@ def concluded(
 
 @dataclass(frozen=True)
 class _About:
-    """Of a map: what the verdict calls it and depends on, the seed of what is drawn, its means."""
+    """Of a map: what the verdict calls it, the seed of what is drawn, its means, and what the verdict rests on."""
 
     name: str
     seed: int
-    critical: Sequence[str]
     table: TableSummary
+    judged: Judged
+    reach: Reach | None
 
 
 def _less(sums: Float64) -> Float64:
@@ -209,15 +216,13 @@ def _concluded(
     about: _About,
     means: Mapping[str, Interval],
     places: PlaceSums,
-    sums: InfluenceSums,
     sample: Sample | None,
     **sections: Any,
 ) -> MapStatistics:
     """All of it, from what was found section by section."""
-    judged, table, count = judged_of(sums), about.table, len(places.cell)
+    judged, reach, table, count = about.judged, about.reach, about.table, len(places.cell)
     repeats = int(places["psa"][1])
     repeated = Repeated(repeats, repeats / table.voxels if table.voxels else math.nan)
-    reach = None if sample is None else reach_from(sample.by, places["kappa"][2:], sums, critical=about.critical)
     said = verdict(
         about.name or "backbone",
         judged=judged,

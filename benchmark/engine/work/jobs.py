@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semstab.check.views import evenly
-from semstab.config import Config, FrameSelection
+from semstab.config import Config, FrameSelection, as_range
 from semstab.engine.observer import Factory
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
@@ -124,7 +124,7 @@ class Request:
 
     def _of(self, portion: Portion | None, frames: Sequence[int]) -> Request:
         """The same, of these frames and that portion alone."""
-        config = self.config.model_copy(update={"frames": FrameSelection(list=tuple(frames))})
+        config = self.config.model_copy(update={"frames": FrameSelection.of(as_range(frames))})
         return replace(self, config=config, portion=portion)
 
     @classmethod
@@ -132,7 +132,7 @@ class Request:
         """What a job is told of it."""
         if not isinstance(planned, PlannedUnit):
             return cls(planned.identity, planned.config, regions=True)
-        frames = FrameSelection(list=tuple(planned.task.indices))
+        frames = FrameSelection.of(planned.task.indices)
         config = planned.config.model_copy(update={"frames": frames})
         wanted = (planned.image_space, planned.kept, planned.judged, planned.sampled)
         return cls(planned.identity, config, *wanted, planned.task.left_out)

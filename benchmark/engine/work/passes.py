@@ -24,7 +24,7 @@ from semstab.engine.work.looking_again import looked_again
 from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
-from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
+from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, in_order, streams_of
 from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.voxels.extent import Extent
@@ -113,7 +113,7 @@ class Pass:
 
     def run(self) -> list[Outcome]:
         """Fuse and measure; the outcome of every unit that was not put off."""
-        order = sorted(frozenset[int]().union(*(stream.indices for stream in self._streams)))
+        order = in_order(self._streams)
         decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
         watched = [one for stream in self._streams for one in stream.maps if one.request.kept or one.request.shown]
         if watched:

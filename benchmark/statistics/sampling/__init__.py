@@ -5,12 +5,14 @@ from semstab.statistics.sampling.combined import mean_of, standard_error, unpair
 from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, of_places_alone, value
 from semstab.statistics.sampling.intervals import (
     LEAST_FRAMES,
+    Asked,
+    answered,
     answers,
     asked_of,
     difference,
     estimate,
     identical,
-    judged_of,
+    judged_by,
     none,
     question_of,
 )
@@ -19,11 +21,13 @@ from semstab.statistics.sampling.places import Mean, Places, PlaceSums
 
 __all__ = [
     "LEAST_FRAMES",
+    "Asked",
     "InfluenceSums",
     "Mean",
     "PlaceSums",
     "Places",
     "aligned",
+    "answered",
     "answers",
     "asked_of",
     "coverage",
@@ -32,7 +36,7 @@ __all__ = [
     "estimate",
     "identical",
     "influence_sums",
-    "judged_of",
+    "judged_by",
     "mean_of",
     "mean_over_frames",
     "merged",

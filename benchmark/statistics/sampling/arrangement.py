@@ -86,7 +86,7 @@ class Arrangement:
     Correlations (C,) are Gaussian or exponential, of a reach; the first is none. Alternatives (A,) are correlations
     with a share of the variance that a cell has for itself.
 
-    reach   (C,)
+    reach   (C,), blocks (C,) the edges of the blocks for it, in cells
     number  (A,) the correlation of an alternative, alone (A,) that share
     """
 
@@ -95,6 +95,7 @@ class Arrangement:
         far = max(self._distance.max(initial=0.0), REACHES[0])
         reaches = [reach for reach in REACHES if reach <= far]
         self.reach = np.repeat([0.0, *reaches], [1, *(2 for _ in reaches)])
+        self.blocks = np.maximum(BLOCK * self.reach, 1.0)
         self.number = np.repeat(np.arange(len(self.reach)), np.where(self.reach > 0, len(ALONE), 1))
         self.alone = np.concatenate([[0.0], np.tile(ALONE, len(self.reach) - 1)])
         self._kernels: dict[float, Float64] = {}
@@ -102,9 +103,12 @@ class Arrangement:
 
     @functools.cached_property
     def _distance(self) -> Float64:
-        square = sum((axis[:, None] - axis) ** 2 for axis in self.at.T)
-        distance: Float64 = np.sqrt(square)
-        return distance
+        return np.asarray(np.sqrt((self._along**2).sum(axis=0)), np.float64)
+
+    @functools.cached_property
+    def _along(self) -> Float64:
+        """(D, G, G) how far cells are apart along each axis."""
+        return np.abs(self.at.T[:, :, None] - self.at.T[:, None])
 
     def far(self, count: int) -> float:
         """How far the first cells are from each other."""
@@ -147,16 +151,12 @@ class Arrangement:
             to[:] = dtrsm(1.0, factor.T, columns, lower=0, trans_a=1).T
         return found
 
-    def block(self, number: Int64) -> Float64:
-        """The edges (m,) of the blocks for correlations (m,), in cells."""
-        return np.maximum(BLOCK * self.reach[number], 1.0)
-
     def kernel(self, block: float) -> Float64:
         """(G, G) in how many of the shifted grids of blocks of that edge two cells share a block."""
         if block not in self._kernels:
-            shared = np.ones((len(self.at), len(self.at)))
-            for axis in self.at.T:
-                shared *= np.maximum(1.0 - np.abs(axis[:, None] - axis) / block, 0.0)
+            shared = np.ones(self._along.shape[1:])
+            for along in self._along:
+                shared *= np.maximum(1.0 - along / block, 0.0)
             self._kernels[block] = shared
         return self._kernels[block]
 
@@ -165,35 +165,27 @@ class Arrangement:
         key = size.tobytes()
         if len(self._known) >= MOST_KNOWN:
             self._known.clear()
-        unknown = np.array([k for k in number.tolist() if (k, key) not in self._known], dtype=np.int64)
-        for some in _stretches(len(unknown), len(size)):
-            found = self._moments(unknown[some], size)
-            self._known |= {(k, key): own for k, own in zip(unknown[some].tolist(), found.T, strict=True)}
+        unknown = [k for k in number.tolist() if (k, key) not in self._known]
+        self._known |= {(k, key): own for k, own in zip(unknown, self._moments(unknown, size), strict=True)}
         known = np.array([self._known[k, key] for k in number.tolist()]).T
         return Moments(known[:2], known[2:4], known[4:])
 
-    def _moments(self, number: Int64, size: Float64) -> Float64:
-        """(7, m) as in `Moments`, coefficient by coefficient."""
-        n, scale, share = len(size), size**GROWTH, size / size.sum()
-        blocks, of = np.unique(self.block(number), return_inverse=True)
-        kernel = np.stack([self.kernel(block)[:n, :n] for block in blocks.tolist()])
-        left = kernel @ share
-        kernel += (left @ share)[:, None, None] - left[:, :, None] - left[:, None, :]
-        kernel *= scale[:, None] * scale
-        of_kernel = np.trace(kernel, axis1=1, axis2=2)[of], np.einsum("bij,bij->b", kernel, kernel)[of]
-        kernel, covariance = kernel[of], self.correlations[number, :n, :n]
-        both, plain = kernel @ covariance, np.full(len(number), (scale**2).sum())
-        return np.stack(
-            [
-                scale @ covariance @ scale,
-                plain,
-                np.trace(both, axis1=1, axis2=2),
-                of_kernel[0],
-                np.einsum("bij,bji->b", both, both),
-                np.einsum("bij,bij->b", both, kernel),
-                of_kernel[1],
-            ]
-        )
+    def _moments(self, numbers: Sequence[int], size: Float64) -> Iterator[Float64]:
+        """Of each correlation, as in `Moments`, coefficient by coefficient."""
+        n, scale, share, block = len(size), size**GROWTH, size / size.sum(), 0.0
+        plain = scale @ scale
+        for number in numbers:
+            if block != (block := float(self.blocks[number])):  # correlations of a reach follow each other
+                kernel = self.kernel(block)[:n, :n]
+                left = kernel @ share
+                kernel = (kernel - left[:, None] - (left - left @ share)) * scale[:, None] * scale
+                of_kernel = kernel.trace(), np.vdot(kernel, kernel)
+            covariance = self.correlations[number, :n, :n]
+            both = kernel @ covariance
+            yield np.array([
+                scale @ covariance @ scale, plain, both.trace(), of_kernel[0],
+                np.vdot(both, both.T), np.vdot(both, kernel), of_kernel[1],
+            ])  # fmt: skip
 
 
 def _stretches(count: int, cells: int) -> Iterator[slice]:

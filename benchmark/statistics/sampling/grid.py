@@ -14,6 +14,7 @@ from semstab.statistics.blocks import gradient_of
 from semstab.statistics.sampling.arrangement import Cells, arranged
 from semstab.statistics.sampling.influence import Statistic
 from semstab.statistics.sampling.reach import Errors, Spread, one_thread, spreads
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 
@@ -69,44 +70,32 @@ class Grid:
         )
 
 
-def influences(
-    cell: npt.NDArray[np.integer],
-    frame: npt.NDArray[np.integer],
-    columns: Float64,
-    of: Statistic,
-    edge: float,
-    step: int,
-    halves: Float64 | None = None,
-) -> Grid | None:
-    """The influences of sums (m, C) by cube (m, 3) and group of frames (m,), -1 where that is not known.
+def influences(where: Where, columns: Float64, of: Statistic, halves: Float64 | None = None) -> Grid | None:
+    """The influences of sums (m, C) by cube and group of frames.
 
     halves (m, 2): of places that two frames saw, what of the first two sums both are held for, instead of half each.
     """
     total = columns.sum(axis=0)
     gradient = gradient_of(of, total)
-    places, row = np.unique(cell.astype(np.int64), axis=0, return_inverse=True)
-    row = row.ravel()
-    everything = np.abs(_sums(row, columns[:, 1], len(places)))
+    everything = np.abs(where.by_place(columns[:, 1]))
     some = everything > TINY * everything.sum()
     if some.sum() < 2 or not np.isfinite(gradient).all():
         return None
     own: Float64 = columns @ gradient
-    block = _sums(row, own, len(places))
     shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
-    known = (frame >= 0) | (step == 0)
-    frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
-    by_frame, size = np.zeros((len(places), len(frames))), np.zeros((len(places), len(frames)))
-    np.add.at(by_frame, (row[known], column), shared[known])
-    np.add.at(size, (row[known], column), np.abs(columns[known, 1]))
+    by_frame, size = where.by_both(shared), where.by_both(np.abs(columns[:, 1]))
     seen = size.sum(axis=0) > 0
-    at = np.ix_(some, seen)
-    one_off = abs(float(gradient[0] * total[1]))
-    return Grid(places[some], frames[seen], block[some], by_frame[at], size[at], everything[some], edge, step, one_off)
-
-
-def _sums(row: npt.NDArray[np.int64], values: Float64, rows: int) -> Float64:
-    sums: Float64 = np.bincount(row, weights=values, minlength=rows).astype(np.float64)
-    return sums
+    return Grid(
+        where.places[some],
+        where.frames[seen],
+        where.by_place(own)[some],
+        by_frame[np.ix_(some, seen)],
+        size[np.ix_(some, seen)],
+        everything[some],
+        where.edge,
+        where.step,
+        one_off=abs(float(gradient[0] * total[1])),
+    )
 
 
 # --- Variance ---------------------------------------------------------------------------------------------------------

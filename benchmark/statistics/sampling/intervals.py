@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ from semstab.statistics.sampling.influence import (
     parts_of,
     value,
 )
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 
@@ -78,6 +79,20 @@ def answers(asked: Iterable[Asked]) -> list[Interval]:
         spread = iter(two_way(known, [own.answered for own in some if own.grid is not None]))
         found += [_nowhere(own.value) if own.grid is None else _answer(own, own.grid, next(spread)) for own in some]
     return found
+
+
+def answered(*groups: Iterable[Asked]) -> list[list[Interval]]:
+    """The same for groups of numbers of one map."""
+    counts = [0] * len(groups)
+
+    def all_of_them() -> Iterator[Asked]:
+        for k, group in enumerate(groups):
+            for own in group:
+                counts[k] += 1
+                yield own
+
+    found = iter(answers(all_of_them()))
+    return [list(itertools.islice(found, count)) for count in counts]
 
 
 def estimate(
@@ -165,12 +180,11 @@ def of_places(
 
     The second column counts what the first is a sum of.
     """
-    return answers([asked_of_places(cell, edge, columns, statistic, scale, bounds, level)])[0]
+    return answers([asked_of_places(Where.of(cell, None, edge), columns, statistic, scale, bounds, level)])[0]
 
 
 def asked_of_places(
-    cell: npt.NDArray[np.integer],
-    edge: float,
+    where: Where,
     columns: Float64,
     statistic: Statistic,
     scale: Scale,
@@ -178,7 +192,7 @@ def asked_of_places(
     level: float = LEVEL,
 ) -> Asked:
     """For `answers`, see `of_places`."""
-    grid = influences(cell, np.full(len(cell), -1), columns, statistic, edge, 0)
+    grid = influences(where, columns, statistic)
     return Asked(float(statistic(columns.sum(axis=0))), grid, THIS_MAP, scale, bounds, level)
 
 
@@ -197,7 +211,7 @@ def asked_of_looks(
     Its interval is for the next flight where frames tell of it, else for this map.
     """
     found = float(statistic(columns.sum(axis=0)))
-    grid = influences(cell, frame, columns, statistic, edge, step, halves)
+    grid = influences(Where.of(cell, frame, edge, step), columns, statistic, halves)
     told = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
     return Asked(found, grid, NEXT_FLIGHT if told else THIS_MAP, "agreement", (-1.0, 1.0), level)
 
@@ -207,11 +221,10 @@ def question_of(sums: InfluenceSums) -> Question:
     return NEXT_FLIGHT if sums.frames * sums.step >= LEAST_FRAMES else THIS_MAP
 
 
-def judged_of(sums: InfluenceSums) -> Judged:
-    """The numbers that a verdict on a map rests on."""
+def judged_by(sums: InfluenceSums) -> Iterator[Asked]:
+    """For `answers`: the numbers that a verdict on a map rests on, in the order of `Judged`."""
     question = question_of(sums)
-    keys = [field.name for field in dataclasses.fields(Judged)]
-    return Judged(*answers(asked_of(sums, key, question=question) for key in keys))
+    return (asked_of(sums, field.name, question=question) for field in dataclasses.fields(Judged))
 
 
 def _nowhere(found: float) -> Interval:
@@ -238,7 +251,7 @@ def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
         return None
     rows = parts_of(sums, number)[0]
     halves = rows.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-    return influences(rows.cell, rows.frame, columns, number.of, rows.edge, rows.step, halves)
+    return influences(rows.where, columns, number.of, halves)
 
 
 # --- Ends -------------------------------------------------------------------------------------------------------------

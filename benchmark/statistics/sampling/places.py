@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +17,8 @@ from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
-from semstab.statistics.sampling.intervals import answers, asked_of_places
+from semstab.statistics.sampling.intervals import Asked, answers, asked_of_places
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 
@@ -133,11 +135,18 @@ class PlaceSums:
 
     def estimates(self, means: Mapping[str, Mean]) -> dict[str, Interval]:
         """Several of them, together."""
-        asked = (
-            asked_of_places(self.cell, self.edge, self.sums[own.sums], own.of, own.kind, own.bounds)
-            for own in means.values()
-        )
-        return dict(zip(means, answers(asked), strict=True))
+        return dict(zip(means, answers(self.asked(means)), strict=True))
+
+    def asked(self, means: Mapping[str, Mean]) -> Iterator[Asked]:
+        """For `answers`."""
+        return (self._asked(own) for own in means.values())
+
+    def _asked(self, mean: Mean) -> Asked:
+        return asked_of_places(self._where, self.sums[mean.sums], mean.of, mean.kind, mean.bounds)
+
+    @functools.cached_property
+    def _where(self) -> Where:
+        return Where.of(self.cell, None, self.edge)
 
     @classmethod
     def merged(cls, parts: Sequence[PlaceSums]) -> PlaceSums:

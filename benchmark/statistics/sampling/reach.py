@@ -178,19 +178,20 @@ class _Together:
 
     def by_kernel(self) -> list[Parts]:
         """What the variances are under each reach that is not unlikely, by its kernel."""
-        return [self._by_kernel(k) for k in range(len(self._count))]
+        block = self._of.blocks[self._of.number]
+        plain = np.zeros_like(self.weight)
+        for edge in set(block[self.weight.any(axis=1)].tolist()):
+            plain[block == edge] = ((self._influence @ self._of.kernel(edge)) * self._influence).sum(axis=1)
+        return [self._by_kernel(k, plain[:, k]) for k in range(len(self._count))]
 
-    def _by_kernel(self, k: int) -> Parts:
-        of, some, size = self._of, np.flatnonzero(self.weight[:, k]), self._size[k, : self._count[k]]
-        block = of.block(of.number[some])
-        edges, edge = np.unique(block, return_inverse=True)
-        plain = np.array([self._influence[k] @ of.kernel(own) @ self._influence[k] for own in edges.tolist()])[edge]
-        total, expected, square = of.moments(of.number[some], size).at(of.alone[some])
-        there = (plain > 0) & (expected > 0)
-        some, block, plain = some[there], block[there], plain[there]
-        total, expected, square = total[there], expected[there], square[there]
+    def _by_kernel(self, k: int, plain: Float64) -> Parts:
+        of, some, size = self._of, np.flatnonzero((self.weight[:, k] > 0) & (plain > 0)), self._size[k]
+        total, expected, square = of.moments(of.number[some], size[: self._count[k]]).at(of.alone[some])
+        there = expected > 0
+        some, total, expected, square = some[there], total[there], expected[there], square[there]
         weight, degrees = self.weight[some, k], np.minimum(expected**2 / square, carriers(self._influence[k]))
-        return Parts(weight / weight.sum(), plain * total / expected, degrees, block, np.ones(len(some)))
+        variance = plain[some] * total / expected
+        return Parts(weight / weight.sum(), variance, degrees, of.blocks[of.number[some]], np.ones(len(some)))
 
     def modelled(self) -> list[Parts]:
         """The same as the correlations have it."""
@@ -202,7 +203,7 @@ class _Together:
         parts = []
         for k, degrees in enumerate(most):
             some = np.flatnonzero(self.weight[:, k])
-            variance, block = self.scatter[some, k] * total[some, k], of.block(of.number[some])
+            variance, block = self.scatter[some, k] * total[some, k], of.blocks[of.number[some]]
             parts.append(
                 Parts(self.weight[some, k], variance, np.full(len(some), degrees), block, total[some, k] / alone[k])
             )
