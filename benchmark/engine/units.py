@@ -327,7 +327,7 @@ def identity(config: Config, task: Task) -> str:
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
-        "frames": task.indices,
+        "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
     return _hash(config, content | ({"beside": beside.model} if config.frame_quality else {}))

@@ -115,7 +115,7 @@ def analyse(
     table, known = table.measured(), None if truth is None else join_truth(table, truth)
     first, further, null = first_look(table, events, known, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
-    second, more = second_look(table, whole, known, limit)
+    second, more = second_look(table, whole.overall, known, limit)
     summary, sums = concluded(
         whole,
         second,
@@ -129,7 +129,7 @@ def analyse(
 
     def maps() -> Maps:
         own = maps_of(table, expected_sbd(table) if null is None else null)
-        return {**own, **further, **more, **whole.maps(table, further)}
+        return {**own, **further, **more, **whole.overall.maps(table, further)}
 
     return Analysis(summary, first.own.table.summary(table.voxel_size, table.classes, edges), sums, maps)
 

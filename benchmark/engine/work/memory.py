@@ -19,8 +19,9 @@ GB = 1e9
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first, all new, is not looked at closer."""
 
-LOADED, LOADED_FOR_SCORES = 190e6, 30e6
-"""Bytes of what a run loads once it is planned (compiled loops, formats of files), and of the sample of looks."""
+LOADED, LOADED_FOR_SCORES, LOADED_FOR_TILES = 170e6, 30e6, 30e6
+"""Bytes of what a run loads once it is planned (compiled loops, formats of files), of the sample of looks, and of what
+is left between parts."""
 FRAMES_AT_WORK = 3
 """Frames that are in memory beside those which are read ahead."""
 
@@ -92,7 +93,7 @@ class Load:
         frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
         dense = 8 * self.K * min(voxels, STRETCH) if in_tiles else 0
         sizes = sizes_bytes(self.first, self.frames, self.K, soft=self.soft)
-        loaded = LOADED + self.soft * LOADED_FOR_SCORES
+        loaded = LOADED + self.soft * LOADED_FOR_SCORES + in_tiles * LOADED_FOR_TILES
         return loaded + frames + max(0.0, dense - maps / 2, sizes - LOADED / 2 - maps)
 
 

@@ -113,7 +113,8 @@ class Stream:
         )
         self.whole = any(one.request.within is None for one in maps)
         self.pixel_stride = maps[0].request.config.pixel_stride
-        self.indices = frozenset(self.task.indices)
+        frames = self.task.indices
+        self.indices: range | frozenset[int] = frames if isinstance(frames, range) else frozenset(frames)
         self.previous: Frame | None = None
         self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
         wanted = self.image_space is not None and maps[0].request.config.frame_quality
@@ -169,8 +170,15 @@ def streams_of(maps: Iterable[UnitMap]) -> list[Stream]:
     for one in maps:
         config = one.request.config
         same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
-        groups.setdefault((*same, tuple(one.task.indices)), []).append(one)
+        frames = one.task.indices
+        groups.setdefault((*same, frames if isinstance(frames, range) else tuple(frames)), []).append(one)
     return [Stream(group) for group in groups.values()]
+
+
+def in_order(streams: Iterable[Stream]) -> Sequence[int]:
+    """The frames of all of them."""
+    first, *others = {stream.indices for stream in streams} or {range(0)}
+    return first if isinstance(first, range) and not others else sorted({*first}.union(*others))
 
 
 def _flicker_between(previous: Frame | None, frame: Frame) -> float:

@@ -20,6 +20,7 @@ from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
 from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
+from semstab.statistics.ranks import ranked
 
 CELLS = 4
 """Cells along a voxel's edge."""
@@ -182,12 +183,8 @@ class Looks:
 
 
 def _order(place: Int64, view: Int64) -> Int64:
-    """What sorts entries by place and view, stably: one number each, with that of the entry in its lowest bits."""
-    views, bits = int(view.max(initial=0)) + 1, len(place).bit_length()
-    if (int(place.max(initial=0)) + 1) * views >> (63 - bits):
+    """What sorts entries by place and view, stably."""
+    views = int(view.max(initial=0)) + 1
+    if (int(place.max(initial=0)) + 1) * views >= 2**63:
         place = np.unique(place, return_inverse=True)[1]
-    number = (place * views + view) << bits
-    number += np.arange(len(place))
-    number.sort()
-    order: Int64 = number & ((1 << bits) - 1)
-    return order
+    return ranked(place * views + view)

@@ -97,3 +97,12 @@ def renumber(of, number):
     for i in range(of.shape[0]):
         if of[i] >= 0:
             of[i] = number[of[i]]
+
+
+@serial
+def add_looks(rows, kind, first, starts, ends, group, groups, total):
+    """Add 1 / T for each of the T looks at each of these voxels, at (kind - first) * groups + group."""
+    for i in rows:
+        share, at = 1.0 / (ends[i] - starts[i]), (kind[i] - first) * groups
+        for row in range(starts[i], ends[i]):
+            total[at + group[row]] += share

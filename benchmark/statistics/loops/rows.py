@@ -119,3 +119,29 @@ def label_near(evidence, rest, K, near, found):
             if label[e] < best and (weight[e] if weight[e] != 0.0 else unseen) / total >= least:
                 best = label[e]
         found[i] = best
+
+
+@serial
+def add_apart(of, evidence, op, shares, apart):
+    """Add to (G, K) by the voxels' cubes (n,), -1 is none: one-hot evidence, and how far apart looks are in a class.
+
+    The latter counts for each look: 2 ((T - 1) e - e^2 + squares) / (T - 1).
+    """
+    starts, label, weight = evidence
+    for i in range(of.shape[0]):
+        if of[i] >= 0:
+            for e in range(starts[i], starts[i + 1]):
+                own, others = weight[e], op[i] - 1.0
+                shares[of[i], label[e]] += own
+                apart[of[i], label[e]] += 2.0 * (others * own - own * own + own) / others
+
+
+@serial
+def weight_of(evidence, wanted, found):
+    """The evidence (n,) of one class of each voxel, 0 where it has none."""
+    starts, label, weight = evidence
+    for i in range(wanted.shape[0]):
+        found[i] = 0.0
+        for e in range(starts[i], starts[i + 1]):
+            if label[e] == wanted[i]:
+                found[i] = weight[e]

@@ -99,8 +99,8 @@ def fuse_all(
     starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.bounds[1:]))
     belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(starts), len(starts)))
     op, count = ends - starts, np.diff(first)
-    each, (alike, model) = np.arange(len(op)), _NONE_ALIKE if evidence is None else _alike(op, evidence)
-    each = np.concatenate([np.delete(each, alike), np.unique(model)])
+    alike, model, models = (_NONE,) * 3 if evidence is None else _alike(op, evidence)
+    each = np.concatenate([np.delete(np.arange(len(op)), alike), models])
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
     rank = each[ranked((op * (most + 1) + count)[each])]
@@ -126,19 +126,19 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     return first, label
 
 
-_NONE_ALIKE = np.zeros(0, np.int64), np.zeros(0, np.int64)
+_NONE = np.zeros(0, np.int64)
 
 
-def _alike(op: Int64, evidence: Evidence) -> tuple[Int64, Int64]:
-    """Voxels (a,) of which all frames saw one class, and nothing else, and one of as many frames (a,) for each.
+def _alike(op: Int64, evidence: Evidence) -> tuple[Int64, Int64, Int64]:
+    """Voxels (a,) of which all frames saw one class, and nothing else, one of as many frames (a,) for each, and those.
 
     What a rule says of such a voxel depends on its OP only.
     """
     single = np.flatnonzero(np.diff(evidence.starts) == 1)
     alike = single[evidence.weight[evidence.starts[single]] == op[single]]
-    model = np.zeros(int(op.max(initial=0)) + 1, np.int64)
-    model[op[alike]] = alike
-    return alike, model[op[alike]]
+    by_op = np.full(int(op.max(initial=0)) + 1, -1)
+    by_op[op[alike]] = alike
+    return alike, by_op[op[alike]], by_op[by_op >= 0]
 
 
 def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.model.evidence import stretches
-from semstab.model.measures import Beliefs
+from semstab.model.measures import Beliefs, Voxels
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
@@ -53,10 +53,10 @@ class LogSums:
         changes: Flips,
         truth: Truth | None,
         seed: int,
-        edge: float,
+        places: Places,
     ) -> LogSums:
-        """Of a table, with cubes of that edge in metres."""
-        places, (rows, trend) = Places.of(table, edge), trend_columns(table, drift)
+        """Of a table, with the cubes of its voxels with OP >= 2."""
+        rows, trend = trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
             "flip_null": changes.null,
@@ -116,14 +116,15 @@ def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
     _, *others = fusion_rules.RULES  # the map's own rule is the first
     total, seen = np.zeros(()), np.flatnonzero(table.op >= 2)
     for some in stretches(len(seen)):
-        part = table.rows(seen[some])
-        usual, every = fusion_rules.labels(part.evidence), np.ones(len(part), np.bool_)
-        known = None if truth is None else Truth(truth.known[seen[some]], truth.label[seen[some]])
+        own = seen[some]
+        part = Voxels(table.op[own], table.evidence.take(own), table.drift_sum[own])
+        usual, every = fusion_rules.labels(part.evidence), np.ones(len(own), np.bool_)
+        known = None if truth is None else Truth(truth.known[own], truth.label[own])
         by_rule: list[Beliefs] = [part]
-        by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=seen[some])
+        by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
         rows = []
         for fused in by_rule:
             relabelled = np.count_nonzero(fusion_rules.labels(fused.evidence) != usual)
-            rows.append(np.concatenate([[relabelled, len(part)], rule_sums(fused, every, known)]))
+            rows.append(np.concatenate([[relabelled, len(own)], rule_sums(fused, every, known)]))
         total = total + np.stack(rows)
     return total

@@ -17,7 +17,7 @@ from semstab.statistics.correctness import Judged, Truth, judged_strata, judged_
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.order.drift import flips, voxel_drift
-from semstab.statistics.sampling import Places, PlaceSums
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums
 from semstab.statistics.sampling.stable_looks import StableLooks
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
@@ -42,16 +42,22 @@ class TruthSums:
 
     @classmethod
     def of(
-        cls, table: VoxelTable, events: Events | None, truth: Truth, edges: Sequence[int], sums: MapSums
+        cls,
+        table: VoxelTable,
+        events: Events | None,
+        truth: Truth,
+        edges: Sequence[int],
+        places: Places,
+        influence: InfluenceSums,
     ) -> TruthSums:
-        """Of a table whose other sums these are."""
-        places, judged = Places.of(table, sums.places.edge), Judged.of(table.evidence, truth.label)
+        """Of a table whose other sums these are, with the cubes of its voxels with OP >= 2."""
+        judged = Judged.of(table.evidence, truth.label)
         right = {"right": np.where(truth.known, judged.right, np.nan)}
         return cls(
             PlaceSums(places.cell, places.edge, places.means(right)),
             judged_strata(judged, table.op, truth.known, edges),
             judged_where(judged, truth.known & (table.op >= 2)),
-            StableLooks.of(table, events, truth.label, sums.influence.edge, sums.influence.step),
+            StableLooks.of(table, events, truth.label, influence.edge, influence.step),
         )
 
     @classmethod
@@ -126,16 +132,19 @@ def first_look(
     label = None if truth is None else truth.label
     null = None if drift is None else drift.null
     own = MapSums.of(table, edges, events=events, true_label=label, null=null)
+    if events is None and truth is None and limit is None:
+        return FirstSums(own, Votes.of(table)), {}, None
+    places = Places.of(table, own.places.edge)
     log, more = None, {}
     if events is not None and drift is not None:
         changes = flips(events)
-        log = LogSums.of(table, events, drift, changes, truth, seed, own.places.edge)
+        log = LogSums.of(table, events, drift, changes, truth, seed, places)
         more = log_maps(drift, changes)
     found = FirstSums(
         own,
         Votes.of(table),
         log,
-        None if truth is None else TruthSums.of(table, events, truth, edges, own),
+        None if truth is None else TruthSums.of(table, events, truth, edges, places, own.influence),
         None if limit is None else Occupied.of(table.index[repeated(table, limit)[0]]),
     )
     return found, more | ({} if truth is None else {"true_label": truth.label}), null
