@@ -18,6 +18,7 @@ import numpy.typing as npt
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
+from semstab.statistics.ranks import numbered
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
@@ -145,15 +146,16 @@ class Sampler:
         from semstab.statistics.looks.loops import add_rows
 
         assert frame.scores is not None
-        m, of, _ = pixels.grouped()
-        for some in _pieces(of, max(1, PIECE // self.K)):
+        _, of, _ = pixels.grouped()
+        for piece in _pieces(of, max(1, PIECE // self.K)):
+            some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
             s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)
             s /= s.sum(axis=1, keepdims=True)
-            first = of[some].min(initial=m)
-            sums = np.zeros((of[some].max(initial=first - 1) - first + 1, self.K))
-            add_rows(s, of[some] - first, sums)
+            own, number = numbered(of[some])
+            sums = np.zeros((len(own), self.K))
+            add_rows(s, number, sums)
             row, label = np.nonzero(sums)
-            yield pixels.cell[first + row], label.astype(np.uint16), sums[row, label], pixels.drawn[first + row]
+            yield pixels.cell[own[row]], label.astype(np.uint16), sums[row, label], pixels.drawn[own[row]]
 
     def _cells(self, key: Int64) -> Int64:
         """Indices (n, 3) of cells by their keys: three voxel indices of 19 bits, three digits of 2 bits."""
@@ -165,10 +167,10 @@ class Sampler:
         return cells
 
 
-def _pieces(of: Int64, most: int) -> list[Any]:
+def _pieces(of: Int64, most: int) -> list[Int64]:
     """Pixels by the number of their cell: of whole cells, in order, about so many at a time."""
     if len(of) <= most:
-        return [slice(None)]
+        return [np.arange(len(of))]
     order = np.argsort(of, kind="stable")
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
     cuts = np.searchsorted(first, np.arange(most, len(of), most))
