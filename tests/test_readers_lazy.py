@@ -16,6 +16,7 @@ from semstab.config import FrameSelection
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.frame_table import FrameTable
 from semstab.datasets.files.templates import Folders
+from semstab.datasets.formats.disk import natural, naturally
 from semstab.datasets.selection import select_frames
 from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.lenses import Lens
@@ -118,6 +119,11 @@ def test_a_table_of_frames_gives_every_source_back(tmp_path, posed):
     for made, given in zip(table, frames, strict=True):
         assert np.array_equal(made.pose, given.pose) if posed else made.pose is None
         assert {**vars(made), "pose": None} == {**vars(given), "pose": None}
+
+
+@pytest.mark.parametrize("names", [["f10", "f09", "f01"], ["f10", "f9", "g1"], ["a1b02", "a1b01", "a0b99"], ["٣", "2"]])
+def test_names_are_in_natural_order_whatever_their_shape(names):
+    assert naturally(names) == sorted(names, key=natural)
 
 
 def test_a_name_that_is_listed_in_a_folder_is_found_and_no_other(tmp_path):

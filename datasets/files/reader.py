@@ -18,7 +18,7 @@ from semstab.datasets.files.messages import nearest
 from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.templates import Folders
-from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.formats.disk import naturally, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.scene import Dataset
 from semstab.datasets.surfaces.casts import usual_folder
@@ -97,7 +97,7 @@ class FileDataset(Dataset, Generic[Options]):
         there = files_named(folder, before, after)
         if self.options.surface is None:
             return there
-        return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
+        return {name: folder / f"{before}{name}{after}" for name in naturally({*there, *instead})}
 
     def has_depth(self, folder: Path) -> bool:
         """Whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
@@ -149,7 +149,7 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
         raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
     fitting = (entry for entry in entries if entry.startswith(before) and entry.endswith(after))
     names = (entry[len(before) : len(entry) - len(after)] for entry in fitting if not entry.startswith("."))
-    return {name: folder / f"{before}{name}{after}" for name in sorted(names, key=natural) if name}
+    return {name: folder / f"{before}{name}{after}" for name in naturally(names) if name}
 
 
 def images_named(folder: Path, before: str = "", after: str = "") -> list[str]:

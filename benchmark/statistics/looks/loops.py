@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.hashing import mix
 from semstab.backends.shared.pixels.pixel_keys import in_voxels
 from semstab.runtime.compiled import serial
 from semstab.statistics.looks.entries import CELLS
@@ -12,6 +11,8 @@ from semstab.statistics.looks.entries import CELLS
 ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uint32(0x8CB92BA7)
 """Weights of a voxel's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no
 plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectiveness of Quasirandom Sequences)."""
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 @serial
@@ -30,21 +31,23 @@ def hash_row(at_x, at_y, at_z, hashed):
 
 
 @serial
-def draw(depth, valid, ray_x, ray_y, T, size, share, row, column, drawn):
-    """The row, column and hash of each pixel that shows a sampled voxel; returns how many there are."""
+def draw(depth, valid, labels, ray_x, ray_y, T, size, share, points, drawn, label, pixel):
+    """The pixels that show a sampled voxel: point in camera axes, hash, label and number; returns how many they are."""
     n = 0
     H, W = depth.shape
     at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
+    found = np.empty(W, np.int32)
     for v in range(H):
         place_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
         hash_row(at[0], at[1], at[2], hashed)
-        end = n
+        end = 0
         for u in range(W):  # without a branch: where depth is noisy, none can be foretold
-            column[end] = u
+            found[end] = u
             end += hashed[u] <= last
-        for found in range(n, end):
-            u = column[found]
-            row[n], column[n], drawn[n] = v, u, hashed[u]
+        for u in found[:end]:
+            z = np.float64(depth[v, u])
+            points[0, n], points[1, n], points[2, n] = ray_x[u] * z, ray_y[v] * z, z
+            drawn[n], label[n], pixel[n] = hashed[u], labels[v, u], v * W + u
             n += valid[v, u]
     return n
 
@@ -64,17 +67,14 @@ def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
 
 
 @serial
-def cells_of(
-    depth, labels, row, column, ray_x, ray_y, T, size, origin, reach, key, label,
-):  # fmt: skip
-    """Labels (n,) of pixels, and keys of their cells: the voxel's, 19 bits an axis, 2 bits more; -1 out of reach."""
+def cells_of(points, T, size, origin, reach, key):
+    """Keys (n,) of the cells of points (3, n): the voxel's, 19 bits an axis, and 2 bits more; -1 out of reach."""
     x0, x1, x2, x3, low_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3], float(origin[0] - reach)
     y0, y1, y2, y3, low_y = T[1, 0], T[1, 1], T[1, 2], T[1, 3], float(origin[1] - reach)
     z0, z1, z2, z3, low_z = T[2, 0], T[2, 1], T[2, 2], T[2, 3], float(origin[2] - reach)
     span = float(2 * reach)
     for n in range(len(key)):
-        label[n], z = labels[row[n], column[n]], np.float64(depth[row[n], column[n]])
-        x, y = ray_x[column[n]] * z, ray_y[row[n]] * z
+        x, y, z = points[0, n], points[1, n], points[2, n]
         a = in_voxels(x0, x1, x2, x3, x, y, z, size)
         b = in_voxels(y0, y1, y2, y3, x, y, z, size)
         c = in_voxels(z0, z1, z2, z3, x, y, z, size)
@@ -106,11 +106,11 @@ def grouped(cell, label, drawn, of, pixels):
     bits = 7
     while len(cell) > 1 << bits:
         bits += 1
-    table, mask = np.full(2 << bits, -1, np.int32), (2 << bits) - 1
+    table, mask, shift = np.full(2 << bits, -1, np.int32), (2 << bits) - 1, np.uint64(69 - bits)
     n = 0
     for i in range(len(cell)):
         own, its_label = cell[i], label[i]
-        slot = np.int64(mix((own >> 6) ^ (np.int64(its_label) << 48)) & np.uint64(mask)) ^ (own & 63)
+        slot = np.int64((np.uint64((own >> 6) ^ (np.int64(its_label) << 48)) * GOLDEN) >> shift) << 6 | (own & 63)
         while table[slot] >= 0 and (cell[table[slot]] != own or label[table[slot]] != its_label):
             slot = (slot + 1) & mask
         if table[slot] < 0:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
+from semstab.statistics.ranks import numbered
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
@@ -42,13 +43,12 @@ Entries = tuple[Int64, npt.NDArray[np.uint16], Float64, UInt32]
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """Pixels (n,) that show sampled voxels: keys of the cells, hashes of the voxels, labels, and where they are."""
+    """Pixels (n,) that show sampled voxels: keys of the cells, hashes of the voxels, labels, and numbers."""
 
     cell: Int64
     drawn: UInt32
     label: npt.NDArray[np.uint16]
-    row: npt.NDArray[np.int32]
-    column: npt.NDArray[np.int32]
+    pixel: npt.NDArray[np.int32]
 
     def grouped(self) -> tuple[int, Int64, Float64]:
         """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels."""
@@ -98,15 +98,18 @@ class Sampler:
 
         (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
         ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
-        row, column, drawn = np.empty(H * W, np.int32), np.empty(H * W, np.int32), np.empty(H * W, np.uint32)
-        depth, valid = fixed(frame.depth), fixed(frame.valid)
-        n = draw(depth, valid, ray_x, ray_y, T_wc, self.voxel_size, self._share, row, column, drawn)
-        row, column, drawn = row[:n], column[:n], drawn[:n]
-        cell, label = np.empty(n, np.int64), np.empty(n, np.uint16)
+        points, drawn = np.empty((3, H * W)), np.empty(H * W, np.uint32)
+        label, pixel = np.empty(H * W, np.uint16), np.empty(H * W, np.int32)
+        valid = fixed(frame.valid)
         labels = valid.view(np.uint8) if frame.labels is None else fixed(frame.labels)
-        cells_of(depth, labels, row, column, ray_x, ray_y, T_wc, self.voxel_size, self._origin, REACH, cell, label)
-        near = slice(None) if cell.min(initial=0) >= 0 else cell >= 0
-        return Pixels(cell[near], drawn[near], label[near], row[near], column[near])
+        n = draw(
+            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share,
+            points, drawn, label, pixel,
+        )  # fmt: skip
+        cell = np.empty(n, np.int64)
+        cells_of(points[:, :n], T_wc, self.voxel_size, self._origin, REACH, cell)
+        near = slice(n) if cell.min(initial=0) >= 0 else np.flatnonzero(cell >= 0)
+        return Pixels(cell[near], drawn[near], label[near], pixel[near])
 
     def _take(self, *part: npt.NDArray[Any]) -> None:
         """Take entries in; where they would be too many, every second voxel goes until they are not."""
@@ -143,15 +146,16 @@ class Sampler:
         from semstab.statistics.looks.loops import add_rows
 
         assert frame.scores is not None
-        m, of, _ = pixels.grouped()
-        for some in _pieces(of, max(1, PIECE // self.K)):
-            s = frame.scores[pixels.row[some], pixels.column[some]].astype(np.float64)
+        _, of, _ = pixels.grouped()
+        for piece in _pieces(of, max(1, PIECE // self.K)):
+            some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
+            s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)
             s /= s.sum(axis=1, keepdims=True)
-            first = of[some].min(initial=m)
-            sums = np.zeros((of[some].max(initial=first - 1) - first + 1, self.K))
-            add_rows(s, of[some] - first, sums)
+            own, number = numbered(of[some])
+            sums = np.zeros((len(own), self.K))
+            add_rows(s, number, sums)
             row, label = np.nonzero(sums)
-            yield pixels.cell[first + row], label.astype(np.uint16), sums[row, label], pixels.drawn[first + row]
+            yield pixels.cell[own[row]], label.astype(np.uint16), sums[row, label], pixels.drawn[own[row]]
 
     def _cells(self, key: Int64) -> Int64:
         """Indices (n, 3) of cells by their keys: three voxel indices of 19 bits, three digits of 2 bits."""
@@ -163,10 +167,10 @@ class Sampler:
         return cells
 
 
-def _pieces(of: Int64, most: int) -> list[Any]:
+def _pieces(of: Int64, most: int) -> list[Int64]:
     """Pixels by the number of their cell: of whole cells, in order, about so many at a time."""
     if len(of) <= most:
-        return [slice(None)]
+        return [np.arange(len(of))]
     order = np.argsort(of, kind="stable")
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
     cuts = np.searchsorted(first, np.arange(most, len(of), most))
