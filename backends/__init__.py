@@ -199,5 +199,14 @@ def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, 
     return int(says(voxels, observations, num_classes, **more))
 
 
+def frame_bytes(name: str, voxels: int, num_classes: int) -> int:
+    """Bytes that a backend takes beside its map while it fuses a frame of so many voxels; 0 for one that does not say.
+
+    A backend says it with a static method of that name and these two parameters.
+    """
+    says = getattr(REGISTRY.load(name), "frame_bytes", None)
+    return 0 if says is None else int(says(voxels, num_classes))
+
+
 def _options(cls: Any) -> list[str]:
     return [name for name in inspect.signature(cls).parameters if name not in GIVEN]

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from semstab.config import Config, Exclusion, Part, Perturbation
+from semstab.config import Config, Exclusion, Part, Perturbation, as_range
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.selection import Selected, select_frames
 from semstab.errors import ConfigError, DataError
@@ -24,13 +24,14 @@ from semstab.pixels.top_k import keep_largest
 class Task:
     """A backbone on a scene: which frames, and how its labels become rows of evidence.
 
+    indices   of the frames, ascending; a range where they are evenly spaced
     top_k     how many scores of each pixel are fused, the largest; all where not given
     left_out  how many frames were selected but lack a file or a pose
     """
 
     scene: Scene
     backbone: str
-    indices: list[int]
+    indices: Sequence[int]
     mapping: LabelMapping
     backends: tuple[str, ...]
     perturbation: Perturbation | None = None
@@ -46,7 +47,7 @@ class Task:
     @cached_property
     def digest(self) -> str:
         """A hash of the input behind it."""
-        return self.scene.digest(self.indices, self.backbone)
+        return self.scene.digest([*self.indices], self.backbone)
 
 
 def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterator[Task]:
@@ -61,6 +62,7 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
         places = f"looked for {', '.join(scene.label_paths)}; " if scene.label_paths else ""
         raise DataError(f"{scene.name}: there are no label maps; {places}add them, or choose with --scene")
     frames = chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
+    indices = as_range(frames.indices)
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
@@ -68,7 +70,7 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
         _require_classes(config.exclude.classes, mapping, scene.name)
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
         yield Task(
-            scene, backbone, frames.indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
+            scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
             frames.left_out,
         )  # fmt: skip
 

@@ -5,6 +5,7 @@ Source: Düzçeker et al., DeepVideoMVS, CVPR 2021 (github.com/ardaduz/deep-vide
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -34,7 +35,7 @@ class HoloLens(FileDataset[HoloLensOptions]):
         """Whether poses.txt and K.txt are there."""
         return (folder / "poses.txt").is_file() and (folder / "K.txt").is_file()
 
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a line of poses.txt. Raises DataError where there are not as many images."""
         camera = Camera(read_intrinsics(folder / "K.txt"))
         poses = read_matrices(folder / "poses.txt")

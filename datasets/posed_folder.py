@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -19,7 +21,7 @@ from semstab.datasets.files.options import (
     ScoresLayout,
 )
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import files_by_stem, natural
+from semstab.datasets.formats.disk import files_by_stem, naturally
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.formats.text_files import read_intrinsics
 from semstab.datasets.views.cameras import Camera
@@ -51,23 +53,21 @@ class PosedFolder(FileDataset[PosedOptions]):
         """Whether depth/ is there, or with a surface pose/."""
         return (folder / ("depth" if self.options.surface is None else "pose")).is_dir()
 
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterator[FrameSource]:
         """One a name of a depth image or a pose. Raises DataError for two files of one frame."""
         depth = files_by_stem(folder / "depth", DEPTH_SUFFIXES)
         poses = files_by_stem(folder / "pose", (".txt",))
         colors = files_by_stem(folder / "color", COLOR_SUFFIXES)
         camera = Camera(read_intrinsics(folder / "intrinsics.txt"))
-        suffix = next((path.suffix for path in depth.values()), DEPTH_SUFFIXES[0])
-        return [
-            FrameSource(
+        suffix = next((os.path.splitext(file)[1] for file in depth.values()), DEPTH_SUFFIXES[0])  # noqa: PTH122
+        for name in naturally({*depth, *poses}):
+            yield FrameSource(
                 name=name,
-                depth=depth.get(name) or folder / f"depth/{name}{suffix}",
-                pose_file=poses.get(name) or folder / f"pose/{name}.txt",
+                depth=folder / "depth" / depth.get(name, name + suffix),
+                pose_file=folder / "pose" / poses.get(name, f"{name}.txt"),
                 camera=camera,
-                color=colors.get(name) or folder / f"color/{name}{COLOR_SUFFIXES[0]}",
+                color=folder / "color" / colors.get(name, name + COLOR_SUFFIXES[0]),
             )
-            for name in sorted({*depth, *poses}, key=natural)
-        ]
 
     def settled(self, folder: Path) -> FileOptions:
         """scene.yaml, where there is one, with the options on top. Raises ConfigError with the file and the setting."""

@@ -5,7 +5,7 @@ Sources: Zhu et al., NICE-SLAM, CVPR 2022; Zhi et al., Semantic-NeRF, ICCV 2021;
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ class Replica(FileDataset[ReplicaOptions]):
         """Whether the trajectory of one of the exports is there."""
         return self._export(folder) is not None
 
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a depth image. Raises DataError where there are not as many poses."""
         export = self._export(folder)
         assert export is not None

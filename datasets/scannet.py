@@ -5,7 +5,7 @@ Source: Dai et al., ScanNet, CVPR 2017, and SensReader/python (github.com/ScanNe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -54,7 +54,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         there = self.has_depth(folder / "depth") and (folder / "pose").is_dir()
         return there and _matrix_file(folder, self.options.intrinsics).is_file()
 
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a depth image."""
         camera = self._camera(folder, self.options.intrinsics)
         label_camera = None

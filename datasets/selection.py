@@ -43,8 +43,8 @@ def select_frames(
     """
     times = scene.timestamps
     chosen = selection.indices(len(scene), None if times is None else times.tolist())
-    missing = {index: scene.missing(index, sources, color=color) for index in chosen}
-    complete = [index for index in chosen if not missing[index]]
+    missing = {index: paths for index in chosen if (paths := scene.missing(index, sources, color=color))}
+    complete = [index for index in chosen if index not in missing]
     if len(complete) < len(chosen):
         needs = ("depth", "pose", *(("labels",) if sources else ()), *(("colour",) if color else ()))
         _tell_missing(scene, [path for paths in missing.values() for path in paths], len(complete), len(chosen), needs)
@@ -57,7 +57,7 @@ def select_frames(
         )  # fmt: skip
     return Selected(
         indices=[index for index in complete if index not in lost],
-        incomplete=tuple(index for index in chosen if missing[index]),
+        incomplete=tuple(missing),
         lost=tuple(sorted(lost)),
     )
 

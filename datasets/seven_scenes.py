@@ -5,6 +5,7 @@ Source: Shotton et al., Scene Coordinate Regression Forests, CVPR 2013, and the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -45,7 +46,7 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
         """Whether the first frame's pose is there, or that of any frame."""
         return (folder / "frame-000000.pose.txt").is_file() or any(folder.glob("frame-*.pose.txt"))
 
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a depth image."""
         color = self.options.color_intrinsics
         camera = self._camera(folder)

@@ -5,6 +5,7 @@ Source: Wang et al., TartanAir, IROS 2020, and data_type.md (github.com/castacks
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -47,7 +48,7 @@ class TartanAir(FileDataset[TartanAirOptions]):
         side = self.options.camera
         return (folder / f"pose_{side}.txt").is_file() and self.has_depth(folder / f"depth_{side}")
 
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a depth map. Raises DataError where there are not as many poses."""
         side = self.options.camera
         path = folder / f"pose_{side}.txt"

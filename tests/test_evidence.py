@@ -8,9 +8,10 @@ from simulated_events import log_of
 
 from semstab.metrics import dominant, entropy, vss
 from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.information import entropy_bits, normalise
+from semstab.model.measures import Rows, margin
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import describe, fuse
+from semstab.statistics import RULES, describe, fuse
+from semstab.statistics.order.fusion_rules import fuse_all
 
 RNG = np.random.default_rng(0)
 DENSE = RNG.random((50, 6)) * (RNG.random((50, 6)) < 0.4)
@@ -39,7 +40,7 @@ def test_rows_are_taken_and_joined():
     np.testing.assert_array_equal(Evidence.joined(parts)[:], DENSE)
 
 
-def test_measures_of_many_voxels_are_bit_equal_to_those_of_a_dense_array():
+def test_one_pass_over_the_entries_finds_the_measures_of_dense_rows():
     n, K = 30_000, 30  # several chunks
     dense = np.round(RNG.random((n, K)) * (RNG.random((n, K)) < 0.1), 3)
     dense[:, 0] += 1
@@ -49,9 +50,33 @@ def test_measures_of_many_voxels_are_bit_equal_to_those_of_a_dense_array():
         last_frame=zeros, self_sum=zeros, frame_entropy_sum=zeros, voxel_size=0.1,
     )  # fmt: skip
     assert len(list(row_chunks(n, K))) > 3
-    np.testing.assert_array_equal(vss(table), dense.max(axis=1) / dense.sum(axis=1))
-    np.testing.assert_array_equal(entropy(table), entropy_bits(normalise(dense)) / np.log2(K))
-    np.testing.assert_array_equal(dominant(table), dense.argmax(axis=1))
+    rows = Rows(table.op, dense, zeros)
+    for formula in (vss, entropy, margin):
+        np.testing.assert_allclose(formula(table), formula(rows), rtol=1e-13, atol=1e-15)
+    np.testing.assert_array_equal(dominant(table), dominant(rows))
+    some = np.arange(5, n, 7)
+    np.testing.assert_array_equal(vss(table.measured().rows(some)), vss(table)[some])
+
+
+def test_measures_of_a_belief_count_the_classes_that_were_not_seen():
+    labels = RNG.integers(0, 4, size=(200, 6))
+    for rule in ("majority", "product", "geometric"):
+        fused = fuse(log_of(labels, K=9), rule)
+        rows = Rows(fused.op, fused.belief, fused.drift_sum)
+        for formula in (vss, entropy, margin):
+            np.testing.assert_allclose(formula(fused), formula(rows), rtol=1e-13, atol=1e-15)
+        np.testing.assert_array_equal(dominant(fused), dominant(rows))
+
+
+def test_voxels_of_one_class_are_fused_once_for_all():
+    labels = np.where(RNG.random((300, 5)) < 0.2, 1, RNG.integers(0, 3, size=(300, 1)))
+    events = log_of(np.where(np.arange(5) < RNG.integers(1, 6, size=(300, 1)), labels, -1), K=4)
+    table = events.table()
+    again = np.flatnonzero(table.op >= 2)
+    known = fuse_all(events, RULES, evidence=table.evidence.take(again), rows=again)
+    for one, other in zip(known, fuse_all(events, RULES), strict=True):
+        np.testing.assert_array_equal(one.belief, other.belief[again])
+        np.testing.assert_array_equal(one.drift_sum, other.drift_sum[again])
 
 
 def test_hundreds_of_classes_have_statistics_and_every_fusion_rule():

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from posed_config import configure, dataset_of
 
-from semstab.config import Config, FrameSelection
+from semstab.config import Config, FrameSelection, as_range
 from semstab.datasets import open_dataset
 from semstab.datasets.selection import select_frames
 from semstab.engine import run
@@ -199,13 +199,13 @@ def test_frames_are_selected_on_the_sequence_and_what_lacks_a_file_is_counted(tm
     for k in set(range(12)) - {0, 3, 6, 9}:
         (root / f"labels/partial/{k:04d}.png").unlink()
     every_third = {"backbones": ["partial"], "frames": {"stride": 3}}
-    assert plan_of(root, every_third).tasks[0].indices == [0, 3, 6, 9]
+    assert [*plan_of(root, every_third).tasks[0].indices] == [0, 3, 6, 9]
     (task,) = plan_of(root, every_third, incomplete="skip").tasks  # the stride is not applied to what is left
-    assert (task.indices, task.left_out) == ([0, 3, 6, 9], 0)
+    assert ([*task.indices], task.left_out) == ([0, 3, 6, 9], 0)
     with pytest.raises(DataError, match=r"4 missing: .*labels/partial/0002\.png"):
         plan_of(root, {"backbones": ["partial"], "frames": {"stride": 2}})
     (task,) = plan_of(root, {"backbones": ["partial"], "frames": {"stride": 2}}, incomplete="skip").tasks
-    assert (task.indices, task.left_out) == ([0, 6], 4)
+    assert ([*task.indices], task.left_out) == ([0, 6], 4)
 
 
 def plan_of(root, settings, **options):
@@ -214,3 +214,11 @@ def plan_of(root, settings, **options):
 
 def run_of(root, settings, **options):
     return run(configure(root, dataset=dataset_of(root, **options), **settings)).runs
+
+
+@given(st.sets(st.integers(0, 40), min_size=1))
+def test_frames_of_a_range_are_a_range_and_others_stay_as_they_are(chosen):
+    listed = sorted(chosen)
+    short = as_range(listed)
+    assert [*short] == listed == FrameSelection.of(short).indices(41)
+    assert isinstance(as_range(listed[:1] + [k + listed[0] for k in (3, 6)]), range)

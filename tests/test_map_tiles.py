@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import re
 import shutil
 from collections.abc import Generator
 from unittest import mock
@@ -23,11 +24,12 @@ from semstab import backends
 from semstab.comparison import pairing
 from semstab.comparison.comparing import find
 from semstab.engine import InProcess
+from semstab.engine.observer import Observer
 from semstab.engine.tiling import stretches
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.gating.calibration import calibrated
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.voxels import VoxelTable
@@ -119,7 +121,7 @@ class Several(InProcess):
 
     def run(self, jobs, observers) -> Generator:
         for job, outcomes in super().run(jobs, observers):
-            self.done += [request.portion and request.portion.name for request in job.requests]
+            self.done += [outcome.portion for outcome in outcomes]
             yield job, outcomes
             self.left -= 1
             if not self.left:
@@ -130,11 +132,12 @@ class Told(InProcess):
     """In this process; remembers the portions, and which of them outgrew the memory."""
 
     def __init__(self, stop_after: int = 1000) -> None:
-        self.left, self.done = stop_after, []
+        self.left, self.done, self.causes = stop_after, [], []
 
     def run(self, jobs, observers) -> Generator:
         for job, outcomes in super().run(jobs, observers):
             self.done += [(outcome.portion, outcome.outgrown) for outcome in outcomes]
+            self.causes += [outcome.cause for outcome in outcomes if outcome.cause is not None]
             yield job, outcomes
             self.left -= 1
             if not self.left:
@@ -418,6 +421,8 @@ def test_parts_that_outgrow_the_memory_are_cut_in_two_and_nothing_finished_is_lo
     semstab.engine.run(config, out=out, executor=second)
     assert kept.isdisjoint(name for name, _ in second.done)
     assert [outgrown for name, outgrown in first.done if name.startswith("tiles")] == [True, True, True, False, False]
+    assert len(first.causes) == 3
+    assert not any(cause.__traceback__ for cause in first.causes), "frames of a traceback keep the map in memory"
     assert not any(outgrown for _, outgrown in second.done)
     assert_same_run(both[0], out)
 
@@ -428,6 +433,44 @@ def test_a_tile_that_outgrows_the_memory_is_told_in_one_line(wall, few_said, tmp
         ConfigError, match=r"million voxels.*or set a smaller --tile-size: part tiles8_\S+ is a single tile$"
     ):
         semstab.engine.run(config, out=tmp_path / "tiles")
+
+
+class Progress(Observer):
+    """The frames that went into maps, and what was remarked."""
+
+    def __init__(self) -> None:
+        self.frames, self.lines = 0, []
+
+    def advanced(self, frames, what) -> None:
+        self.frames += frames
+
+    def remarked(self, line) -> None:
+        self.lines.append(line)
+
+
+def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_said, tmp_path) -> None:
+    """And goes on so after an interruption, without a further try at once."""
+    config, out = configure(wall, **SETTINGS, memory_gb=30e-6), tmp_path / "run"
+    first, second, progress = Told(stop_after=4), Told(), Progress()
+    with pytest.raises(KeyboardInterrupt):
+        semstab.engine.run(config, out=out, executor=first)
+    assert first.done[:2] == [(None, True), ("frames_0-30", False)]
+    semstab.engine.run(config, out=out, executor=second, observers=[progress])
+    assert all(name is not None and not outgrown for name, outgrown in second.done)
+    (line,) = progress.lines
+    assert re.fullmatch(r"wall, a: about .* 3e-05 GB are there, which it outgrew: begun again in 3 parts, .*", line)
+    assert_same_bits(semstab.load(out).table(), semstab.load(both[0]).table())
+    found = differences(summary_of(both[0]), summary_of(out), tolerance=1e-12)
+    assert [line for line in found if "_file" not in line.split(":")[0]] == []
+    again = Progress()
+    semstab.engine.run(config, out=tmp_path / "anew", observers=[again])
+    assert again.frames == 30
+
+
+def test_tiles_that_are_forbidden_are_not_begun_either(wall, few_said, tmp_path) -> None:
+    config = configure(wall, **SETTINGS, memory_gb=30e-6, tile_size="off")
+    with pytest.raises(OutgrownError, match=r"after 20 of 30 frames the map has .* is left of memory_gb"):
+        semstab.engine.run(config, out=tmp_path / "run")
 
 
 def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_path) -> None:

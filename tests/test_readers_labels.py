@@ -12,9 +12,13 @@ from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
+from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.frame_table import FrameTable
 from semstab.datasets.files.label_source import ScenePlace, find_sources
 from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.templates import Folders
 from semstab.datasets.scannet import read_class_table
+from semstab.datasets.views.cameras import Camera
 from semstab.datasets.views.resampling import fit_labels, fit_scores
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Intrinsics
@@ -88,10 +92,12 @@ def test_a_template_that_cannot_be_is_one_line(scene, option, template, message)
 
 
 def test_a_name_from_a_file_cannot_lead_out_of_the_folder(tmp_path):
-    place = ScenePlace("s", tmp_path, "s")
+    place, camera = ScenePlace("s", tmp_path, "s"), Camera(Intrinsics(1, 1, 0, 0))
     (tmp_path / "labels/net").mkdir(parents=True)
     for name in ("../../../etc/passwd", "a\nb", "a\0b", "x" * 2000, "\ud800"):
-        fails(DataError, "leaves|cannot be the path", find_sources, FileOptions(root=tmp_path), place, {name: [name]})
+        frames = [FrameSource(name, tmp_path, tmp_path, camera)]
+        for of in (FrameTable, frames, tmp_path), (find_sources, FileOptions(root=tmp_path), place, frames, Folders()):
+            fails(DataError, "leaves|cannot be the path", *of)
 
 
 def test_labels_and_scores_side_by_side(scene):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import tempfile
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semstab.engine.series import FrameRow, Series, to_csv
+from semstab.engine.series import FRAME_COLUMNS, FrameRow, Series
 from semstab.model.results import FrameReport
+from semstab.runtime.rows import BLOCK
 
 counts, numbers = st.integers(0, 2**53), st.floats()
 reports = st.builds(
@@ -25,13 +30,25 @@ def test_rows_come_out_as_they_went_in(given_rows) -> None:
     series = Series()
     for row in given_rows:
         series.append(row)
-    assert repr(list(series)) == repr(given_rows)
-    assert to_csv(series) == to_csv(given_rows)
+    assert repr(list(series)) == repr([series[k] for k in range(len(series))]) == repr(given_rows)
+    assert repr(series.drift.tolist()) == repr([row.report.drift for row in given_rows])
     assert repr(list(Series(series.numbers))) == repr(given_rows)
+    with tempfile.TemporaryDirectory() as folder:
+        series.save_csv(Path(folder) / "series.csv")
+        header, *lines = csv.reader((Path(folder) / "series.csv").read_text().splitlines())
+    assert header == [*FRAME_COLUMNS]
+    assert lines == [["" if cell is None else str(cell) for cell in row.cells().values()] for row in given_rows]
 
 
-def test_a_row_takes_a_few_numbers() -> None:
-    series = Series()
-    for _ in range(1000):
-        series.append(FrameRow(FrameReport(1, 2, 3, 4, 0.5, 0.1, 7), None, np.nan))
-    assert series.numbers.nbytes == 1000 * 21 * 8
+def test_a_row_takes_a_few_numbers_and_no_row_is_copied_when_more_come() -> None:
+    series, row = Series(), FrameRow(FrameReport(1, 2, 3, 4, 0.5, 0.1, 7), None, np.nan)
+    count = 4 * BLOCK + 1
+    tracemalloc.start()
+    for _ in range(count):
+        series.append(row)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 21 * 8 * (count + BLOCK) + 10_000
+    assert series.numbers.shape == (count, 21)
+    assert len(series) == count
+    assert series[-1].report.map_voxels == series[0].report.map_voxels == 7

@@ -14,6 +14,7 @@ from semstab.metrics.matching import voxel_keys
 from semstab.statistics import BlockBootstrap, spatial_blocks
 from semstab.statistics.agreement import alpha_columns, alpha_of, psa_columns, ratio_of
 from semstab.statistics.blocks import gradient_of, interval
+from semstab.statistics.sampling.cubes import cubes
 
 COVERED = (0.91, 0.99)
 """Of 300 intervals at 95 % this share is within 3 standard errors."""
@@ -163,3 +164,17 @@ def test_columns_leave_out_voxels_seen_once():
     table = log_of([[0, 1, 0], [1, -1, -1]]).table()
     assert not psa_columns(table)[1].any()
     assert not alpha_columns(table)[1].any()
+
+
+@pytest.mark.parametrize("spread", [3, 40, 100_000])
+def test_cubes_are_the_smallest_of_which_few_enough_hold_the_voxels(spread):
+    rng = np.random.default_rng(spread)
+    index = np.unique(rng.integers(-spread, spread, size=(6000, 3)), axis=0).astype(np.int32)
+    some = rng.random(len(index)) < 0.5
+    cell, of, edge = cubes(tuple(index.T), 0.3, some=some)
+    at = {size: np.floor((index[some] + 0.5) * (0.3 / size)) for size in (edge, edge / 2)}
+    assert len(np.unique(at[edge], axis=0)) == len(cell) <= 256
+    assert edge == 0.5 or len(np.unique(at[edge / 2], axis=0)) > 256
+    np.testing.assert_array_equal(cell[of[some]], at[edge])
+    np.testing.assert_array_equal(cell, np.unique(cell, axis=0))
+    assert (of[~some] == -1).all()

@@ -116,7 +116,7 @@ def test_quadrants_by_hand():
     labels[4, :2], labels[5] = 2, 2
     table = log_of(labels).table()
     truth = join_truth(table, log_of([[0], [0], [0], [1], [0]]).table())
-    found = quadrants(table, truth, Places(table.index, 0.2))
+    found = quadrants(table, truth, Places.of(table, where=table.op > 0))
     assert found.voxels == 4
     shares = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
@@ -160,14 +160,14 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     labels = np.where(flicker, rng.integers(0, 3, size=flicker.shape), (true + place) % 3)
     table = log_of(labels, index=grid(side)).table()
     truth = join_truth(table, log_of(true, index=grid(side)).table())
-    found = quadrants(table, truth, Places(table.index, 0.2))
+    found = quadrants(table, truth, Places.of(table, where=table.op > 0))
     assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
     assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
 
 
 def test_without_a_voxel_that_counts_quadrants_are_undefined():
     table = log_of([[0, 0]]).table()
-    found = quadrants(table, join_truth(table, table), Places(table.index, 0.2))
+    found = quadrants(table, join_truth(table, table), Places.of(table, where=table.op > 0))
     assert found.voxels == 0
     assert math.isnan(found.stable_wrong.value)
     assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)

@@ -14,6 +14,8 @@ from simulated_events import grid, log_of
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval
 from semstab.statistics.sampling import (
+    answers,
+    asked_of,
     difference,
     estimate,
     influence_sums,
@@ -129,6 +131,24 @@ def test_every_number_has_an_interval_around_it():
         found = estimate(sums, key, k)
         assert found.low < found.value < found.high, key
         assert found.value == value(sums, key, k)
+
+
+def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
+    """Cells of one are those of another without some; the same map elsewhere has nothing from before at hand."""
+    labels = np.random.default_rng(0).integers(0, 2, (24 * 24, 4))
+    labels[: 24 * 16] = 0
+    labels[: 24 * 8, 2:] = -1  # seen twice
+    log = log_of(labels, K=2, index=grid(24), voxel_size=0.125)
+    sums = influence_sums(log.table(), log)
+    elsewhere = dataclasses.replace(sums, cell=sums.cell + np.array([5, -3, 2], np.int32))
+    numbers = [("psa", None), ("alpha", None), ("vss", None), ("alpha", 1)]
+    together = answers(asked_of(sums, key, k) for key, k in numbers)
+    assert len({found.places for found in together}) > 1
+    for (key, k), found in zip(numbers, together, strict=True):
+        alone = estimate(elsewhere, key, k)
+        for field in ("value", "low", "high", "degrees", "block_size"):
+            assert getattr(found, field) == pytest.approx(getattr(alone, field), rel=1e-9, nan_ok=True)
+        assert found.undecided == alone.undecided
 
 
 # --- Differences ------------------------------------------------------------------------------------------------------

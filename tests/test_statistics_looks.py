@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from semstab.statistics import (
     psa,
     reach_of,
 )
+from semstab.statistics.looks.loops import hash_row
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
 
@@ -121,6 +123,53 @@ def test_a_bounded_sample_holds_some_voxels_whole_and_all_maps_the_same():
     np.testing.assert_array_equal(a.evidence, b.evidence)
     other = sampled(flight(flicker=0.2, seed=1), 0.1, budget=20000)
     assert len(shared_observations(some.seen, other.seen)[0]) > 0.4 * len(some.seen)
+
+
+def hash_of(x, y, z):
+    """The hash of a voxel, from its definition."""
+    h = (0xD1B54A33 * x + 0xABC98389 * y + 0x8CB92BA7 * z) % 2**32
+    h = (h ^ h >> 16) * 0x7FEB352D % 2**32
+    h = (h ^ h >> 15) * 0x846CA68B % 2**32
+    return h ^ h >> 16
+
+
+def test_what_is_drawn_is_its_definition():
+    looks = sampler_of(flight(flicker=0.2), 0.1, budget=20000).looks()
+    voxels = (looks.cell // 4).tolist()
+    assert min(min(voxel) for voxel in voxels) < 0
+    assert [hash_of(*voxel) for voxel in voxels] == looks.drawn.tolist()
+    assert max(looks.drawn) < looks.share < 2**32
+
+
+@pytest.mark.parametrize(
+    ("along", "shape"),
+    [
+        ([(1, 0, 0)], (60000,)),
+        ([(3, -2, 1)], (60000,)),
+        ([(1, 0, 0), (0, 1, 0)], (250, 240)),
+        ([(0, 1, 0), (0, 0, 1)], (250, 240)),
+        ([(1, 1, 0), (0, 1, -1)], (250, 240)),
+        ([(2, 0, 1), (1, -2, 0)], (250, 240)),
+        ([(256, 0, 0), (0, 256, 0)], (250, 240)),
+        ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], (40, 40, 38)),
+    ],
+)
+def test_lines_planes_and_blocks_of_voxels_are_sampled_evenly(along, shape):
+    """About the origin and far from it: the share below a threshold, of all and of stretches, is as if at random."""
+    steps = np.stack(np.meshgrid(*(np.arange(n) - n // 2 for n in shape), indexing="ij"), axis=-1).reshape(
+        -1, len(shape)
+    )
+    for origin in ((0, 0, 0), (-70001, 1234567, -13)):
+        index = (steps @ np.array(along) + origin).astype(np.int32)
+        drawn = np.empty(len(index), np.uint32)
+        hash_row(*np.ascontiguousarray(index.T), drawn)
+        for p in (1 / 2, 1 / 8, 1 / 64):
+            below = drawn < p * 2**32
+            n = below.size
+            assert abs(below.sum() - n * p) < 4 * math.sqrt(n * p * (1 - p))
+            few = below[: n // 500 * 500].reshape(-1, 500).sum(axis=1)
+            assert few.var() == pytest.approx(500 * p * (1 - p), rel=0.45)
+            assert abs((below[1:] & below[:-1]).sum() - n * p * p) < 5 * math.sqrt(n) * p
 
 
 def test_no_frames_leave_an_empty_sample():

@@ -394,11 +394,11 @@ def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
     sweeps = {"frame_count": {"values": [2, 8], "scenes": ["long"]}}
     config = configure(tmp_path / "data", frames={}, scene_frames=frames, sweeps=sweeps, backends=["numpy"])
     cells = make_plan(config).units
-    assert [cell.task.indices for cell in cells] == [[0, 4], [*range(10)], [0, 7], [*range(8)]]
+    assert [[*cell.task.indices] for cell in cells] == [[0, 4], [*range(10)], [0, 7], [*range(8)]]
     listed = configure(
         tmp_path / "data", frames={"list": [1, 2, 5, 6, 9]}, sweeps={"frame_count": [3]}, backends=["numpy"]
     )
-    assert [cell.task.indices for cell in make_plan(listed).units][2:] == [[1, 5, 9]] * 2
+    assert [[*cell.task.indices] for cell in make_plan(listed).units][2:] == [[1, 5, 9]] * 2
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_a_local_process_that_is_killed_costs_no_unit(config, tmp_path, expected
 class Deadly:
     """A unit whose process dies of it."""
 
-    identity, portion = "deadly", None
+    identity, portion, again = "deadly", None, None
 
     def __reduce__(self):
         return os._exit, (1,)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,10 @@ import numpy.typing as npt
 from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.model.results import RECURRENT, FrameReport
 
+PIECE = 1 << 20
+"""Numbers of evidence that are looked at together, about: each takes some hundred bytes meanwhile."""
+
+Mask = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
@@ -52,21 +56,34 @@ class Change:
         op             (n,) observations including this one
         pixels         (n,) of the frame
         """
-        seen = op > 1
-        before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
-        p_after = normalise(after)
-        p_before = normalise(before.T[:, seen].T)
-        drift = np.zeros(len(op))
-        drift[seen] = js_divergence(p_after.T[:, seen].T, p_before)
+        known = op > 1
+        found = [_voxel_by_voxel(before[some], after[some], known[some]) for some in _pieces(*after.shape)]
+        drift, vss, vss_before, entropy, entropy_before = map(np.concatenate, zip(*found, strict=True))
         return cls(
             points=int(pixels.sum()),
             voxels=len(op),
-            new=int(np.count_nonzero(~seen)),
+            new=int(np.count_nonzero(~known)),
             drift=float(drift.sum()),
-            vss=float(p_after.max(axis=1).sum() - p_before.max(axis=1).sum()),
-            entropy=float(entropy_bits(p_after).sum() - entropy_bits(p_before).sum()),
+            vss=float(vss.sum() - vss_before.sum()),
+            entropy=float(entropy.sum() - entropy_before.sum()),
             recurrent=int(np.count_nonzero(op == RECURRENT)),
         )
+
+
+def _pieces(rows: int, columns: int) -> Iterator[slice]:
+    """Of about as many rows each, so that arrays of that many columns take little memory; one where there is none."""
+    count = max(1, -(-rows * columns // PIECE))
+    return (slice(k * rows // count, (k + 1) * rows // count) for k in range(count))
+
+
+def _voxel_by_voxel(before: Float64, after: Float64, known: Mask) -> tuple[Float64, ...]:
+    """Drift and VSS of touched voxels, VSS before of the known ones, entropy likewise."""
+    before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
+    p_after = normalise(after)
+    p_before = normalise(before.T[:, known].T)
+    drift = np.zeros(len(known))
+    drift[known] = js_divergence(p_after.T[:, known].T, p_before)
+    return drift, p_after.max(axis=1), p_before.max(axis=1), entropy_bits(p_after), entropy_bits(p_before)
 
 
 class MapTotal:

@@ -191,11 +191,10 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     """The mean of a measure over the voxels where it is defined, by its differences voxel by voxel."""
     before, after = measure.of(base), measure.of(other)
     known = ~np.isnan(before) & ~np.isnan(after)
-    before, after = before[known], after[known]
-    if not len(before):
+    if not known.any():
         return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
-    places = Places(base.index[known], base.voxel_size, edge)
-    columns = np.stack([after - before, np.ones(len(before))], axis=1)
+    places, columns = Places.of(base, edge, where=known), np.stack([after - before, known], axis=1)
+    before, after = before[known], after[known]
     change = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
     found = none(change) if np.array_equal(before, after) else _with_p_value(change)
     return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")

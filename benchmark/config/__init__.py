@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from semstab.config.selection import FrameSelection
+from semstab.config.selection import FrameSelection, as_range
 from semstab.config.settings import Settings, explain, merge, read_yaml, validated
 from semstab.config.sweeps import Counts, Deviation, Lengths, Noise, Part, Sweeps
 from semstab.errors import ConfigError
@@ -29,6 +29,7 @@ __all__ = [
     "Perturbation",
     "Settings",
     "Sweeps",
+    "as_range",
     "explain",
     "merge",
     "nearest",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
@@ -77,6 +78,13 @@ class FrameSelection(Settings):
         """Whether frames are chosen by the time they were taken at."""
         return self.from_time is not None or self.to_time is not None
 
+    @classmethod
+    def of(cls, indices: Sequence[int]) -> Self:
+        """Of exactly these frames, ascending; in a few numbers where they are a range."""
+        if isinstance(indices, range):
+            return cls(start=indices.start, stop=indices.stop, stride=indices.step)
+        return cls(list=tuple(indices))
+
     def indices(self, length: int, timestamps: Sequence[float] | None = None) -> Indices:
         """The selected indices of a sequence of that length, whose frames were taken at `timestamps` (seconds).
 
@@ -99,6 +107,14 @@ class FrameSelection(Settings):
         first = -math.inf if self.from_time is None else self.from_time
         last = math.inf if self.to_time is None else self.to_time
         return [index for index in extent if first <= timestamps[index] <= last]
+
+
+def as_range(indices: Sequence[int]) -> Sequence[int]:
+    """The same as a range where they are evenly spaced: a hundred thousand numbers in lists and sets take 15 MB."""
+    if len(indices) < 2:
+        return indices
+    even = range(indices[0], indices[-1] + 1, max(1, indices[1] - indices[0]))
+    return even if len(even) == len(indices) and all(map(operator.eq, even, indices)) else indices
 
 
 def _evenly(items: Indices, count: int) -> Indices:

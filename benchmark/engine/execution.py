@@ -7,22 +7,23 @@ import dataclasses
 import itertools
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
 from semstab.config import Config
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.found import Found, advice_of, result_of
+from semstab.engine.in_tiles import InTiles
 from semstab.engine.manifest import manifest
-from semstab.engine.observer import Factory, Observer, Observers
+from semstab.engine.observer import Observer, Observers
 from semstab.engine.sizing import Sizing, sized
 from semstab.engine.survey import Survey
-from semstab.engine.tiled_unit import TiledUnit
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.engine.waiting import Waiting
 from semstab.engine.work.executors import Executor, InProcess
-from semstab.engine.work.jobs import Job, Outcome, Request, split
+from semstab.engine.work.jobs import Outcome
 from semstab.engine.work.passes import lend
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result, UnitContent
@@ -30,8 +31,6 @@ from semstab.model.results import VoxelAdvice
 from semstab.runtime.process import give_back
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
-
-GB = 1e9
 
 
 def run(
@@ -120,14 +119,15 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
         with watch("check"):
             found.geometry, found.advice = _checked(plan.config, missing, told)
     with folder.started() as start, lend(start, plan.scenes):
+        survey = Survey(executor, folder, start)
         with watch("sizing"):
-            sizing = sized(plan.config, missing, Survey(executor, folder, start))
+            sizing = sized(plan.config, missing, survey)
             give_back()
         for line in sizing.remarks:
             told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         _refuse(sizing, missing, found, executor, told)
         fitting = [each for each in missing if each.identity not in sizing.refused]
-        _work_off(plan, folder, start, executor, told, found, fitting, sizing.tilings)
+        _work_off(plan.config, survey, told, found, fitting, sizing.tilings)
     return found
 
 
@@ -141,58 +141,37 @@ def _refuse(sizing: Sizing, missing: Sequence[Planned], found: Found, executor: 
 
 
 def _work_off(
-    plan: Plan,
-    folder: Folder,
-    start: str,
-    executor: Executor,
+    config: Config,
+    survey: Survey,
     told: Observers,
     found: Found,
     missing: Sequence[Planned],
     tilings: Mapping[str, Tiling],
 ) -> None:
     """What is missing, kept as it finishes."""
-    units = {each.identity: each for each in missing}
-    whole = [each for each in missing if each.identity not in tilings]
-    in_tiles = {
-        each.identity: TiledUnit(each, tilings[each.identity], folder, executor.width)
-        for each in missing
-        if isinstance(each, PlannedUnit) and each.identity in tilings
-    }
+    executor, folder = survey.executor, survey.folder
     factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
-    jobs = split(_jobs(plan.config, folder.path, start, whole, factories), executor.width)
-
-    def portions() -> Iterator[Job]:
-        return _portion_jobs(plan.config, folder.path, start, in_tiles.values(), factories)
-
-    kept = (tiled.take(None) for tiled in in_tiles.values())
-    done = _outcomes(executor, itertools.chain(jobs, portions()), portions, told)
-    with contextlib.closing(done):
-        for outcome in itertools.chain((outcome for outcome in kept if outcome is not None), done):
-            each, tiled = units[outcome.identity], in_tiles.get(outcome.identity)
-            ended: Outcome | None = outcome
+    waiting = Waiting(config, folder.path, survey.start, factories)
+    in_tiles = InTiles(config, survey, waiting, told)
+    units, ended = {each.identity: each for each in missing}, list[Outcome | None]()
+    for each in missing:
+        if isinstance(each, PlannedUnit) and each.identity in tilings:
+            ended.append(in_tiles.begin(each, tilings[each.identity]))
+    waiting.add_whole([each for each in missing if each.identity not in tilings], executor.width)
+    with contextlib.closing(executor.run(waiting, told)) as finished:
+        done = itertools.chain.from_iterable(outcomes for _, outcomes in finished)
+        for outcome in itertools.chain((outcome for outcome in ended if outcome is not None), done):
+            each = units[outcome.identity]
             for stage, seconds in outcome.seconds.items():
                 found.watch.seconds[stage] += seconds
-            if tiled is not None and outcome.portion is not None:
-                if outcome.error is None:
-                    told.tell(lambda observer, tiled=tiled: observer.advanced(tiled.step(), tiled.name))  # type: ignore[misc]
-                with found.watch("assemble"):
-                    ended = tiled.take(outcome)
-            if ended is not None and ended.identity not in found.errors:
-                _keep(folder, found, each, ended)
-                if tiled is not None and ended.content is not None:
-                    _tell_assembled(tiled, ended.content, told)
-                _tell_done(each, ended.error, executor, told, counted=tiled is not None)
-
-
-def _outcomes(
-    executor: Executor, jobs: Iterable[Job], further: Callable[[], Iterator[Job]], told: Observers
-) -> Generator[Outcome, None, None]:
-    """Those of the jobs, then of further ones that have come up meanwhile, until there are none."""
-    while (first := next(waiting := iter(jobs), None)) is not None:
-        with contextlib.closing(executor.run(itertools.chain([first], waiting), told)) as finished:
-            for _, outcomes in finished:
-                yield from outcomes
-        jobs = further()
+            with found.watch("assemble"):
+                own = in_tiles.take(each, outcome)
+            if own is not None and own.identity not in found.errors:
+                _keep(folder, found, each, own)
+                tiled = own.identity in in_tiles
+                if tiled and own.content is not None:
+                    _tell_assembled(each, own.content, told)
+                _tell_done(each, own.error, executor, told, counted=tiled)
 
 
 def _keep(folder: Folder, found: Found, each: Planned, outcome: Outcome) -> None:
@@ -220,9 +199,9 @@ def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers)
             told.tell(lambda observer, task=task, summaries=summaries: observer.group_kept(task, summaries))  # type: ignore[misc]
 
 
-def _tell_assembled(tiled: TiledUnit, content: UnitContent, told: Observers) -> None:
-    summary, planned = content.summary, tiled.planned
-    if planned.kept and summary is not None:
+def _tell_assembled(planned: Planned, content: UnitContent, told: Observers) -> None:
+    summary = content.summary
+    if isinstance(planned, PlannedUnit) and planned.kept and summary is not None:
         told.tell(lambda observer: observer.unit_assembled(planned.task, summary))
 
 
@@ -254,33 +233,3 @@ def _checked(
         refuse_unsound(scene, verdict)
         told.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]
     return found, advice
-
-
-def _jobs(
-    config: Config, folder: Path, start: str, missing: Sequence[Planned], observers: Sequence[Factory]
-) -> list[Job]:
-    """The units by the sequence that they read; scene by scene, for what a scene's backbones share stays at hand."""
-    sequences: dict[tuple[str, str], list[Request]] = {}
-    for each in missing:
-        sequences.setdefault((each.unit.scene, each.unit.backbone), []).append(Request.of(each))
-    memory = None if config.memory_gb is None else config.memory_gb * GB
-    return [
-        Job(scene, backbone, tuple(requests), start, folder, config.threads, memory, tuple(observers))
-        for (scene, backbone), requests in sequences.items()
-    ]
-
-
-def _portion_jobs(
-    config: Config, folder: Path, start: str, tiled: Iterable[TiledUnit], observers: Sequence[Factory]
-) -> Iterator[Job]:
-    """A job each, so that no two maps are in memory at once; a frame by itself is shown to observers of one of them."""
-    memory = None if config.memory_gb is None else config.memory_gb * GB
-    shown = set()
-    for each in tiled:
-        unit = each.planned.unit
-        for request in each.waiting():
-            frames = (unit.scene, unit.backbone, request.stretch and request.stretch.name)
-            seen = request.part is not None or (request.shown and frames not in shown)
-            own = tuple(observers) if seen else ()
-            shown.add(frames)
-            yield Job(unit.scene, unit.backbone, (request,), start, folder, config.threads, memory, own)

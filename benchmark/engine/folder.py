@@ -134,6 +134,10 @@ class Folder:
         """Names of what earlier starts left of a unit's portions."""
         return {path.stem for path in (self.path / PORTIONS / key).glob("*.npz")}
 
+    def begun_in_tiles(self, planned: PlannedUnit) -> bool:
+        """Whether earlier starts left portions of a unit with these settings."""
+        return any((self.path / PORTIONS).glob(f"{planned.identity}*/*.npz"))
+
     def portion(self, key: str, name: str) -> Finished | None:
         """What an earlier start left of a portion, if its files are there as they were."""
         try:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.model.results import STAGES, FrameReport
+from semstab.runtime.files import atomic_path
+from semstab.runtime.rows import Rows
 
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
@@ -60,15 +62,6 @@ class FrameRow:
         return {name: None if row[name] is None or row[name] != row[name] else row[name] for name in FRAME_COLUMNS}
 
 
-def to_csv(rows: Sequence[FrameRow]) -> str:
-    """The rows as text, with a header."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, FRAME_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row.cells() for row in rows)
-    return text.getvalue()
-
-
 REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
           "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
 ROW = ("timestamp", "flicker_percent", "decode_seconds", "wait_seconds", "flicker_seconds", "logging_seconds",
@@ -80,33 +73,50 @@ INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
 
 
 class Series(Sequence[FrameRow]):
-    """The rows of a time series, kept as numbers: as objects they would take ten times the memory.
+    """The rows of a time series, kept as numbers.
 
     numbers  (F, C) of the first rows
     """
 
     def __init__(self, numbers: npt.NDArray[np.float64] | None = None) -> None:
-        self._numbers = np.zeros((0, len(NUMBERS))) if numbers is None else numbers
-        self._rows = len(self._numbers)
+        self._rows = Rows(len(NUMBERS), numbers)
 
     @property
     def numbers(self) -> npt.NDArray[np.float64]:
         """(F, C) the NUMBERS of each row."""
-        return self._numbers[: self._rows]
+        return self._rows.table()
+
+    def column(self, name: str) -> npt.NDArray[np.float64]:
+        """(F,) one of the NUMBERS."""
+        return self._rows.column(NUMBERS.index(name))
+
+    @property
+    def drift(self) -> npt.NDArray[np.float64]:
+        """(F,) mean drift of each frame's updates; see `FrameReport.drift`."""
+        updated = self.column("voxels") - self.column("new_voxels")
+        with np.errstate(invalid="ignore"):
+            drift: npt.NDArray[np.float64] = np.where(updated, self.column("drift_sum"), np.nan) / updated
+        return drift
 
     def append(self, row: FrameRow) -> None:
         """One more frame."""
-        if self._rows == len(self._numbers):
-            room = np.zeros((max(64, 2 * self._rows), len(NUMBERS)))
-            room[: self._rows] = self._numbers
-            self._numbers = room
         report = (getattr(row.report, name) for name in REPORT)
-        self._numbers[self._rows] = [*report, *(getattr(row, name) for name in ROW)]
-        self._rows += 1
+        self._rows.append([*report, *(getattr(row, name) for name in ROW)])
+
+    def save_csv(self, path: Path) -> None:
+        """Write FRAME_COLUMNS as text, with a header, atomically."""
+        with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, FRAME_COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(row.cells() for row in self)
 
     def __len__(self) -> int:
         """The number of frames."""
-        return self._rows
+        return len(self._rows)
+
+    def __iter__(self) -> Iterator[FrameRow]:
+        """The rows in turn, each made when it is wanted."""
+        return map(_row, self._rows)
 
     @overload
     def __getitem__(self, at: int) -> FrameRow: ...
@@ -114,7 +124,7 @@ class Series(Sequence[FrameRow]):
     def __getitem__(self, at: slice) -> Sequence[FrameRow]: ...
     def __getitem__(self, at: int | slice) -> FrameRow | Sequence[FrameRow]:
         """A row, or some."""
-        return Series(self.numbers[at]) if isinstance(at, slice) else _row(self.numbers[at].tolist())
+        return Series(self.numbers[at]) if isinstance(at, slice) else _row(self._rows.row(at))
 
 
 def _row(numbers: Sequence[float]) -> FrameRow:

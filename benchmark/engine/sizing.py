@@ -8,19 +8,23 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from semstab.backends import restrictable
+from semstab.backends import frame_bytes, restrictable
 from semstab.config import Config
 from semstab.engine.survey import Survey
-from semstab.engine.tiling.partition import Tiling, tiled
+from semstab.engine.tiling.partition import ROOM, Tiling, tile_size, tiled
 from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large
+from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large, voxels_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
 
 SHARE = 0.45
 """Of the memory that maps may take, a part of one in tiles takes so much: a hash or a grid that doubles needs room."""
+
+
+SMALLER = 8
+"""Tiles of a map that outgrew the memory are so much smaller than others: a part can be cut down to a single one."""
 
 
 @dataclass
@@ -46,6 +50,18 @@ def sized(config: Config, missing: Sequence[Planned], survey: Survey) -> Sizing:
     return found
 
 
+def begun_again(config: Config, planned: PlannedUnit, survey: Survey) -> Sizing:
+    """What is done with a unit that was fused at once and took more memory than there is: it is fused in tiles.
+
+    Nothing where that cannot be, or is forbidden.
+    """
+    found = Sizing()
+    with contextlib.suppress(DataError):
+        if _cannot_be_tiled(config, [planned]) is None:
+            _size(config, [planned], survey, found, outgrown=True)
+    return found
+
+
 def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
     """Units that are in memory at once: those of a sequence that are watched; others can be put off."""
     together: dict[tuple[str, str], list[PlannedUnit]] = {}
@@ -58,9 +74,14 @@ def _groups(missing: Sequence[Planned]) -> Iterator[list[PlannedUnit]]:
     yield from together.values()
 
 
-def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: Sizing) -> None:
+def _size(
+    config: Config, group: Sequence[PlannedUnit], survey: Survey, found: Sizing, *, outgrown: bool = False
+) -> None:
+    """Where a unit has outgrown the memory, or had when it was begun, more than the estimate takes all there is."""
     task, settings, width = group[0].task, group[0].config, survey.executor.width
-    forced = isinstance(config.tile_size, int)
+    begun = config.tile_size is None and any(survey.folder.begun_in_tiles(each) for each in group)
+    outgrown = outgrown or begun
+    forced = isinstance(config.tile_size, int) or outgrown
     first = _first(task, settings)
     if not forced and _surely_fits(config, width, group, first):
         return
@@ -68,26 +89,31 @@ def _size(config: Config, group: Sequence[PlannedUnit], survey: Survey, found: S
     size = config.tile_size if isinstance(config.tile_size, int) else None
     sights = _sights(survey, group[0], settings, min(CELL, size or CELL))
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
-    kinds, load = _kinds(group, soft=soft), _load(group, first, soft=soft)
+    kinds, load = _kinds(group, first, soft=soft), _load(group, first, soft=soft)
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
     own = room(config, width, load.beside(voxels, needed))
     if not forced and needed <= own:
         return
     if (why := _cannot_be_tiled(config, group)) is not None:
-        if forced:
+        if isinstance(config.tile_size, int):
             raise ConfigError(f"tile_size = {config.tile_size}: {why}")
         names = [each.unit.backend for each in group]
         line = too_large(task, names, settings, voxels, needed, own, f" ({why})")
         found.refused |= {each.identity: line for each in group}
         return
-    budget = SHARE * own
+    outgrown = outgrown and needed <= own
+    more = own / needed if outgrown and needed else 1.0
+    budget = SHARE * room(config, width, load.beside(voxels, needed, in_tiles=True)) / more
+    if outgrown and size is None:  # small ones, as nobody knows how much more it will be
+        size = tile_size(sights, kinds[0].bytes, budget / ROOM / SMALLER)
     for each, kind in zip(group, kinds, strict=True):
         found.tilings[each.identity] = tiled(sights, kind.bytes, budget, size, 2 * width if width > 1 else 1)
     tiling = found.tilings[group[0].identity]
     decoded = tiling.decodes / max(len(task.indices), 1)
     each_has = " for each process" if width > 1 else ""
+    how = ", which it outgrew: begun again" if outgrown else ": fused"
     found.remarks.append(
-        f"{takes(task, settings, voxels, needed)}, {own / GB:.2g} GB are there{each_has}: fused in {len(tiling.parts)}"
+        f"{takes(task, settings, voxels, needed)}, {own / GB:.2g} GB are there{each_has}{how} in {len(tiling.parts)}"
         f" parts, of tiles of {tiling.size * settings.voxel_size:g} m; a frame is decoded {decoded:.2f} times for them"
     )
 
@@ -98,7 +124,7 @@ def _surely_fits(config: Config, width: int, group: Sequence[PlannedUnit], first
     voxels = most_voxels(task, settings, first)
 
     def fits(*, soft: bool) -> bool:
-        needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, soft=soft))
+        needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, first, soft=soft))
         return needed <= room(config, width, _load(group, first, soft=soft).beside(voxels, needed))
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
@@ -115,7 +141,10 @@ def _first(task: Task, settings: Config) -> Frame:
     return task.scene.geometry(task.indices[0]).every(settings.pixel_stride)
 
 
-def _kinds(group: Sequence[PlannedUnit], *, soft: bool) -> list[Kind]:
+def _kinds(group: Sequence[PlannedUnit], first: Frame, *, soft: bool) -> list[Kind]:
+    touched = 0
+    if any(frame_bytes(each.unit.backend, 1, 2) for each in group):
+        touched = voxels_of(first, group[0].config.voxel_size, len(group[0].task.mapping.target))
     return [
         Kind(
             each.unit.backend,
@@ -123,6 +152,7 @@ def _kinds(group: Sequence[PlannedUnit], *, soft: bool) -> list[Kind]:
             soft=soft,
             logged=each.config.statistics or each.config.events,
             sampled=each.sampled,
+            touched=touched,
         )
         for each in group
     ]
@@ -144,6 +174,6 @@ def _sights(survey: Survey, planned: PlannedUnit, settings: Config, cell: int) -
     """What the frames see, kept from before or looked at now."""
     task = planned.task
     noise = None if task.perturbation is None else task.perturbation.model_dump()
-    content = [task.scene.name, task.digest, settings.voxel_size, settings.pixel_stride, noise, task.indices, cell]
+    content = [task.scene.name, task.digest, settings.voxel_size, settings.pixel_stride, noise, [*task.indices], cell]
     key = hashlib.blake2b(json.dumps(content).encode(), digest_size=12).hexdigest()
     return survey.sights(planned, settings, cell, key)

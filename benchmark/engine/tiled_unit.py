@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 
 from semstab.engine.folder import Folder, unit_key
-from semstab.engine.tiling.partition import Tiling
-from semstab.engine.tiling.portion import Finished
+from semstab.engine.tiling.again import SeenAgain
+from semstab.engine.tiling.partition import Part, Tiling
+from semstab.engine.tiling.portion import PART, STRETCH, Finished
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.assembly import Sampled, assembled
+from semstab.engine.work.assembly import Sampled, assembled, second_looks
 from semstab.engine.work.jobs import Outcome, Request, failed
+from semstab.engine.work.looking_again import look_again
 from semstab.errors import OutgrownError, SemstabError
+from semstab.statistics.sums import Whole
 
 MORE = 1.5
 """A part that is expected to take so many times its share is cut before it is begun; a share leaves that much room."""
@@ -22,7 +25,8 @@ class TiledUnit:
     """What an earlier start finished of it is kept, if the unit is still cut in the same way.
 
     A part that turned out larger than there is memory for it is cut in two, and so are those that would, judged by how
-    many voxels the parts before had, of how many were expected.
+    many voxels the parts before had, of how many were expected. Where several tasks share the parts, the largest are
+    first, and the last one of each is cut in two as well: none is left with a large one when the others are done.
     """
 
     def __init__(self, planned: PlannedUnit, tiling: Tiling, folder: Folder, width: int = 1) -> None:
@@ -33,12 +37,17 @@ class TiledUnit:
         requests = [each for request in whole for each in self._as_cut(request, there - {_name(one) for one in whole})]
         self._requests = {_name(request): request for request in requests}
         self._there: dict[str, Finished] = {}
+        self._whole: Whole | None = None
+        self._second: dict[str, Request] | None = None  # looks at the parts, once all of them are there
+        self._again: dict[str, SeenAgain] = {}
         for name in self._requests.keys() & there:
             if (found := folder.portion(self._key, name)) is not None:
                 self._there[name] = found
         self._failed = False
         self._sampled: Sampled | None = None
         self._waiting = [request for name, request in self._requests.items() if name not in self._there]
+        if width > 1:
+            self._balance(width)
         folder.clear(planned, {name for each in self._there.values() for name in each.about.files})
         shares = itertools.pairwise(k * planned.frames // len(self._requests) for k in range(len(self._requests) + 1))
         self._steps = iter([last - first for first, last in shares])
@@ -53,46 +62,88 @@ class TiledUnit:
         """The frames that the portion which is finished now stands for."""
         return next(self._steps, 0)
 
-    def waiting(self) -> Iterator[Request]:
-        """What is still to be begun, until there is nothing; more of it may come up meanwhile."""
+    def next_request(self) -> Request | None:
+        """What is to be begun next; None where there is nothing, until what is finished calls for more."""
         while self._waiting and not self._failed:
             request = self._waiting.pop(0)
             if self._expected(request) <= MORE * self._tiling.budget or not self._cut(request):
-                yield request
+                return request
+        return None
 
     def take(self, outcome: Outcome | None) -> Outcome | None:
         """One more portion, None for nothing new; the unit's own outcome where it failed, or all are there."""
-        if outcome is not None and outcome.portion is not None and outcome.error is None:
-            self._folder.save_files(outcome)
-            found = self._folder.portion(self._key, outcome.portion)
-            if found is None:
-                return self._error(outcome.portion, f"part {outcome.portion} is not in the folder; start it again")
-            self._there[outcome.portion] = found
-        elif outcome is not None and outcome.portion is not None and outcome.outgrown:
-            if not self._cut(self._requests[outcome.portion]):
-                more = f", or set a smaller --tile-size: part {outcome.portion} is a single tile"
-                return self._error(outcome.portion, OutgrownError(f"{outcome.error}{more}"))
+        name = None if outcome is None else outcome.portion
+        if outcome is not None and name is not None and outcome.error is None:
+            if self._second is not None:
+                self._again[name] = outcome.again or self._look_again(self._second[name])
+            elif (error := self._keep(outcome, name)) is not None:
+                return error
+        elif outcome is not None and name is not None and outcome.outgrown and name in self._requests:
+            if not self._cut(self._requests[name]):
+                more = f", or set a smaller --tile-size: part {name} is a single tile"
+                return self._error(name, OutgrownError(f"{outcome.error}{more}"))
         elif outcome is not None:
             self._failed = True
             return outcome
-        if len(self._there) == len(self._requests):
-            return self._assembled()
-        self._look_ahead()
+        if len(self._there) < len(self._requests):
+            self._look_ahead()
+            return None
+        return self._ended()
+
+    def _keep(self, outcome: Outcome, name: str) -> Outcome | None:
+        """A finished portion; why the unit failed, where it cannot be kept."""
+        self._folder.save_files(outcome)
+        found = self._folder.portion(self._key, name)
+        if found is None:
+            return self._error(name, f"part {name} is not in the folder; start it again")
+        self._there[name] = found
         return None
+
+    def _ended(self) -> Outcome | None:
+        """The unit's own outcome, once all parts have been looked at again, which is asked for first."""
+        finished = {name: self._there[name] for name in self._requests}  # sums do not hang on who was first
+        try:
+            sampled = self._sampled or Sampled.of(finished.values(), self._folder.path)
+            if self._second is None:
+                parts = {name: each for name, each in finished.items() if each.about.kind == PART}
+                self._whole, looks = second_looks(self.planned, parts, sampled)
+                self._waiting = Request.of(self.planned).looking_again(looks)
+                self._second = {each.name: request for each, request in zip(looks, self._waiting, strict=True)}
+            if len(self._again) < len(self._second):
+                return None
+            again = [self._again[name] for name in self._second]
+            content = assembled(self.planned, finished, self._folder.path, sampled, self._whole, again)
+            return Outcome(self.planned.identity, content)
+        except SemstabError as error:
+            return failed([*self._requests.values()][:1], error)[0]
+
+    def _look_again(self, request: Request) -> SeenAgain:
+        """Here, where the worker does not see the folder."""
+        assert request.again is not None
+        return look_again(request.again, self._folder.path)
 
     def _look_ahead(self) -> None:
         """Prepare what all frames tell, once they are looked at, while others fuse the parts."""
-        portions = {name: request.portion for name, request in self._requests.items()}
-        frames = {name for name, portion in portions.items() if portion is not None and portion.stretch is not None}
-        if self._sampled is None and frames <= self._there.keys():
+        frames = [name for name, request in self._requests.items() if _kind(request) == STRETCH]
+        if self._sampled is None and self._there.keys() >= set(frames):
             with contextlib.suppress(SemstabError):  # raised again where the unit is put together
-                self._sampled = Sampled.of(
-                    [self._there[name] for name in portions if name in frames], self._folder.path
-                )
+                self._sampled = Sampled.of([self._there[name] for name in frames], self._folder.path)
+
+    def _balance(self, width: int) -> None:
+        """Stretches first, as what they tell is put together meanwhile; then parts, the largest first."""
+        parts = [each for each in self._waiting if _kind(each) == PART]
+        parts.sort(key=lambda each: -self._expected(each))
+        frames = [each for each in self._waiting if _kind(each) == STRETCH]
+        rest = [each for each in self._waiting if _kind(each) not in (PART, STRETCH)]
+        self._waiting = []
+        for last in parts[-width:] if len(parts) > width else []:
+            if self._cut(last):
+                parts.remove(last)
+        self._waiting = [*frames, *parts, *self._waiting, *rest]
 
     def _as_cut(self, request: Request, names: Collection[str]) -> list[Request]:
         """A part as an earlier start cut it, where something of that is there."""
-        part = None if request.portion is None else request.portion.part
+        part = _part(request)
         if not names or part is None:
             return [request]
         halves = [each for half in self._tiling.halves(part) for each in self._as_cut(request.of_part(half), names)]
@@ -100,7 +151,7 @@ class TiledUnit:
 
     def _cut(self, request: Request) -> bool:
         """Put a part's halves in its place, to be begun next; not where it is a single tile."""
-        part = None if request.portion is None else request.portion.part
+        part = _part(request)
         halves = [] if part is None else [request.of_part(half) for half in self._tiling.halves(part)]
         if halves:
             parts = ((each,) if each is not request else halves for each in self._requests.values())
@@ -110,26 +161,27 @@ class TiledUnit:
 
     def _expected(self, request: Request) -> float:
         """Bytes that it takes, by what is known by now; 0 of what is no part."""
-        if request.portion is None or request.portion.part is None:
+        if (part := _part(request)) is None:
             return 0.0
-        done = [(self._requests[name].portion, found.about.voxels) for name, found in self._there.items()]
-        known = [(each.part.voxels, came) for each, came in done if each is not None and each.part is not None]
+        done = [(_part(self._requests[name]), found.about.voxels) for name, found in self._there.items()]
+        known = [(each.voxels, came) for each, came in done if each is not None]
         planned, came = sum(one for one, _ in known), sum(one for _, one in known)
-        return self._tiling.bytes(request.portion.part) * max(1.0, came / max(planned, 1))
+        return self._tiling.bytes(part) * max(1.0, came / max(planned, 1))
 
     def _error(self, portion: str, error: str | OutgrownError) -> Outcome:
         self._failed = True
         return failed([self._requests[portion]], error)[0]
 
-    def _assembled(self) -> Outcome:
-        identity = self.planned.identity
-        finished = {name: self._there[name] for name in self._requests}  # sums do not hang on who was first
-        try:
-            return Outcome(identity, assembled(self.planned, finished, self._folder.path, self._sampled))
-        except SemstabError as error:
-            return failed([*self._requests.values()][:1], error)[0]
-
 
 def _name(request: Request) -> str:
     assert request.portion is not None
     return request.portion.name
+
+
+def _kind(request: Request) -> str:
+    assert request.portion is not None
+    return request.portion.kind
+
+
+def _part(request: Request) -> Part | None:
+    return None if request.portion is None else request.portion.part

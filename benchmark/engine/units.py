@@ -31,7 +31,7 @@ from semstab.model.records import REGIONS, Variation
 from semstab.model.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
 
-FORMAT = 6
+FORMAT = 7
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
 IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes")
@@ -327,7 +327,7 @@ def identity(config: Config, task: Task) -> str:
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
-        "frames": task.indices,
+        "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
     return _hash(config, content | ({"beside": beside.model} if config.frame_quality else {}))

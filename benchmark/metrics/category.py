@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.model.information import entropy_bits, normalise
-from semstab.model.measures import Rows, by_chunk, sbd
+from semstab.model.measures import bits, sbd
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 
@@ -61,12 +60,7 @@ def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) 
     Drifting comes first because nearly all drifting voxels are ambiguous as well, but not the other way round: with
     more observations a voxel that stays ambiguous goes from drifting to uncertain.
     """
-    return categorise(table.op, sbd(table), _bits(table), thresholds)
-
-
-@by_chunk
-def _bits(table: Rows) -> npt.NDArray[np.float64]:
-    return entropy_bits(normalise(table.evidence))
+    return categorise(table.op, sbd(table), bits(table), thresholds)
 
 
 def categorise(

@@ -57,6 +57,9 @@ def shared_observations(*logs: Events) -> list[Events]:
     Raises DataError where the logs differ in K or voxel size.
     """
     require_same_grid(*logs)
+    names = ("ix", "iy", "iz", "voxel", "frame")
+    if all(np.array_equal(getattr(logs[0], name), getattr(log, name)) for log in logs[1:] for name in names):
+        return list(logs)
     index = [np.stack([log.ix, log.iy, log.iz], axis=1) for log in logs]
     frames = 1 + max((int(log.frame.max()) for log in logs if len(log)), default=0)
     keys = [key[log.voxel] * frames + log.frame for key, log in zip(_dense(index), logs, strict=True)]
@@ -97,7 +100,7 @@ def require_same_grid(*tables: VoxelTable | Events) -> None:
 
 def require_same_map(table: VoxelTable, events: Events) -> None:
     """Raise DataError where the events are not the log behind the table."""
-    op = np.diff(np.append(events.starts, len(events)))
+    op = np.diff(events.bounds)
     if not (len(table) == len(events.ix) and np.array_equal(table.op, op)):
         raise DataError(
             f"events of {len(events.ix)} voxels and {len(events)} observations do not belong to a table of"

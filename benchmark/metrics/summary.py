@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.measures import Float64, Int32, MeasureMeans, chunks, dominant, mean, measures
+from semstab.model.concentration import by_group
+from semstab.model.evidence import stretches
+from semstab.model.measures import Float64, Int32, MeasureMeans, Voxels, dominant, mean, measures
 from semstab.model.results import RECURRENT, Means, TableSummary
 from semstab.model.voxels import VoxelTable
 
@@ -55,16 +57,15 @@ class TableSums:
         steps = _steps(edges)
         groups = (len(edges) + 1, table.K, 2, len(steps) + 1)
         sums = [np.zeros((1 + 3 * len(measures()), n)) for n in groups]
-        for rows in chunks(table):
+        finest = sorted({*edges, RECURRENT - 1, *steps})
+        by_op = np.zeros((1 + 3 * len(measures()), len(finest) + 1))
+        for some in stretches(len(table)):
+            rows = Voxels(table.op[some], table.evidence.take(some).measured(), table.drift_sum[some])
             values = [measure.of(rows) for measure in measures()]
-            group = (
-                np.searchsorted(edges, rows.op),
-                dominant(rows),
-                (rows.op >= RECURRENT).astype(np.int64),
-                np.searchsorted(steps, rows.op),
-            )
-            for own, of in zip(sums, group, strict=True):
-                own += _by_group(values, rows.op, of, own.shape[1])  # noqa: PLW2901 - in place
+            sums[1] += _by_group(values, rows.op, dominant(rows), table.K)
+            by_op += _by_group(values, rows.op, groups_of(rows.op, finest), by_op.shape[1])
+        for own, bounds in ((sums[0], edges), (sums[2], [RECURRENT - 1]), (sums[3], steps)):
+            np.add.at(own.T, np.searchsorted(bounds, [*finest, np.iinfo(np.int32).max]), by_op.T)
         total = [table.pixels.sum(), table.op.sum(dtype=np.int64), len(table)]
         return cls(np.array(total, dtype=np.float64), *sums)
 
@@ -116,12 +117,20 @@ def _steps(edges: Sequence[int]) -> list[int]:
 def _by_group(values: Sequence[Float64], op: Int32, group: npt.NDArray[np.int64], groups: int) -> Float64:
     """(1 + 3 M, groups) of values (n,) of M measures: voxels, then of each measure its sum, how often it is defined,
     and how often OP is high enough for it."""
-    rows = [np.bincount(group, minlength=groups)]
-    for measure, value in zip(measures(), values, strict=True):
-        known, often = ~np.isnan(value), op >= measure.lowest_op
-        rows.append(np.bincount(group[known], weights=value[known], minlength=groups))
-        rows += [np.bincount(group[where], minlength=groups) for where in (known, often)]
-    return np.stack(rows).astype(np.float64)
+    levels = sorted({1, *(measure.lowest_op for measure in measures())})
+    enough = [np.where(op >= level, 1.0, np.nan) for level in levels]
+    sums, defined = by_group(group, [*values, *enough], groups)
+    often = dict(zip(levels, defined.T[len(values) :], strict=True))
+    rows = [often[1]]
+    for measure, total, known in zip(measures(), sums.T, defined.T, strict=False):
+        rows += [total, known, often[measure.lowest_op]]
+    return np.stack(rows)
+
+
+def groups_of(op: Int32, edges: Sequence[int]) -> npt.NDArray[np.int64]:
+    """Which stratum of OP (n,) each voxel is in: how many of the edges lie below its OP."""
+    group: npt.NDArray[np.int64] = np.searchsorted(edges, np.arange(int(op.max(initial=0)) + 1))[op]
+    return group
 
 
 def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:

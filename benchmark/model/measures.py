@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
+from semstab.model.concentration import Concentration
 from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.information import entropy_bits, normalise
 from semstab.runtime.json_form import fields_of
@@ -50,6 +51,15 @@ class Rows:
     drift_sum: Float64
 
 
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Some voxels whose evidence is kept by its entries."""
+
+    op: Int32
+    evidence: Evidence
+    drift_sum: Float64
+
+
 def chunks(table: Beliefs) -> Iterator[Rows]:
     """The voxels, few enough at a time for dense evidence."""
     n, K = table.evidence.shape
@@ -65,6 +75,31 @@ def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
         return values
 
     return of
+
+
+def whole(formula: Callable[[Beliefs], Values]) -> Callable[[Beliefs], Values]:
+    """A formula of voxels that needs no dense evidence of them."""
+    formula.whole = True  # type: ignore[attr-defined]
+    return formula
+
+
+def by_row(
+    found: Callable[[Concentration], Values],
+) -> Callable[[Callable[[Rows], Values]], Callable[[Beliefs], Values]]:
+    """A formula of voxels that, where their evidence is kept by its entries, the one pass over these finds."""
+
+    def decorate(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
+        @whole
+        @functools.wraps(formula)
+        def of(table: Beliefs) -> Values:
+            evidence = table.evidence
+            if isinstance(evidence, Evidence):
+                return found(evidence.concentration)
+            return formula(Rows(table.op, evidence, table.drift_sum))
+
+        return of
+
+    return decorate
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,19 +156,21 @@ class Measure(Quantity):
     panel: bool = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "of", by_chunk(self.of))
+        if not hasattr(self.of, "whole"):
+            object.__setattr__(self, "of", by_chunk(self.of))
 
 
 # --- Formulas ---------------------------------------------------------------------------------------------------------
 
 
-@by_chunk
+@by_row(lambda found: found.largest)
 def vss(table: Rows) -> Float64:
     """Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
     concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
     return concentration
 
 
+@whole
 def sbd(table: Beliefs) -> Float64:
     """Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1]; NaN where OP < 2."""
     return mean_drift(table.drift_sum, table.op)
@@ -141,10 +178,7 @@ def sbd(table: Beliefs) -> Float64:
 
 def mean_drift(drift_sum: Float64, op: Int32) -> Float64:
     """SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
-    drift = np.full(len(op), np.nan)
-    again = op >= 2
-    drift[again] = drift_sum[again] / (op[again] - 1)
-    return drift
+    return np.where(op >= 2, drift_sum / np.maximum(op - 1, 1), np.nan)
 
 
 def op(table: Beliefs) -> Int32:
@@ -152,14 +186,19 @@ def op(table: Beliefs) -> Int32:
     return table.op
 
 
-@by_chunk
-def entropy(table: Rows) -> Float64:
+@whole
+def entropy(table: Beliefs) -> Float64:
     """Normalised entropy (n,): -sum_k p_k log p_k / log K, in [0, 1]; report it together with K."""
-    normalised: Float64 = entropy_bits(normalise(table.evidence)) / math.log2(table.evidence.shape[1])
-    return normalised
+    return bits(table) / math.log2(table.evidence.shape[1])
 
 
-@by_chunk
+@by_row(lambda found: found.bits)
+def bits(table: Rows) -> Float64:
+    """Entropy (n,): -sum_k p_k log2 p_k, bits."""
+    return entropy_bits(normalise(table.evidence))
+
+
+@by_row(lambda found: found.lead)
 def margin(table: Rows) -> Float64:
     """How far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
     belief = normalise(table.evidence)
@@ -170,7 +209,7 @@ def margin(table: Rows) -> Float64:
     return lead
 
 
-@by_chunk
+@by_row(lambda found: found.label.astype(np.int64))
 def dominant(table: Rows) -> npt.NDArray[np.int64]:
     """Dominant class (n,): argmax_k e_k, the lowest on ties."""
     label: npt.NDArray[np.int64] = table.evidence.argmax(axis=1)

@@ -39,11 +39,8 @@ def psa(table: VoxelTable) -> Float64:
     expectation is ||pi||^2 for every T >= 2.
     """
     T = table.op.astype(np.float64)
-    pairs = table.evidence.rowwise(lambda e: (e**2).sum(axis=1)) - table.self_sum
-    agreement = np.full(len(table), np.nan)
-    again = table.op >= 2
-    agreement[again] = np.clip(pairs[again] / (T * (T - 1))[again], 0.0, 1.0)
-    return agreement
+    agreeing = table.evidence.concentration.squares - table.self_sum
+    return np.where(T >= 2, np.clip(agreeing / np.maximum(T * (T - 1), 1), 0.0, 1.0), np.nan)
 
 
 def fleiss_kappa(table: VoxelTable) -> float:
@@ -186,15 +183,19 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
 
 def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
     """(7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2."""
-    again, of = table.op >= 2, np.repeat(np.arange(len(table)), np.diff(table.evidence.starts))
-    used = again[of]  # classes that nobody saw in a voxel are no disagreement there
-    k, e, squares = table.evidence.label[used], table.evidence.weight[used], _squares(table, events)[used]
-    T = table.op[of][used].astype(np.float64)
-    disagreement = 2 * ((T - 1) * e - e**2 + squares) / (T * (T - 1))
-    voxels, n = np.count_nonzero(again), table.op[again].sum(dtype=np.float64)
-    columns = (e, e / T, disagreement, T * disagreement, squares)
-    sums = [np.bincount(k, weights=values, minlength=table.K) for values in columns]
-    return np.stack([*sums, np.full(table.K, voxels), np.full(table.K, n)]).astype(np.float64)
+    from semstab.statistics.loops.rows import add_class_sums
+
+    again, one_hot, sums = table.op >= 2, table.self_sum == table.op, np.zeros((7, table.K))
+    if events is None:
+        one_hot, told = np.ones(len(table), np.bool_), one_hot_where(table, again)
+        log, bounds = table.evidence.entries, np.zeros(len(table) + 1, np.int64)
+    else:
+        log, bounds, told = events.evidence.entries, events.bounds, True
+    add_class_sums(table.evidence.entries, table.op, one_hot, bounds, log, sums[:5])
+    if not told:
+        sums[2:5, sums[0] > 0] = np.nan
+    sums[5], sums[6] = np.count_nonzero(again), table.op.sum(dtype=np.int64, where=again)
+    return sums
 
 
 def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[ClassAgreement, ...]:
@@ -210,18 +211,9 @@ def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[Clas
     return tuple(ClassAgreement(name, *(float(value) for value in values)) for name, *values in rows)
 
 
-def _squares(table: VoxelTable, events: Events | None) -> Float64:
-    """The sum over frames of s_tk^2 for each entry (m,) of the table's evidence."""
-    if events is not None:
-        from semstab.statistics.loops import chunks, log_kernels
-
-        squares, bounds = np.zeros(len(table.evidence.weight)), np.append(events.starts, len(events))
-        voxels = table.evidence.entries
-        chunks.in_chunks(log_kernels.sum_squares, bounds, events.evidence.entries, table.K, voxels, squares)
-        return squares
-    again = table.op >= 2
-    one_hot = (np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[again].all()
-    return table.evidence.weight if one_hot else np.full(len(table.evidence.weight), np.nan)
+def one_hot_where(table: VoxelTable, where: npt.NDArray[np.bool_]) -> bool:
+    """Whether all observations are one-hot of the voxels for which `where` (n,) holds."""
+    return bool((np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[where].all())
 
 
 def _beyond_chance(observed: Float64, expected: Float64) -> Float64:

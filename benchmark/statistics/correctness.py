@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from semstab.metrics import strata
 from semstab.metrics.matching import shared_rows
-from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.information import normalise
-from semstab.model.measures import Beliefs, MeasureMeans, Quantity, dominant, measures, vss
+from semstab.metrics.summary import groups_of
+from semstab.model.concentration import blockwise, by_group
+from semstab.model.evidence import Evidence
+from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
@@ -30,8 +31,9 @@ MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
 ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
 BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
 
-PURE = 0.5
-"""A voxel has a true class where more than this share of its ground truth evidence is of one class."""
+PURE = 0.5 + 1e-9
+"""A voxel has a true class where more than this share of its ground truth evidence is of one class: not where it is a
+half, however that is rounded."""
 
 BINS = 15
 
@@ -54,9 +56,10 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
     Raises DataError where the maps differ in K or voxel size.
     """
     rows, true_rows = shared_rows(table, truth)
-    pure = vss(truth)[true_rows] > PURE
+    found = truth.evidence.concentration
+    pure = found.largest[true_rows] > PURE
     label = np.full(len(table), -1, dtype=np.int64)
-    label[rows[pure]] = dominant(truth)[true_rows[pure]]
+    label[rows[pure]] = found.label[true_rows[pure]]
     return Truth(label >= 0, label)
 
 
@@ -79,14 +82,12 @@ class Judged:
     @classmethod
     def of(cls, evidence: Float64 | Evidence, label: npt.NDArray[np.int64]) -> Judged:
         """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
-        n, K = evidence.shape
-        predicted, confidence, error = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
-        for some in row_chunks(n, K):
-            belief = normalise(evidence[some])
-            predicted[some], confidence[some] = belief.argmax(axis=1), belief.max(axis=1)
-            belief[np.arange(len(belief)), label[some]] -= 1
-            error[some] = (belief**2).sum(axis=1)
-        return cls(label, predicted, confidence, error, K)
+        from semstab.statistics.loops.rows import square_errors
+
+        kept = Evidence.of(evidence)
+        found, error, rest = kept.concentration, np.empty(len(kept)), kept.unseen
+        square_errors(kept.entries, np.zeros(0) if rest is None else rest, kept.K, label, error)
+        return cls(label, found.label.astype(np.int64), found.largest, error, kept.K)
 
     def rows(self, where: Mask) -> Judged:
         """Those for which `where` (n,) holds."""
@@ -114,12 +115,26 @@ def judged_sums(judged: Judged) -> Float64:
     Voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right, true and
     predicted ones.
     """
-    right, K = judged.right, judged.K
-    of = np.clip(np.ceil(judged.confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
-    bins = [np.bincount(of, weights=values, minlength=BINS) for values in (None, judged.confidence, right)]
-    kinds = [np.bincount(label, minlength=K) for label in (judged.label[right], judged.label, judged.predicted)]
-    total = np.array([len(right), np.count_nonzero(right), judged.error.sum()])
-    return np.concatenate([total, *bins, *kinds])
+    return judged_where(judged, np.ones(len(judged.label), np.bool_))
+
+
+def judged_where(judged: Judged, where: Mask) -> Float64:
+    """`judged_sums` of those for which `where` (n,) holds."""
+    sums: Float64 = _judged_by_group(judged, where - np.int64(1), 1)[0]
+    return sums
+
+
+def _judged_by_group(judged: Judged, group: npt.NDArray[np.int64], groups: int) -> Float64:
+    """(G, ...) `judged_sums` of each group; -1 is none."""
+    from semstab.statistics.loops.rows import add_judged
+
+    def of(some: slice) -> Float64:
+        sums = np.zeros((groups, 3 + 3 * BINS + 3 * judged.K))
+        own = (judged.label, judged.predicted, judged.confidence, judged.error)
+        add_judged(group[some], *(values[some] for values in own), BINS, sums)
+        return sums
+
+    return blockwise(of, len(group), groups * judged.K)
 
 
 def correctness_of(sums: Float64, name: str = "all") -> Correctness:
@@ -152,14 +167,14 @@ def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
 
 def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`."""
-    rows: list[float] = []
-    for measure in measures():
-        values = measure.of(fused)[where]
-        defined = values[~np.isnan(values)]
-        rows += [defined.sum(), len(defined), float(np.count_nonzero(where & (fused.op >= measure.lowest_op)))]
+    evidence = Evidence.of(fused.evidence).measured()
+    fused = Voxels(fused.op, evidence, fused.drift_sum)
+    total, defined = by_group(where - np.int64(1), [measure.of(fused) for measure in measures()], 1)
+    often = [np.count_nonzero(where & (fused.op >= measure.lowest_op)) for measure in measures()]
+    rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
-        return np.array(rows)
-    return np.concatenate([rows, judged_sums(Judged.of(fused.evidence, truth.label).rows(where & truth.known))])
+        return rows
+    return np.concatenate([rows, judged_where(Judged.of(evidence, truth.label), where & truth.known)])
 
 
 def rule_means_of(sums: Float64) -> RuleMeans:
@@ -184,18 +199,20 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
 
 def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
     """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
-    judged = Judged.of(table.evidence, truth.label)
-    groups = [truth.known & (table.op >= low) & (table.op <= high) for _, low, high in _groups(edges)]
-    return np.stack([judged_sums(judged.rows(where)) for where in groups])
+    return judged_strata(Judged.of(table.evidence, truth.label), table.op, truth.known, edges)
+
+
+def judged_strata(judged: Judged, op: npt.NDArray[np.int32], known: Mask, edges: Sequence[int]) -> Float64:
+    """The same of what is judged already, by OP (n,) and where a true class is known (n,)."""
+    group = np.where(known, groups_of(op, edges), -1)
+    sums = _judged_by_group(judged, group, len(edges) + 1)
+    return np.concatenate([sums.sum(axis=0, keepdims=True), sums])
 
 
 def strata_of(sums: Float64, edges: Sequence[int]) -> tuple[Correctness, ...]:
     """What is said of them, from `stratum_sums`."""
-    return tuple(correctness_of(own, name) for own, (name, _, _) in zip(sums, _groups(edges), strict=True))
-
-
-def _groups(edges: Sequence[int]) -> list[tuple[str, int, int]]:
-    return [("all", 1, np.iinfo(np.int32).max), *strata(edges)]
+    names = ["all", *(name for name, _, _ in strata(edges))]
+    return tuple(correctness_of(own, name) for own, name in zip(sums, names, strict=True))
 
 
 def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
@@ -213,12 +230,11 @@ QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
 def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> PlaceSums:
     """What `quadrants_of` is a function of, over cubes of that edge, by the probability (n,) that each is stable."""
     counted, likely, right = _masks(table, truth, stable)
-    every, places = counted.astype(np.float64), Places(table.index, table.voxel_size, edge)
+    places = Places.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
-    columns = {name: np.stack([part * every, every], axis=1) for name, part in zip(QUADRANTS, parts, strict=True)} | {
-        "wrong_of_stable": np.stack([~right * every * likely, every * likely], axis=1)
-    }
-    return PlaceSums(places.cell, edge, {name: places.sums(values) for name, values in columns.items()})
+    sums = places.means(dict(zip(QUADRANTS, parts, strict=True)))
+    wrong, every = sums["stable_wrong"][:, 0], sums["stable_right"][:, 0] + sums["stable_wrong"][:, 0]
+    return PlaceSums(places.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
 
 
 def quadrants_of(sums: PlaceSums) -> Quadrants:
@@ -229,9 +245,14 @@ def quadrants_of(sums: PlaceSums) -> Quadrants:
     return Quadrants(voxels, *(sums.estimate(name, ratio_of) for name in (*QUADRANTS, "wrong_of_stable")))
 
 
-def stable_wrong(table: VoxelTable, truth: Truth, shares: Float64 | None = None, *, stable: float = STABLE) -> Mask:
-    """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong. For `shares` see `steady`."""
-    counted, likely, right = _masks(table, truth, steady(table, shares, stable=stable))
+def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
+    """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
+    return wrong_of_steady(table, truth, steady(table, stable=stable))
+
+
+def wrong_of_steady(table: VoxelTable, truth: Truth, stable: Float64) -> Mask:
+    """The same, by the probability (n,) that each is stable."""
+    counted, likely, right = _masks(table, truth, stable)
     return counted & (likely >= LIKELY) & ~right
 
 

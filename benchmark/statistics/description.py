@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,8 +24,10 @@ from semstab.model.statistics import (
     FlipRates,
     FrameAgreement,
     Interval,
+    Judged,
     Losses,
     MapStatistics,
+    Reach,
     Repeated,
     StratumStatistics,
 )
@@ -34,10 +36,10 @@ from semstab.statistics.agreement import alpha_of, between_of, class_agreement_o
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
 from semstab.statistics.judging.ceiling import losses_of
 from semstab.statistics.judging.verdict import verdict
-from semstab.statistics.looks import Sample, correlogram, reach_from
+from semstab.statistics.looks import Sample, correlogram, reach_by, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
 from semstab.statistics.order.drift import expected_sbd
-from semstab.statistics.sampling import InfluenceSums, PlaceSums, judged_of, with_sample
+from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, answered, judged_by, with_sample
 from semstab.statistics.sums import SecondSums, Whole, first_look, second_look
 
 SCHEMA = 1
@@ -110,10 +112,10 @@ def analyse(
     """
     if events is not None:
         require_same_map(table, events)
-    known = None if truth is None else join_truth(table, truth)
+    table, known = table.measured(), None if truth is None else join_truth(table, truth)
     first, further, null = first_look(table, events, known, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
-    second, more = second_look(table, whole, known, limit)
+    second, more = second_look(table, whole.overall, known, limit)
     summary, sums = concluded(
         whole,
         second,
@@ -127,7 +129,7 @@ def analyse(
 
     def maps() -> Maps:
         own = maps_of(table, expected_sbd(table) if null is None else null)
-        return {**own, **further, **more, **whole.maps(table, further)}
+        return {**own, **further, **more, **whole.overall.maps(table, further)}
 
     return Analysis(summary, first.own.table.summary(table.voxel_size, table.classes, edges), sums, maps)
 
@@ -145,20 +147,25 @@ def concluded(
 ) -> tuple[MapStatistics, InfluenceSums]:
     """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts."""
     first, own = whole.first, whole.first.own
-    about = _About(name, whole.seed, critical, own.table.summary(voxel_size, classes, edges))
-    means = _Means(own.places)
-    influence = whole.influence
+    table, influence = own.table.summary(voxel_size, classes, edges), whole.influence
     if sample is not None:
         influence = with_sample(influence, sample.shared(), logged=first.log is not None)
+    found, judged, reached = answered(
+        own.places.asked(MEANS), judged_by(influence), () if sample is None else reach_by(influence, table.K)
+    )
+    means = dict(zip(MEANS, found, strict=True))
+    reach = None
+    if sample is not None:
+        reach = reach_from(sample.by, own.places["kappa"][2:], influence, reached, critical=critical)
     summary = _concluded(
-        about,
+        _About(name, whole.seed, table, Judged(*judged), reach),
         means,
-        influence,
+        own.places,
         sample,
         agreement=_agreement(means, class_agreement_of(own.classes, classes)),
         flipping=second.flipping.flipping(classes),
-        drift=_drift(means, whole),
-        strata=_strata(about.table, own.strata),
+        drift=_drift(means, own.places, whole),
+        strata=_strata(table, own.strata),
         geometry=_geometry(whole, second, voxel_size),
         correctness=_correctness(whole, second, edges),
         fusion_rules=None if first.log is None else first.log.rule_outcomes(),
@@ -171,41 +178,51 @@ def concluded(
 
 @dataclass(frozen=True)
 class _About:
-    """Of a map: what the verdict calls it and depends on, the seed of what is drawn, its means."""
+    """Of a map: what the verdict calls it, the seed of what is drawn, its means, and what the verdict rests on."""
 
     name: str
     seed: int
-    critical: Sequence[str]
     table: TableSummary
+    judged: Judged
+    reach: Reach | None
 
 
-class _Means:
-    """Means over the voxels with OP >= 2, with their intervals for this map."""
+def _less(sums: Float64) -> Float64:
+    """A ratio less another, (...,) from sums (..., 4)."""
+    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
 
-    def __init__(self, sums: PlaceSums) -> None:
-        self.sums = sums
 
-    def mean(self, name: str, bounds: tuple[float, float] = (0.0, 1.0)) -> Interval:
-        """Of values by name, where they are defined."""
-        return self.sums.estimate(name, ratio_of, bounds)
+SIGNED = (-1.0, 1.0)
+MEANS: Mapping[str, Mean] = {
+    **{name: Mean(name) for name in ("psa", "vss", "within", "between", "sbd", "null")},
+    **{name: Mean(name) for name in ("entropy", "entropy_within", "entropy_between")},
+    **{name: Mean(name, bounds=SIGNED) for name in ("excess", "steadier")},
+    "coin": Mean("coin", _less, SIGNED),
+    "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
+    "alpha": Mean("alpha", alpha_of, SIGNED, "agreement"),
+    "alpha_between": Mean("alpha", between_of, SIGNED, "agreement"),
+    "each_place": Mean("each_place", between_of, SIGNED, "agreement"),
+}
+"""Over the voxels with OP >= 2, of values where they are defined, and agreement beyond chance."""
 
-    def agreement(self, name: str, statistic: Callable[[Float64], Float64]) -> Interval:
-        """Agreement beyond chance."""
-        return self.sums.estimate(name, statistic, (-1.0, 1.0), "agreement")
+OF_FLIPS: Mapping[str, Mean] = {
+    **{name: Mean(name) for name in ("flip_rate", "flip_null")},
+    "flip_excess": Mean("flip_excess", bounds=SIGNED),
+    "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
+}
 
 
 def _concluded(
     about: _About,
-    means: _Means,
-    sums: InfluenceSums,
+    means: Mapping[str, Interval],
+    places: PlaceSums,
     sample: Sample | None,
     **sections: Any,
 ) -> MapStatistics:
     """All of it, from what was found section by section."""
-    judged, table, count = judged_of(sums), about.table, len(means.sums.cell)
-    repeats = int(means.sums["psa"][1])
+    judged, reach, table, count = about.judged, about.reach, about.table, len(places.cell)
+    repeats = int(places["psa"][1])
     repeated = Repeated(repeats, repeats / table.voxels if table.voxels else math.nan)
-    reach = None if sample is None else reach_from(sample.by, means.sums["kappa"][2:], sums, critical=about.critical)
     said = verdict(
         about.name or "backbone",
         judged=judged,
@@ -229,46 +246,33 @@ def _concluded(
         judged=judged,
         reach=reach,
         correlogram=None if sample is None else correlogram(sample),
-        uncertainty=EntropyParts(means.mean("entropy"), means.mean("entropy_within"), means.mean("entropy_between")),
-        beyond_coin=BeyondCoin(means.sums.estimate("coin", _less, (-1.0, 1.0)), means.mean("steadier", (-1.0, 1.0))),
+        uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
+        beyond_coin=BeyondCoin(means["coin"], means["steadier"]),
         **sections,
     )
 
 
-def _agreement(means: _Means, classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
-    return FrameAgreement(
-        psa=means.mean("psa"),
-        kappa=means.agreement("kappa", kappa_of),
-        alpha=means.agreement("alpha", alpha_of),
-        vss=means.mean("vss"),
-        within=means.mean("within"),
-        between=means.mean("between"),
-        alpha_between=means.agreement("alpha", between_of),
-        each_place=means.agreement("each_place", between_of),
-        classes=classes,
-    )
+def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
+    names = ("psa", "kappa", "alpha", "vss", "within", "between", "alpha_between", "each_place")
+    return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(means: _Means, whole: Whole) -> DriftStatistics:
+def _drift(means: Mapping[str, Interval], places: PlaceSums, whole: Whole) -> DriftStatistics:
     """Against its null; without a log only for one-hot evidence, and without tests."""
     log = whole.first.log
     return DriftStatistics(
-        voxels=int(means.sums["null"][1]),
-        sbd=means.mean("sbd"),
-        null=means.mean("null"),
-        excess=means.mean("excess", (-1.0, 1.0)),
+        voxels=int(places["null"][1]),
+        sbd=means["sbd"],
+        null=means["null"],
+        excess=means["excess"],
         tests=None if log is None else whole.drift_tests(),
-        flips=None if log is None else _flips(_Means(log.places)),
+        flips=None if log is None else _flips(log.places),
     )
 
 
-def _flips(means: _Means) -> FlipRates:
-    return FlipRates(
-        rate=means.mean("flip_rate"),
-        null=means.mean("flip_null"),
-        excess=means.mean("flip_excess", (-1.0, 1.0)),
-        frames_since=means.mean("frames_since", (0.0, math.inf)),
-    )
+def _flips(places: PlaceSums) -> FlipRates:
+    found = places.estimates(OF_FLIPS)
+    return FlipRates(found["flip_rate"], found["flip_null"], found["flip_excess"], found["frames_since"])
 
 
 def _geometry(whole: Whole, second: SecondSums, voxel_size: float) -> Losses | None:
@@ -287,11 +291,6 @@ def _correctness(whole: Whole, second: SecondSums, edges: Sequence[int]) -> Corr
         reliability=reliability_of(truth.reliability),
         quadrants=quadrants_of(second.quadrants),
     )
-
-
-def _less(sums: Float64) -> Float64:
-    """A ratio less another, (...,) from sums (..., 4)."""
-    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
 
 
 def _strata(table: TableSummary, sums: Float64) -> tuple[StratumStatistics, ...]:

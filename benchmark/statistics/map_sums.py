@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics.summary import STRATA, TableSums
+from semstab.metrics.summary import STRATA, TableSums, groups_of
+from semstab.model.concentration import by_group
 from semstab.model.evidence import stretches
 from semstab.model.measures import sbd, vss
 from semstab.model.voxels import Events, VoxelTable
@@ -76,7 +77,7 @@ class MapSums:
         """Without what its log or its true classes tell better, unless it is alone."""
         maps = maps_of(table, null=expected_sbd(table) if null is None else null)
         some = table if alone else table.rows(slice(0, 0))
-        places = Places(table.index[table.op >= 2], table.voxel_size)
+        places = Places.of(table)
         return cls(
             TableSums.of(table, edges),
             place_sums(table, maps, places),
@@ -141,50 +142,48 @@ def maps_of(table: VoxelTable, null: Float64) -> Maps:
     }
 
 
-def mean_columns(values: Float64) -> Float64:
-    """(n, 2): what the mean of values (n,) where they are defined is a function of by its sum."""
-    defined = ~np.isnan(values)
-    return np.stack([np.where(defined, values, 0.0), defined], axis=1)
-
-
 def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
     """Over the cubes of the voxels with OP >= 2: what means and agreement beyond chance are functions of."""
-    again = table.op >= 2
-    own = {name: values[again] for name, values in maps.items()}
-    T, known, op = table.op[again].astype(np.float64), ~np.isnan(own["sbd_null"]), table.op[again]
-    means = {
-        "psa": own["psa"],
-        "vss": vss(table)[again],
-        "sbd": np.where(known, sbd(table)[again], np.nan),
-        "null": own["sbd_null"],
-        "excess": own["sbd_excess"],
-        "steadier": np.where(op > 2, -own["sbd_excess"], np.nan),
-        "entropy": own["entropy_within"] + own["entropy_between"],
-        "entropy_within": own["entropy_within"],
-        "entropy_between": own["entropy_between"],
-    }
-    columns = {name: mean_columns(values) for name, values in means.items()}
-    columns |= {name: np.stack([T * own[f"disagreement_{name}"], T], axis=1) for name in ("within", "between")}
-    coin = [np.stack([own["psa"] * where, where], axis=1) for where in (op == 2, op > 2)]
-    columns["coin"] = np.concatenate(coin, axis=1)
-    sums = {name: places.sums(values) for name, values in columns.items()}
-    evidence, every, self_sum = table.evidence.take(again), np.ones(len(T)), table.self_sum[again]
-    by_look, by_place = places.sums_by_class(evidence, every), places.sums_by_class(evidence, 1 / T)
+    T, op, psa = table.op.astype(np.float64), table.op, maps["psa"]
+    sums = places.means(
+        {
+            "psa": psa,
+            "vss": vss(table),
+            "sbd": maps["sbd_excess"] + maps["sbd_null"],
+            "null": maps["sbd_null"],
+            "excess": maps["sbd_excess"],
+            "steadier": np.where(op > 2, -maps["sbd_excess"], np.nan),
+            "entropy": maps["entropy_within"] + maps["entropy_between"],
+            "entropy_within": maps["entropy_within"],
+            "entropy_between": maps["entropy_between"],
+            "of two": np.where(op == 2, psa, np.nan),
+            "of more": np.where(op > 2, psa, np.nan),
+            "looks": T,
+            "agreeing": T * psa,
+            "own": table.self_sum,
+            "own of a look": table.self_sum / T,
+            **{name: T * maps[f"disagreement_{name}"] for name in ("within", "between")},
+        }
+    )
+    looks, agreeing, own, own_of_look = (
+        sums.pop(name)[:, :1] for name in ("looks", "agreeing", "own", "own of a look")
+    )
+    coin = [sums.pop(name) for name in ("of two", "of more")]
+    by_look, by_place = places.sums_by_class(table.evidence, op)
     further = {
-        "kappa": ([own["psa"], every], by_place),  # as of `kappa_columns`, and of `alpha_columns` twice
-        "alpha": ([T * own["psa"], T, self_sum], by_look),
-        "each_place": ([own["psa"], every, self_sum / T], by_place),
+        **{name: [sums[name][:, :1], looks] for name in ("within", "between")},
+        "coin": coin,
+        "kappa": [sums["psa"], by_place],  # as of `kappa_columns`, and of `alpha_columns` twice
+        "alpha": [agreeing, looks, own, by_look],
+        "each_place": [sums["psa"], own_of_look, by_place],
     }
-    for name, (values, by_class) in further.items():
-        sums[name] = np.concatenate([places.sums(np.stack(values, axis=1)), by_class], axis=1)
-    return PlaceSums(places.cell, places.edge, sums)
+    return PlaceSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
 
 
 def stratum_sums(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> Float64:
     """(2 * len(BY_STRATUM), strata) of maps: their sums, and how often each is defined."""
-    group, count = np.searchsorted(edges, table.op), len(edges) + 1
-    columns = np.concatenate([mean_columns(maps[name]) for name in BY_STRATUM], axis=1)
-    return np.stack([np.bincount(group, weights=column, minlength=count) for column in columns.T])
+    both = by_group(groups_of(table.op, edges), [maps[name] for name in BY_STRATUM], len(edges) + 1)
+    return np.stack(both, axis=-1).reshape(len(edges) + 1, -1).T
 
 
 def _class_sums(parts: Sequence[Float64]) -> Float64:

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 SPARSE = 8
@@ -15,19 +14,20 @@ SPARSE = 8
 
 
 def ranked(numbers: Int64) -> Int64:
-    """The order (n,) that sorts numbers from 0 on, stably: by radix where they have 16 bits at most."""
-    order: Int64 = np.argsort(numbers.astype(np.min_scalar_type(int(numbers.max(initial=0)))), kind="stable")
-    return order
+    """The order (n,) that sorts numbers from 0 on, stably.
 
-
-def added(key: Int64, weight: Float64) -> tuple[Int64, Float64]:
-    """Distinct keys, whole numbers from 0 on, ascending, with the sums of their weights, which are above 0."""
-    if key.max(initial=0) < SPARSE * len(key):
-        total = np.bincount(key, weights=weight)
-        found: Int64 = np.flatnonzero(total)
-        return found, np.asarray(total[found], np.float64)
-    found, of = np.unique(key, return_inverse=True)
-    return found.astype(np.int64), np.bincount(of, weights=weight, minlength=len(found)).astype(np.float64)
+    By radix where they have 16 bits at most; else with the place of each in its lowest bits, as far as there is room
+    for it: whole numbers are sorted several times as fast as places.
+    """
+    most, bits = int(numbers.max(initial=0)), len(numbers).bit_length()
+    if most < 1 << 16 or most >> (63 - bits):
+        order: Int64 = np.argsort(numbers.astype(np.min_scalar_type(most)), kind="stable")
+        return order
+    placed = numbers.astype(np.int64) << bits
+    placed |= np.arange(len(numbers))
+    placed.sort()
+    placed &= (1 << bits) - 1
+    return placed
 
 
 def numbered(values: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
@@ -35,9 +35,19 @@ def numbered(values: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
     if not len(values) or values.min() < 0 or values.max() >= SPARSE * len(values):
         found, of = np.unique(values, return_inverse=True)
         return found.astype(np.int64), of.astype(np.int64)
+    found = distinct(values)
+    number = np.empty(int(found[-1]) + 1, np.int64)
+    number[found] = np.arange(len(found))
+    return found, number[values]
+
+
+def distinct(values: npt.NDArray[np.integer]) -> Int64:
+    """The distinct values, ascending: np.unique, by a table where they are dense."""
+    if not len(values) or values.min() < 0 or values.max() >= SPARSE * len(values):
+        return np.unique(values).astype(np.int64)
     there = np.zeros(int(values.max()) + 1, np.bool_)
     there[values] = True
-    return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
+    return np.flatnonzero(there)
 
 
 def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:

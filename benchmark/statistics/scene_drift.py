@@ -16,7 +16,8 @@ from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.order.drift import VoxelDrift, drawn, streams, trend_columns, varying
-from semstab.statistics.sampling.reach import arrangement
+from semstab.statistics.sampling.arrangement import arranged
+from semstab.statistics.sampling.reach import Errors, longest
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -73,7 +74,7 @@ def scene_drift(
     `drift` is what `voxel_drift` says of the same map.
     """
     test = order_test(*sampled(table, events, seed), seed=seed, frame_orders=frame_orders)
-    one_way, by_chance, all_of_it = trend_columns(table, drift).sum(axis=0)
+    one_way, by_chance, all_of_it = trend_columns(table, drift)[1].sum(axis=0)
     return SceneDrift(
         sbd=mean(sbd(table)),
         null=mean(drift.null),
@@ -194,7 +195,8 @@ def _lasting(departures: Float64, frame: Int64, frames: int) -> float:
     starts = np.arange(0, frames, span)
     sums: Float64 = np.add.reduceat(series, starts)
     sizes: Float64 = np.add.reduceat(size, starts)
-    return span * arrangement(np.arange(len(starts))[:, None]).longest(sums, sizes, CERTAIN)
+    (cells,) = arranged([np.arange(len(starts))[:, None]])
+    return span * longest(Errors(cells, sums, sizes), CERTAIN)
 
 
 def _total(values: Float64) -> float:

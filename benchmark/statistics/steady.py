@@ -17,6 +17,7 @@ from semstab.model.evidence import stretches
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE
+from semstab.statistics.ranks import numbered
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -65,10 +66,8 @@ class Votes:
         likelihood, share = _likelihood(self.seen, self.most), np.full(STEPS, 1 / STEPS)
         if not len(self.seen):
             return share
-        for _ in range(ROUNDS):
-            posterior = likelihood * share
-            posterior /= posterior.sum(axis=1, keepdims=True)
-            share = self.count @ posterior / self.count.sum()
+        for _ in range(ROUNDS):  # how often each share is so, a posteriori
+            share = share * ((self.count / (likelihood @ share)) @ likelihood) / self.count.sum()
         return share
 
     def stable(self, shares: Float64, *, stable: float = STABLE) -> Float64:
@@ -84,12 +83,10 @@ STEPS_OF_P = 0.5 + 0.5 * (np.arange(STEPS) + 0.5) / STEPS
 
 def _likelihood(seen: Int64, most: Int64) -> Float64:
     """(v, STEPS) of votes given each share, up to a factor of each row."""
-    from scipy.special import xlog1py, xlogy
-
-    m, t, p = most[:, None], seen[:, None], STEPS_OF_P
-    own, folded = xlogy(m, p) + xlog1py(t - m, -p), xlogy(t - m, p) + xlog1py(m, -p)
-    found: Float64 = np.logaddexp(own, folded)
-    likelihood: Float64 = np.exp(found - found.max(axis=1, keepdims=True))
+    m, rest, p, q = most[:, None], (seen - most)[:, None], np.log(STEPS_OF_P), np.log1p(-STEPS_OF_P)
+    own, folded = m * p + rest * q, rest * p + m * q
+    best = np.maximum(own, folded).max(axis=1, keepdims=True)
+    likelihood: Float64 = np.exp(own - best) + np.exp(folded - best)
     return likelihood
 
 
@@ -99,8 +96,8 @@ def _votes(table: VoxelTable) -> tuple[Votes, Int64]:
     T = table.op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1
     votes = np.rint(vss(table)[again] * T).astype(np.int64)
-    pairs, of, count = np.unique(votes + T * longest, return_inverse=True, return_counts=True)
-    return Votes(pairs // longest, pairs % longest, count.astype(np.int64)), of.astype(np.int64)
+    pairs, of = numbered(votes + T * longest)
+    return Votes(*np.divmod(pairs, longest), np.bincount(of, minlength=len(pairs)).astype(np.int64)), of
 
 
 def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:

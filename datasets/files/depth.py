@@ -40,8 +40,10 @@ class DepthSource(Protocol):
         """Units of stored depth in a metre, None where depth is not stored."""
         ...
 
-    def depth(self, frame: FrameSource, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]) -> Depth:
-        """Depth (H, W) along the optical axis in metres. Raises DataError with the file."""
+    def depth(
+        self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]
+    ) -> Depth:
+        """Depth (H, W) along the optical axis in metres, of a file whose bytes `read` gives. Raises DataError."""
         ...
 
     def digest(self, frame: FrameSource) -> bytes | None:
@@ -50,11 +52,10 @@ class DepthSource(Protocol):
 
 
 class StoredDepth:
-    """A file a frame; `read` gives its bytes."""
+    """A file a frame."""
 
-    def __init__(self, options: FileOptions, read: Read) -> None:
+    def __init__(self, options: FileOptions) -> None:
         self._options = options
-        self._read = read
 
     def path(self, frame: FrameSource) -> Path:
         """The frame's own file."""
@@ -65,10 +66,12 @@ class StoredDepth:
         usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
         return self._options.depth_scale or frame.depth_scale or usual
 
-    def depth(self, frame: FrameSource, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]) -> Depth:
+    def depth(
+        self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]
+    ) -> Depth:
         """What the file holds, without what marks pixels that have none."""
         scale = self._options.depth_scale or frame.depth_scale
-        depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, self._read)
+        depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
         if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
             depth = np.zeros_like(depth)
         for value in self._options.invalid_depth:
@@ -101,7 +104,9 @@ class CastDepth:
         """Depth is not stored."""
         return
 
-    def depth(self, frame: FrameSource, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]) -> Depth:
+    def depth(
+        self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]
+    ) -> Depth:
         """What the camera sees of it."""
         shape = shape_of(frame, self._options)
         depth = self._surface.depth(View(camera(shape), T_wc(), shape))

@@ -42,3 +42,8 @@ class FrameSource:
     color: Path | None = None
     depth_scale: float | None = None
     timestamp: float | None = None
+
+    @property
+    def called(self) -> tuple[str, ...]:
+        """The names that its label maps may have, its own first."""
+        return self.name, *self.aliases

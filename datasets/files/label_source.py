@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from semstab.datasets import GROUND_TRUTH
+from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.templates import Folders, Template, inside_text, matching_folders
 from semstab.datasets.formats.images import LABEL_SUFFIXES, MASK_SUFFIXES, SCORE_SUFFIXES
@@ -26,27 +27,37 @@ REGIONS = "regions/{backbone}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
 """In a folder of label maps or scores: their classes, where they are not the scene's; a taxonomy file."""
 
-FileNames = Mapping[str, Sequence[str]]
-"""By a frame's name the names that its files may have, its own first."""
-
 SEPARATE = "{scene}/{backbone}/{name}"
 """The template of label maps in a folder of their own."""
 
 
 @dataclass(frozen=True)
 class LabelSource:
-    """One label source of a scene: where a frame's file would be, and those that are there, by the frame's name."""
+    """One label source of a scene: where a frame's file would be.
+
+    folders  what lies there
+    first    the first frame that has a file, and the file; None where none has
+    """
 
     kind: Kind
     base: Path
     template: str
-    files: Mapping[str, str]
+    folders: Folders
+    first: tuple[str, str] | None = None
 
-    def missing(self, name: str) -> list[str]:
+    def file(self, frame: FrameSource) -> str | None:
+        """The file of a frame; as text, for a path takes longer to make than to look up."""
+        where = str(self.base)
+        paths = (inside_text(self.base, self.template.replace("{name}", name), where) for name in frame.called)
+        return next(
+            (file for path in paths if (file := self.folders.file(path, SUFFIXES[self.kind])) is not None), None
+        )
+
+    def missing(self, frame: FrameSource) -> list[str]:
         """Nothing, or the path that the file of that frame would have."""
-        if name in self.files:
+        if self.file(frame) is not None:
             return []
-        path = self.base / self.template.replace("{name}", name)
+        path = self.base / self.template.replace("{name}", frame.name)
         return [str(path if path.suffix.lower() in SUFFIXES[self.kind] else f"{path}{SUFFIXES[self.kind][0]}")]
 
 
@@ -59,79 +70,78 @@ class ScenePlace:
     below_root: str
 
 
-def find_sources(options: FileOptions, place: ScenePlace, names: FileNames) -> dict[str, LabelSource]:
-    """The label sources of a scene whose frames have these names; `gt` is the ground truth.
+def find_sources(
+    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders
+) -> dict[str, LabelSource]:
+    """The label sources of a scene with these frames; `gt` is the ground truth.
 
     labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
     else is there. A folder without a file of any frame is left out with a warning.
     Raises ConfigError for a template that cannot be used, or a labels_root that is not there, DataError for a folder
     that cannot be listed.
     """
-    folders, found = Folders(), {}
+    found: dict[str, LabelSource] = {}
     base = place.folder if options.labels_root is None else options.labels_root
     if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
     for kind in KINDS:
         for backbone, template in _templates(kind, options, place, base).items():
-            source = _source(kind, base, template, names, folders)
+            source = _source(kind, base, template, frames, folders)
             name = f"{backbone}-scores" if kind == "scores" and not isinstance(options.scores, dict) else backbone
             if name in found:
                 raise ConfigError(f"{place.folder}: two label sources are called '{name}'; rename one")
-            if source.files:
+            if source.first is not None:
                 found[name] = source
-            elif names:
-                logger.warning(
-                    "%s: no file of any frame, such as %s; left out", name, source.missing(next(iter(names)))[0]
-                )
+            elif frames:
+                logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
     if not found and (options.labels or options.scores or options.labels_root):
         logger.warning(
             "%s: no label maps in %s fit the options labels and scores; looked for %s",
-            place.name, base, ", ".join(label_paths(options, place, [*names])),
+            place.name, base, ", ".join(label_paths(options, place, frames)),
         )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in found:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
-        source = _source("labels", place.folder, truth.filled(scene=place.below_root), names, folders)
-        found |= {GROUND_TRUTH: source} if source.files else {}
+        source = _source("labels", place.folder, truth.filled(scene=place.below_root), frames, folders)
+        found |= {GROUND_TRUTH: source} if source.first is not None else {}
     return found
 
 
-def label_paths(options: FileOptions, place: ScenePlace, names: Sequence[str]) -> list[str]:
+def label_paths(options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource]) -> list[str]:
     """Where label maps and scores are looked for: the paths of the first frame, with BACKBONE for any name."""
     base, found = options.labels_root or place.folder, []
     for kind in KINDS:
         said = _said(kind, options)
         for template in said.values() if isinstance(said, dict) else [said] if said else []:
             name = template.replace("{scene}", place.below_root).replace("{backbone}", "BACKBONE")
-            path = base / name.replace("{name}", names[0] if names else "NAME")
+            path = base / name.replace("{name}", frames[0].name if frames else "NAME")
             found.append(str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}"))
     return found
 
 
 def find_regions(
-    options: FileOptions, place: ScenePlace, names: FileNames, sources: Collection[str]
+    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders, sources: Collection[str]
 ) -> dict[str, LabelSource]:
     """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none.
 
     Raises DataError where the name is one of `sources`, too.
     """
-    folders = Folders()
     base = place.folder if options.labels_root is None else options.labels_root
     template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
     found = {
-        backbone: _source("labels", base, filled, names, folders)
+        backbone: _source("labels", base, filled, frames, folders)
         for backbone, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
     }
     if both := next((name for name in found if name in sources), None):
         raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
-    return {backbone: source for backbone, source in found.items() if source.files}
+    return {backbone: source for backbone, source in found.items() if source.first is not None}
 
 
-def find_masks(options: FileOptions, place: ScenePlace, names: FileNames) -> Mapping[str, str]:
-    """The mask of each frame that has one, by the frame's name; none without the option."""
+def find_masks(options: FileOptions, place: ScenePlace, folders: Folders) -> LabelSource | None:
+    """Where the masks of frames are; None without the option."""
     if options.masks is None:
-        return {}
+        return None
     template = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=place.below_root)
-    return _source("masks", place.folder, template, names, Folders()).files
+    return LabelSource("masks", place.folder, template, folders)
 
 
 def _said(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
@@ -156,15 +166,11 @@ def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) 
     return matching_folders(base, template, "backbone", scene=place.below_root)
 
 
-def _source(kind: Kind, base: Path, template: str, names: FileNames, folders: Folders) -> LabelSource:
-    """The files of one source, by the frames' names; as text, for a path takes longer to make than to look up."""
-    where, found = str(base), {}
-    for name, known in names.items():
-        paths = (inside_text(base, template.replace("{name}", each), where) for each in known)
-        file = next((file for path in paths if (file := folders.file(path, SUFFIXES[kind])) is not None), None)
-        if file is not None:
-            found[name] = file
-    return LabelSource(kind, base, template, found)
+def _source(kind: Kind, base: Path, template: str, frames: Sequence[FrameSource], folders: Folders) -> LabelSource:
+    """One source, with the first frame that has a file."""
+    source = LabelSource(kind, base, template, folders)
+    there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
+    return replace(source, first=next(there, None))
 
 
 def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:
@@ -174,7 +180,8 @@ def label_space(options: FileOptions, folder: Path, name: str, source: LabelSour
     """
     if name in options.taxonomies:
         return LabelSpace.load(options.taxonomies[name])
-    frame, file = next(iter(source.files.items()))
+    assert source.first is not None
+    frame, file = source.first
     for parent in Path(file).parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
         if (beside := parent / LABEL_SPACE_FILE).is_file():
             return LabelSpace.load(beside)

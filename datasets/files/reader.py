@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.frame_table import FrameTable
 from semstab.datasets.files.label_source import ScenePlace
 from semstab.datasets.files.messages import nearest
 from semstab.datasets.files.options import FileOptions
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.templates import Folders
-from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.formats.disk import naturally, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.scene import Dataset
 from semstab.datasets.surfaces.casts import usual_folder
@@ -64,7 +65,7 @@ class FileDataset(Dataset, Generic[Options]):
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self._places)}")
         place = self._places[name]
         options = self.settled(place.folder)
-        frames = self.frames(place.folder)
+        frames = FrameTable(self.frames(place.folder), place.folder)
         if not frames:
             raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
         georeference = self.georeference(place.folder, options)
@@ -96,7 +97,7 @@ class FileDataset(Dataset, Generic[Options]):
         there = files_named(folder, before, after)
         if self.options.surface is None:
             return there
-        return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
+        return {name: folder / f"{before}{name}{after}" for name in naturally({*there, *instead})}
 
     def has_depth(self, folder: Path) -> bool:
         """Whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
@@ -111,7 +112,7 @@ class FileDataset(Dataset, Generic[Options]):
         """Whether a folder is a scene of this format."""
 
     @abstractmethod
-    def frames(self, folder: Path) -> list[FrameSource]:
+    def frames(self, folder: Path) -> Iterable[FrameSource]:
         """The frames of a scene's folder, in order, each with a name of its own. Raises DataError with the file."""
 
 
@@ -148,7 +149,7 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
         raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
     fitting = (entry for entry in entries if entry.startswith(before) and entry.endswith(after))
     names = (entry[len(before) : len(entry) - len(after)] for entry in fitting if not entry.startswith("."))
-    return {name: folder / f"{before}{name}{after}" for name in sorted(names, key=natural) if name}
+    return {name: folder / f"{before}{name}{after}" for name in naturally(names) if name}
 
 
 def images_named(folder: Path, before: str = "", after: str = "") -> list[str]:
@@ -167,7 +168,7 @@ def frames_of(
     label_camera: Camera | None = None,
     depth_scale: float | None = None,
     what: str = "depth images",
-) -> list[FrameSource]:
+) -> Iterator[FrameSource]:
     """One a depth image, with its colour where there is any; `pose` and `color` are templates with {name}.
 
     poses  (n, 4, 4) in the same order, where `pose` is the file of them all
@@ -179,7 +180,7 @@ def frames_of(
             f"{folder / pose}: has {len(poses)} poses, but there are {len(depth)} {what}; they must be as many"
         )
     folders = Folders()
-    return [
+    return (
         FrameSource(
             name=name,
             depth=path,
@@ -191,7 +192,7 @@ def frames_of(
             depth_scale=depth_scale,
         )
         for k, (name, path) in enumerate(depth.items())
-    ]
+    )
 
 
 def _surface(options: FileOptions, georeference: Georeference | None) -> Surface | None:

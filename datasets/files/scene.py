@@ -13,16 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
+from semstab.datasets.files.digests import Digests
 from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.frame_table import FrameTable
 from semstab.datasets.files.label_maps import LabelMaps
 from semstab.datasets.files.label_source import (
     ScenePlace,
     label_paths,
 )
 from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.templates import Folders, inside
+from semstab.datasets.files.templates import Folders
 from semstab.datasets.formats import disk
-from semstab.datasets.formats.images import read_color
+from semstab.datasets.formats.images import Read, read_color
 from semstab.datasets.formats.text_files import read_pose
 from semstab.datasets.scene import Scene
 from semstab.datasets.surfaces.casting import View
@@ -46,6 +48,12 @@ PLACES = {
 AT_ONCE = 64
 """Files that a thread reads one after the other for their digests."""
 
+BATCH = 4096
+"""Frames whose files are in memory by name at once, for their digests."""
+
+DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
+"""What a frame's files are."""
+
 
 class FileScene(Scene):
     """One sequence of files, each required when it is read; opening it reads no image.
@@ -58,36 +66,31 @@ class FileScene(Scene):
     def __init__(
         self,
         place: ScenePlace,
-        frames: Sequence[FrameSource],
+        frames: FrameTable,
         options: FileOptions,
         class_ids: Mapping[str, npt.NDArray[np.uint16]] | None = None,
         surface: Surface | None = None,
     ) -> None:
-        names = [frame.name for frame in frames]
-        if len(set(names)) < len(names):
+        if len(set(frames.names)) < len(frames):
             raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
-        for frame in frames:  # files of predictions are called so
-            if ".." in frame.name or frame.name.startswith("/"):
-                inside(place.folder, place.folder, frame.name, str(frame.pose_file))
         self.name = place.name
         self.folder = place.folder
         self.options = options
         self.skips_incomplete = options.incomplete == "skip"
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
-        self._maps = LabelMaps(options, place, frames, class_ids or {}, self._read)
+        self._folders = Folders()
+        self._maps = LabelMaps(options, place, frames, class_ids or {}, self._folders)
         self.backbones = self._maps.backbones
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
-        self.label_paths = tuple(label_paths(options, place, names))
-        self._folders = Folders()
-        self._digests: dict[str, bytes] = {}
-        self._depth: DepthSource = (
-            StoredDepth(options, self._read) if surface is None else CastDepth(surface, options, self._views)
-        )
+        self.label_paths = tuple(label_paths(options, place, frames))
+        self._digests = Digests(len(frames))
+        self._tracked: list[bool | None] = [None] * len(frames)
+        self._depth: DepthSource = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
         self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
-        self.on_photographs = any(frame.label_lens is not None for frame in frames)
+        self.on_photographs = frames.distorted
 
     def __len__(self) -> int:
         """Number of frames of the sequence, those that lack a file or a pose among them."""
@@ -98,19 +101,21 @@ class FileScene(Scene):
         """(len,) seconds on the dataset's own clock; None where it has none."""
         if self.options.frames_per_second is not None:
             return np.arange(len(self)) / self.options.frames_per_second
-        times = [frame.timestamp for frame in self._frames]
-        return None if None in times else np.array(times, dtype=np.float64)
+        return self._frames.times
 
     def tracked(self, index: int) -> bool:
-        """Whether the frame has a pose: one that is not finite says that tracking was lost."""
-        return bool(np.isfinite(self._stored_pose(self._frame(index))).all())
+        """Whether the frame has a pose: one that is not finite says that tracking was lost. Its file is read once."""
+        source, known = self._frame(index), self._tracked[index]
+        if known is None:
+            known = self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
+        return known
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
         files = [self._depth.path(frame), *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
-        lost += [path for name in sources for path in self._maps.source(name).missing(frame.name)]
+        lost += [path for name in sources for path in self._maps.source(name).missing(frame)]
         if color and self._color_file(frame) is None:
             lost.append(f"{self.folder}: the colour of {frame.name}" if frame.color is None else str(frame.color))
         if color and frame.label_lens is not None and not self._folders.has(frame.photograph or Path()):
@@ -140,12 +145,13 @@ class FileScene(Scene):
         Labels of another size than the depth are brought to its pixels. Raises DataError that names the file,
         ConfigError where there is no such frame or backbone.
         """
-        file, kind = self._maps.file(self._frame(index).name, backbone), self._maps.source(backbone).kind
+        file, kind = self._maps.file(self._frame(index), backbone), self._maps.source(backbone).kind
+        read = self._reader(index, LABELS + backbone)
         depth, labels, scores = self.depth(index), None, None
         if kind == "labels":
-            labels = self._stored(index, self._maps.labels(backbone, file), depth.shape, file, "labels are")
+            labels = self._stored(index, self._maps.labels(backbone, file, read), depth.shape, file, "labels are")
         else:
-            stored = self._maps.scores(backbone, file, (depth.shape[0], depth.shape[1]))
+            stored = self._maps.scores(backbone, file, (depth.shape[0], depth.shape[1]), read)
             scores = self._stored(index, stored, depth.shape, file, "scores are")
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
@@ -179,8 +185,8 @@ class FileScene(Scene):
 
     def depth(self, index: int) -> npt.NDArray[np.float32]:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
-        source = self._frame(index)
-        return self._depth.depth(source, lambda shape: self.intrinsics(index, shape), lambda: self.T_wc(index))
+        source, read = self._frame(index), self._reader(index, DEPTH)
+        return self._depth.depth(source, read, lambda shape: self.intrinsics(index, shape), lambda: self.T_wc(index))
 
     def color(self, index: int) -> npt.NDArray[np.uint8] | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
@@ -226,7 +232,7 @@ class FileScene(Scene):
         convention, axes = options.pose_convention or "camera_to_world", options.camera_axes or "opencv"
         return to_camera_to_world(stored, convention, axes, str(source.pose_file))
 
-    def digest(self, indices: list[int], backbone: str) -> str:
+    def digest(self, indices: Sequence[int], backbone: str) -> str:
         """A hash of the settings, the classes, and the depth, poses and labels of those frames; colour does not count.
 
         Of the images it is the content that `frame` read, where it did; others are read for it.
@@ -236,21 +242,31 @@ class FileScene(Scene):
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
         digest.update(self._maps.table_bytes(backbone))
-        files = [self._images(self._frame(index), backbone) for index in indices]
-        read = _digests_of([file for each in files for file in each if file not in self._digests])
-        for index, images in zip(indices, files, strict=True):
-            source = self._frame(index)
-            digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
-            digest.update(self._depth.digest(source) or b"")
-            for file in images:
-                digest.update(read.get(file) or self._digests[file])
+        for first in range(0, len(indices), BATCH):
+            some = indices[first : first + BATCH]
+            files = [self._images(index, backbone) for index in some]
+            unread = [
+                (index, what, path)
+                for index, own in zip(some, files, strict=True)
+                for what, path in own.items()
+                if self._digests.of(index, what) is None
+            ]
+            read = _digests_of(unread)
+            for index, own in zip(some, files, strict=True):
+                source = self._frame(index)
+                digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
+                digest.update(self._depth.digest(source) or b"")
+                for what in own:
+                    digest.update(read.get((index, what)) or self._digests.of(index, what) or b"")
         return digest.hexdigest()
 
-    def _images(self, source: FrameSource, backbone: str) -> list[str]:
+    def _images(self, index: int, backbone: str) -> dict[str, Path]:
         """The files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
+        source = self._frame(index)
         depth = source.depth if self._depth.digest(source) is None else None
-        paths = (depth, self._maps.file(source.name, backbone), self._maps.mask_file(source.name))
-        return [str(path) for path in paths if path is not None]
+        labels, mask = self._maps.file(source, backbone), self._maps.mask_file(source)
+        files = {DEPTH: depth, LABELS + backbone: labels, MASK: mask}
+        return {what: path for what, path in files.items() if path is not None}
 
     def _views(self) -> Iterator[View]:
         """Those of the frames that have a pose."""
@@ -271,7 +287,7 @@ class FileScene(Scene):
         """The frame with labels or scores that have the depth's pixels."""
         source, timestamps = self._frame(index), self.timestamps
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
-        mask = self._maps.mask_file(source.name)
+        mask = self._maps.mask_file(source)
         shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
         known = {"depth": self._depth.path(source), "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
@@ -290,7 +306,7 @@ class FileScene(Scene):
 
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
         """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
-        mask = self._maps.mask(path)
+        mask = self._maps.mask(path, self._reader(index, MASK))
         masked: npt.NDArray[np.bool_] = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
@@ -318,11 +334,15 @@ class FileScene(Scene):
         cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
         return self._stored_pose(source).tobytes() + repr(cameras).encode()
 
-    def _read(self, path: Path) -> bytes:
-        """The content of an image file; its digest is kept, so that `digest` need not read the file again."""
-        data = disk.read_bytes(path)
-        self._digests[str(path)] = disk.digest(data)
-        return data
+    def _reader(self, index: int, what: str) -> Read:
+        """What gives the content of a frame's file; its digest is kept, so that `digest` need not read it again."""
+
+        def read(path: Path) -> bytes:
+            data = disk.read_bytes(path)
+            self._digests.keep(index, what, disk.digest(data))
+            return data
+
+        return read
 
     def _stored_pose(self, source: FrameSource) -> Poses:
         return read_pose(source.pose_file) if source.pose is None else source.pose
@@ -337,12 +357,12 @@ class FileScene(Scene):
         return self._frames[index]
 
 
-def _digests_of(files: Sequence[str]) -> dict[str, bytes]:
-    """Those of files that have to be read for it, some in each of several threads."""
+def _digests_of(files: Sequence[tuple[int, str, Path]]) -> dict[tuple[int, str], bytes]:
+    """Those of files of frames that have to be read for it, some in each of several threads."""
     some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
-    digests = prefetch(lambda k: [disk.file_digest(Path(file)) for file in some[k]], range(len(some)))
+    digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
     return {
-        file: digest
-        for names, fetched in zip(some, digests, strict=True)
-        for file, digest in zip(names, fetched.item, strict=True)
+        (index, what): digest
+        for own, fetched in zip(some, digests, strict=True)
+        for (index, what, _), digest in zip(own, fetched.item, strict=True)
     }

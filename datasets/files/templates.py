@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+from bisect import bisect_left
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+
+import numpy as np
+import numpy.typing as npt
 
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.errors import ConfigError, DataError
@@ -106,15 +110,17 @@ def _require_path(relative: str, where: str) -> None:
 
 
 class Folders:
-    """What lies in folders, each listed when it is first asked for."""
+    """What lies in folders, each listed when it is first asked for: names as bytes in order, a fifth of a set's memory.
+
+    Several threads may ask.
+    """
 
     def __init__(self) -> None:
-        self._names: dict[str, frozenset[str]] = {}
+        self._names: dict[str, npt.NDArray[np.bytes_]] = {}
 
     def has(self, path: Path) -> bool:
         """Whether there is a file or folder of that path."""
-        parent, name = os.path.split(path)
-        return name in self._listed(parent)
+        return self._has(*os.path.split(path))
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
         """The path where it has one of the suffixes, else that with the first suffix there is a file of."""
@@ -124,16 +130,21 @@ class Folders:
     def file(self, path: str, suffixes: Collection[str]) -> str | None:
         """The same as text."""
         parent, name = os.path.split(path)
-        there = self._listed(parent)
         if os.path.splitext(name)[1].lower() in suffixes:  # noqa: PTH122  of ten thousand names
-            return path if name in there else None
-        suffix = next((suffix for suffix in suffixes if name + suffix in there), None)
+            return path if self._has(parent, name) else None
+        suffix = next((suffix for suffix in suffixes if self._has(parent, name + suffix)), None)
         return None if suffix is None else path + suffix
 
-    def _listed(self, folder: str) -> frozenset[str]:
+    def _has(self, folder: str, name: str) -> bool:
+        listed, wanted = self._listed(folder), os.fsencode(name)
+        at = bisect_left(listed, wanted)
+        return at < len(listed) and bool(listed[at] == wanted)
+
+    def _listed(self, folder: str) -> npt.NDArray[np.bytes_]:
         if folder not in self._names:
             try:
-                self._names[folder] = frozenset(os.listdir(folder or "."))  # noqa: PTH208  names, not paths
+                names = os.listdir(os.fsencode(folder or "."))  # noqa: PTH208  names, not paths
             except OSError:
-                self._names[folder] = frozenset()
+                names = []
+            self._names[folder] = np.sort(np.array(names, dtype=np.bytes_))
         return self._names[folder]

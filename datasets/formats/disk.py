@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Container
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 
 from semstab.errors import DataError
@@ -53,31 +53,40 @@ def natural(name: str) -> tuple[list[str | int], str]:
     return [int(part[:4000]) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
+def naturally(names: Iterable[str]) -> list[str]:
+    """The names in natural order; of names alike but for their digits, as of a camera, that is the usual order."""
+    listed = sorted(names)
+    alike = len({re.sub("[0-9]", "0", name) for name in listed}) < 2
+    return listed if alike else sorted(listed, key=natural)
+
+
 def subfolders(folder: Path) -> list[str]:
     """Names in natural order. Raises DataError where the folder cannot be listed."""
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
 
 
-def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, Path]:
-    """The files with one of these suffixes. Raises DataError for two of one stem, or a folder that cannot be listed."""
-    files: dict[str, Path] = {}
+def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
+    """Names of the files with one of these suffixes.
+
+    Raises DataError for two of one stem, or a folder that cannot be listed.
+    """
+    files: dict[str, str] = {}
     for entry in _entries(folder):
         stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122  of a hundred thousand names
         if suffix.lower() not in suffixes or not entry.is_file():
             continue
-        path = folder / entry.name
         if stem in files:
-            raise DataError(f"{path}: {files[stem].name} is the same frame; keep one of the two")
-        files[stem] = path
+            raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
+        files[stem] = entry.name
     return files
 
 
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
+def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
     """What is in a folder, but for hidden entries; nothing where there is no folder."""
     try:
         with os.scandir(folder) as entries:
-            return [entry for entry in entries if not entry.name.startswith(".")]
+            yield from (entry for entry in entries if not entry.name.startswith("."))
     except FileNotFoundError:
-        return []
+        return
     except OSError as error:
         raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error

@@ -26,7 +26,7 @@ import semstab
 from semstab.engine.sizing import SHARE
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights
-from semstab.engine.work.memory import GB, Kind, Load
+from semstab.engine.work.memory import GB, Kind, Load, voxels_of
 from semstab.runtime.files import write_json
 
 HERE = Path(__file__).resolve().parent
@@ -84,8 +84,9 @@ def largest_part(out: Path, kind: Kind, memory_gb: float, observed: float) -> tu
 def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: float) -> Iterator[dict[str, Any]]:
     """At once, then in tiles."""
     soft, (width, height) = kind == "scores", SIZE[kind]
-    of = Kind(backend, K, soft=soft, sampled=backend == "numba")
-    load = Load(flight.frame(0, width, height, K), FRAMES[kind], K, soft, None)
+    first = flight.frame(0, width, height, K)
+    of = Kind(backend, K, soft=soft, sampled=backend == "numba", touched=voxels_of(first, VOXEL_SIZE, K))
+    load = Load(first, FRAMES[kind], K, soft, None)
     if of.bytes(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
         print(f"{backend:>8} {K:4} {kind:>7} left out: {of.bytes(most, most) / GB:.2g} GB")
         return
@@ -98,7 +99,13 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
     part, voxels = largest_part(out, of, limit, looks / voxels)
-    yield {**own, "run": "tiles", "bytes": found, "estimate": part + load.beside(voxels, part), "stage": stage}
+    yield {
+        **own,
+        "run": "tiles",
+        "bytes": found,
+        "estimate": part + load.beside(voxels, part, in_tiles=True),
+        "stage": stage,
+    }
 
 
 def main() -> None:

@@ -1,12 +1,13 @@
 """One map in tiles on one Dask worker and on two: how much faster are two, and what keeps them from twice as fast?
 
-    python tests/perf/bench_workers.py [--frames 150] [--memory-gb 1] [--workers 1 2] [--repeat 2] [--json FILE]
+    python tests/perf/bench_workers.py [--frames 150] [--memory-gb 1] [--workers 1 2] [--repeat 2] [--cold]
 
 The flight of bench_tiles.py, in a folder that all see; a real scheduler and worker processes of one thread each on
-127.0.0.1, started before the clock, with so much memory each. Wall-clock of the whole command, the least of `--repeat`
-runs in turn: it says something on a quiet machine with as many free cores as workers. Beside it the CPU time of the
-command itself, which is what workers cannot share, and of each worker, whose largest is the way that is left. That two
-workers find what one finds is compared bit by bit.
+127.0.0.1, started before the clock, with so much memory each. They have done a run of a few frames before, as workers
+that stay have, so that nothing is loaded for the first time; with `--cold` they have not. Wall-clock of the whole
+command, the least of `--repeat` runs in turn: it says something on a quiet machine with as many free cores as workers.
+Beside it the CPU time of the command itself, which is what workers cannot share, and of each worker, whose largest is
+the way that is left. That two workers find what one finds is compared bit by bit.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import contextlib
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -71,21 +73,29 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(scene: Path, out: Path, workers: int, memory_gb: float) -> dict[str, float]:
+def measure(scene: Path, out: Path, workers: int, memory_gb: float, *, cold: bool = False) -> dict[str, float]:
     """Wall-clock of the command, CPU time of it and of the workers, seconds."""
     with cluster(workers, out.parent) as (address, ids):
+        if not cold:
+            run(scene, out.with_name(f"{out.name}, before"), address, "--frames", ":24", "--tile-size", "128")
         before, started = [cpu_seconds(pid) for pid in ids], time.perf_counter()
-        command = [sys.executable, "-m", "semstab", "run", "--data", str(scene), "--out", str(out), "--voxel-size",
-                   "0.2", "--trust-geometry", "--report", "off", "--rerun", "off", "--quiet", "--scheduler", address,
-                   "--set", f"memory_gb={memory_gb * workers}"]  # fmt: skip
-        process = subprocess.Popen(command, env=os.environ | ONE_THREAD)
-        _, status, usage = os.wait4(process.pid, 0)
+        usage = run(scene, out, address, "--set", f"memory_gb={memory_gb * workers}")
         wall = time.perf_counter() - started
         busy = [cpu_seconds(pid) - was for pid, was in zip(ids, before, strict=True)]
-    if status:
-        raise SystemExit(f"{' '.join(command)}: ended with {os.waitstatus_to_exitcode(status)}")
     own = {"command_cpu_s": usage.ru_utime + usage.ru_stime, "workers_cpu_s": sum(busy), "busiest_cpu_s": max(busy)}
     return {"wall_s": wall, **own, **stages(out)}
+
+
+def run(scene: Path, out: Path, address: str, *options: str) -> resource.struct_rusage:
+    """What the command takes itself."""
+    command = [sys.executable, "-m", "semstab", "run", "--data", str(scene), "--out", str(out), "--voxel-size", "0.2",
+               "--trust-geometry", "--report", "off", "--rerun", "off", "--quiet", "--scheduler", address,
+               *options]  # fmt: skip
+    process = subprocess.Popen(command, env=os.environ | ONE_THREAD)
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(command)}: ended with {os.waitstatus_to_exitcode(status)}")
+    return usage
 
 
 def stages(out: Path) -> dict[str, float]:
@@ -113,6 +123,7 @@ def main() -> None:
     parser.add_argument("--memory-gb", type=float, default=1.0)
     parser.add_argument("--workers", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--repeat", type=int, default=2)
+    parser.add_argument("--cold", action="store_true", help="workers that have just been started")
     parser.add_argument("--json", help="also write the figures there")
     arguments = parser.parse_args()
     rows: list[dict[str, float]] = []
@@ -121,7 +132,9 @@ def main() -> None:
         for k in range(arguments.repeat):
             for workers in arguments.workers:
                 out = Path(folder) / f"{workers} workers, {k}"
-                rows.append({"workers": workers, **measure(scene, out, workers, arguments.memory_gb)})
+                rows.append(
+                    {"workers": workers, **measure(scene, out, workers, arguments.memory_gb, cold=arguments.cold)}
+                )
                 print(*(f"{name} {value:.4g}" for name, value in rows[-1].items()), sep=", ", flush=True)
         first, *others = (Path(folder) / f"{workers} workers, 0" for workers in arguments.workers)
         equal = all(same(first, other) for other in others)

@@ -16,7 +16,7 @@ from semstab.runtime.array_files import read_arrays, write_arrays
 MOST_ROWS = 1 << 22
 """Pairs of frame and cell that are kept; where there are more, cells become twice as wide."""
 
-BUDGET, SHARE = 1 << 20, 1 << 29
+BUDGET, SHARE = 1 << 18, 1 << 29
 """Sampled voxels that are kept: one in eight at first, and half of them go whenever there are too many."""
 
 Int32 = npt.NDArray[np.int32]
@@ -42,9 +42,14 @@ class Seen:
     drawn: Int64
     looks: Int64
 
+    def below(self, share: int) -> Seen:
+        """The same with those voxels alone whose hashes are below that share."""
+        kept = self.drawn < share
+        return dataclasses.replace(self, key=self.key[kept], drawn=self.drawn[kept], looks=self.looks[kept])
+
     def save(self, path: Path) -> None:
-        """Write it, atomically."""
-        write_arrays(path, vars(self))
+        """Write it, atomically; as it is, for it is soon read and gone."""
+        write_arrays(path, vars(self), packed=False)
 
     @classmethod
     def load(cls, path: Path) -> Seen | None:
@@ -77,8 +82,8 @@ class Collected:
         self._count += len(self._rows[-1])
         while self._count > MOST_ROWS:
             self._widen()
-        self._parts.append(seen)
-        self._waiting += len(seen.key)
+        self._parts.append(seen.below(self._share))
+        self._waiting += len(self._parts[-1].key)
         if self._waiting > BUDGET:
             self._settle()
 
@@ -99,13 +104,10 @@ class Collected:
         keys, drawn, looks = (np.concatenate([getattr(part, k) for part in parts]) for k in ("key", "drawn", "looks"))
         key, first, of = np.unique(keys, return_index=True, return_inverse=True)
         looks = np.bincount(of, weights=looks, minlength=len(first)).astype(np.int64)
-        drawn = drawn[first]
-        while np.count_nonzero(drawn < self._share) > BUDGET:
+        found = dataclasses.replace(self._all, key=key, drawn=drawn[first], looks=looks)
+        while np.count_nonzero(found.drawn < self._share) > BUDGET:
             self._share //= 2
-        kept = drawn < self._share
-        self._all = dataclasses.replace(
-            self._all, share=self._share, key=key[kept], drawn=drawn[kept], looks=looks[kept]
-        )
+        self._all = dataclasses.replace(found.below(self._share), share=self._share)
 
 
 def _joined(rows: Iterable[Int32]) -> Int32:

@@ -106,7 +106,7 @@ class Finished:
     series   (F, C) a row a frame, its NUMBERS
     sums     over the voxels, by name: those of `TableSums`, or of `FirstSums` where its map is judged
     reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
-    poses    (F, 4, 4) of the frames, where it is of these
+    poses    (F, 3, 3) down, forward and centre of the cameras, where it is of frames and up is to be estimated
     image    (F, C) what each of them tells in image coordinates, see `ImageSpaceMeter`
     """
 
@@ -114,7 +114,7 @@ class Finished:
     series: Float64
     sums: Mapping[str, Any] = field(default_factory=dict)
     reduced: Float64 = field(default_factory=lambda: np.zeros(0))
-    poses: Float64 = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    poses: Float64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
     image: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
 
     def save(self, path: Path) -> None:
@@ -129,7 +129,7 @@ class Finished:
     def load(cls, path: Path) -> Finished | None:
         """What `save` wrote; None where it is not there, or damaged. Raises DataError for that of another version."""
         arrays = read_arrays(path)
-        if arrays is None or arrays["series"].shape[1:] != (len(NUMBERS),):
+        if arrays is None or arrays["series"].shape[1:] != (len(NUMBERS),) or arrays["poses"].shape[1:] != (3, 3):
             return None
         about = from_json(About, parse_json(arrays["about"].tobytes()), path)
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
@@ -138,7 +138,8 @@ class Finished:
 
 def joined_series(frames: Float64, parts: Sequence[Float64]) -> Series:
     """The time series of a unit (F rows) from that of its frames without a map, and those of the parts of its map."""
-    columns = {name: frames[:, k].copy() for k, name in enumerate(NUMBERS)}
+    joined = frames.copy()
+    columns = {name: joined[:, k] for k, name in enumerate(NUMBERS)}
     state = {name: np.zeros(len(frames)) for name in ("map_voxels", *MEANS)}
     for part in parts:
         own = {name: part[:, k] for k, name in enumerate(NUMBERS)}
@@ -153,5 +154,7 @@ def joined_series(frames: Float64, parts: Sequence[Float64]) -> Series:
         for name in MEANS:
             state[name] += np.where(voxels > 0, voxels * own[name][last], 0.0)
     n = np.where(state["map_voxels"] > 0, state["map_voxels"], math.nan)
-    columns |= {"map_voxels": state["map_voxels"], **{name: state[name] / n for name in MEANS}}
-    return Series(np.stack([columns[name] for name in NUMBERS], axis=1))
+    columns["map_voxels"][:] = state["map_voxels"]
+    for name in MEANS:
+        columns[name][:] = state[name] / n
+    return Series(joined)

@@ -160,7 +160,7 @@ def seen_in(frame: Frame, voxel_size: float, origin: Int64, size: int = CELL) ->
     ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
     rays, margin = frame_terms(ray_x, frame.T_wc, voxel_size)
     everything, row = np.zeros(W, np.uint8), np.empty(W, np.int64)
-    room = min(H * W, 1 << 14)
+    room = min(H * W, max(1 << 14, 2 * H * W * SHARE // ALL))
     while True:
         cells, keys, drawn = (np.empty(room, np.int64) for _ in range(3))
         n, m = look(

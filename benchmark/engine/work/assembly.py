@@ -6,7 +6,6 @@ import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,26 +13,22 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.series import to_csv
+from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.finish import Savers, further_columns, no_voxels, reduced_of, save_voxels, unit_summary
+from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
 from semstab.engine.work.image_space import image_space_of
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
-from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
 from semstab.model.results import Agreement
-from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
-from semstab.model.voxels.parquet import tile_of
-from semstab.runtime.files import write_text
-from semstab.statistics import Looks, Sample, Truth, join_truth
+from semstab.statistics import Looks, Sample
 from semstab.statistics.description import concluded
 from semstab.statistics.looks.sampler import merged
-from semstab.statistics.sampling import InfluenceSums
-from semstab.statistics.sums import FirstSums, SecondSums, Whole, second_look
+from semstab.statistics.sums import FirstSums, SecondSums, Whole
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
@@ -58,11 +53,14 @@ class Sampled:
 
 
 def assembled(
-    planned: PlannedUnit, finished: Mapping[str, Finished], folder: Path, sampled: Sampled | None = None
+    planned: PlannedUnit,
+    finished: Mapping[str, Finished],
+    folder: Path,
+    sampled: Sampled,
+    whole: Whole | None,
+    again: Sequence[SeenAgain],
 ) -> UnitContent:
-    """The unit's content, from its portions by name, in order; its series is written.
-
-    sampled  of its frames, where that is known already
+    """The unit's content, from its portions by name, and second looks at its parts, in order; its series is written.
 
     Raises DataError where no pixel was valid.
     """
@@ -73,9 +71,19 @@ def assembled(
     if not sums.total[2]:
         raise no_voxels(task, config)
     files = {name: digest for each in finished.values() for name, digest in each.about.files.items()}
-    sampled = sampled or Sampled.of(stretches, folder)
     looks, sample = sampled.looks, sampled.sample
-    found = _statistics(planned, parts, sample, folder, files) if planned.judged and sample is not None else None
+    found = None
+    if whole is not None:
+        found = concluded(
+            whole,
+            SecondSums.merged([each.sums for each in again]),
+            voxel_size=config.voxel_size,
+            classes=task.mapping.target.classes,
+            sample=sample,
+            name=task.backbone,
+            edges=config.strata,
+            critical=config.critical_classes,
+        )
     rows = joined_series(np.concatenate([each.series for each in stretches]), [part.series for part in parts])
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
@@ -89,10 +97,10 @@ def assembled(
     files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
     savers: Savers = {}
     if planned.kept:
-        savers[f"{FRAMES}/{unit.slug}.csv"] = lambda path: write_text(path, to_csv(rows))
+        savers[f"{FRAMES}/{unit.slug}.csv"] = rows.save_csv
         if found is not None:
             savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
-            files |= found[2]
+            files |= {name: digest for each in again for name, digest in each.files.items()}
         if looks is not None:
             savers[f"{LOOKS}/{unit.slug}.parquet"] = looks.save
     files |= {name: _saved(save, folder / name) for name, save in savers.items()}
@@ -121,61 +129,22 @@ def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> Looks 
     return merged([Looks.load(folder / name) for name in chosen]) if chosen else None
 
 
-def _statistics(
-    planned: PlannedUnit, parts: Sequence[Finished], sample: Sample, folder: Path, files: Iterable[str]
-) -> tuple[MapStatistics, InfluenceSums, dict[str, str]]:
-    """What the statistics say of all parts together, with the looks that were sampled of the frames.
-
-    Then each tile is looked at again, and written once more where the whole map tells more of its voxels: the digests
-    of these files.
-    """
-    classes, config = planned.task.mapping.target.classes, planned.config
-    whole = Whole(FirstSums.merged([FirstSums.read(part.sums, classes) for part in parts]))
-    second, written = _second_looks(planned, whole, folder, files)
-    summary, sums = concluded(
-        whole,
-        second,
-        voxel_size=config.voxel_size,
-        classes=classes,
-        sample=sample,
-        name=planned.task.backbone,
-        edges=config.strata,
-        critical=config.critical_classes,
-    )
-    return summary, sums, written
-
-
-def _second_looks(
-    planned: PlannedUnit, whole: Whole, folder: Path, files: Iterable[str]
-) -> tuple[SecondSums, dict[str, str]]:
-    unit, written = planned.unit, dict[str, str]()
-    found: list[SecondSums] = []
-    for name in (name for name in files if Path(name).parent.name in ("voxels", unit.slug)):
-        if not name.startswith((f"{VOXELS}/", f"{PORTIONS}/")):
-            continue
-        file, table = folder / name, VoxelTable.load(folder / name)
-        true = file.parents[1] / "truth" / file.name
-        truth = VoxelTable.load(true) if name.startswith(f"{PORTIONS}/") and true.exists() else None
-        known = None if whole.first.truth is None else _known(table, truth)
-        second, more = second_look(table, whole, known, truth)
-        found.append(second)
-        if planned.kept and planned.config.statistics:
-            maps = VoxelTable.columns(file, further_columns(file))
-            columns, tile = {**maps, **more, **whole.maps(table, maps)}, tile_of(file)
-            savers: Savers = {
-                f"{VOXELS}/{unit.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
-            }
-            if truth is not None and planned.image_space:
-                savers[f"{TRUTH}/{unit.slug}/{file.name}"] = partial(truth.save, tile=tile)
-            written |= {path: _saved(save, folder / path) for path, save in savers.items()}
-    return SecondSums.merged(found), written
-
-
-def _known(table: VoxelTable, truth: VoxelTable | None) -> Truth:
-    """The true classes of a tile; none where the ground truth saw nothing of it."""
-    if truth is None:
-        return Truth(np.zeros(len(table), np.bool_), np.full(len(table), -1, np.int64))
-    return join_truth(table, truth)
+def second_looks(
+    planned: PlannedUnit, parts: Mapping[str, Finished], sampled: Sampled
+) -> tuple[Whole | None, list[Again]]:
+    """What all parts together tell of the map, and the second look at each that it asks for; nothing where unjudged."""
+    if not planned.judged or sampled.sample is None or not any(part.about.voxels for part in parts.values()):
+        return None, []
+    classes, slug = planned.task.mapping.target.classes, planned.unit.slug
+    whole = Whole(FirstSums.merged([FirstSums.read(part.sums, classes) for part in parts.values()]))
+    written = planned.kept and planned.config.statistics
+    looks = []
+    for name, part in parts.items():
+        tiles = tuple(file for file in part.about.files if Path(file).parent.name in ("voxels", slug))
+        tiles = tuple(file for file in tiles if file.startswith((f"{VOXELS}/", f"{PORTIONS}/")))
+        if tiles:
+            looks.append(Again(f"{name} again", whole.overall, tiles, slug, written, planned.image_space))
+    return whole, looks
 
 
 def _checked(found: Sequence[Agreement | None]) -> Agreement | None:

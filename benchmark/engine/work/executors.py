@@ -7,9 +7,10 @@ import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
+import itertools
 import multiprocessing
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
@@ -46,7 +47,8 @@ class Executor(Protocol):
     def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
         """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest.
 
-        Jobs are taken when there is somebody to do them: the next one may be told by those that are finished.
+        Jobs are taken when there is somebody to do them. Where there is none, `jobs` is asked again once those that
+        were yielded have been looked at: they may call for more.
 
         `observers` are told of the work that is done in this very process.
         """
@@ -67,7 +69,8 @@ class InProcess:
 
     def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
         """In order."""
-        for job in jobs:
+        waiting = iter(jobs)
+        while (job := next(waiting, None)) is not None:
             yield job, run_job(job, observers)
 
     def close(self) -> None:
@@ -87,39 +90,61 @@ class LocalProcesses:
         self.name = f"{jobs} local processes"
 
     def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """As they finish, all begun at once.
+        """As they finish.
 
-        Where a process dies, nobody knows of which job: what is left is tried again, then once more one by one. The job
-        whose process dies then fails, and the others finish.
+        Where a process dies, nobody knows of which job: those that were at work are tried again, then once more one by
+        one. The job whose process dies then fails, and the others finish.
         """
-        left = dict(enumerate(self._with_a_share(job) for job in jobs))
-        for width in (self.width, self.width):
-            with contextlib.suppress(BrokenProcessPool):
-                yield from self._run(left, width)
-        while left:
-            try:
-                yield from self._run(left, 1)
-            except BrokenProcessPool:
-                job = left.pop(min(left))
-                text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
-                yield job, tuple(failed(job.requests, text, outgrown=True))
+        waiting, left = map(self._with_a_share(available_bytes() / 2), iter(jobs)), list[Job]()
+        while True:
+            for _ in range(2):
+                with contextlib.suppress(BrokenProcessPool):
+                    yield from self._run(left, waiting, self.width)
+                    return
+            while left:
+                try:
+                    yield from self._run(left, iter(()), 1)
+                except BrokenProcessPool:
+                    job = left.pop(0)
+                    text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
+                    yield job, tuple(failed(job.requests, text, outgrown=True))
 
-    def _run(self, left: dict[int, Job], width: int) -> Generator[Finished, None, None]:
-        """Run the jobs that are left, in order; take away those that are finished."""
-        if not left:
+    def _run(self, left: list[Job], waiting: Iterator[Job], width: int) -> Generator[Finished, None, None]:
+        """Run the jobs that are left, then those that wait, in order; left are those that were begun and not finished.
+
+        Each is begun before what is finished is looked at: nobody waits for that.
+        """
+        again, futures = [*left], dict[cf.Future[tuple[Outcome, ...]], Job]()
+
+        def taken() -> Job | None:
+            if again:
+                return again.pop(0)
+            if (job := next(waiting, None)) is not None:
+                left.append(job)
+            return job
+
+        def begin(job: Job | None) -> None:
+            while job is not None:
+                futures[pool.submit(run_job, job)] = job
+                job = taken() if len(futures) < width else None
+
+        if (first := taken()) is None:
             return
         context = multiprocessing.get_context("spawn")
         listening, alive = context.Pipe(duplex=False)
         share = max(1, cores() // self.width)
-        pool = cf.ProcessPoolExecutor(
-            min(width, len(left)), context, initializer=_start_worker, initargs=(listening, share)
-        )
+        pool = cf.ProcessPoolExecutor(width, context, initializer=_start_worker, initargs=(listening, share))
         try:
             _check_start(pool)
-            futures = {pool.submit(run_job, job): k for k, job in left.items()}
-            for future in cf.as_completed(futures) if width > 1 else list(futures):
-                outcomes = future.result()
-                yield left.pop(futures[future]), outcomes
+            begin(first)
+            while futures:
+                done, _ = cf.wait(futures, return_when=cf.FIRST_COMPLETED)
+                for future in done:
+                    outcomes, job = future.result(), futures.pop(future)
+                    begin(taken())
+                    left[:] = [each for each in left if each is not job]
+                    yield job, outcomes
+                    begin(taken() if len(futures) < width else None)
             pool.shutdown()
         finally:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
@@ -128,11 +153,13 @@ class LocalProcesses:
     def close(self) -> None:
         """Processes end with what they were started for."""
 
-    def _with_a_share(self, job: Job) -> Job:
-        memory = available_bytes() / 2 if job.memory_bytes is None else job.memory_bytes
-        threads = job.threads or default_threads()
-        threads = max(1, threads // self.width)
-        return dataclasses.replace(job, threads=threads, memory_bytes=memory / self.width, width=self.width)
+    def _with_a_share(self, free: float) -> Callable[[Job], Job]:
+        def shared(job: Job) -> Job:
+            memory = free if job.memory_bytes is None else job.memory_bytes
+            threads = max(1, (job.threads or default_threads()) // self.width)
+            return dataclasses.replace(job, threads=threads, memory_bytes=memory / self.width, width=self.width)
+
+        return shared
 
 
 def _check_start(pool: cf.ProcessPoolExecutor) -> None:
@@ -171,19 +198,45 @@ class DaskCluster:
             raise ConfigError(
                 f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
             ) from error
-        self.width = max(1, sum(self._client.nthreads().values()))
+        self.width = 1
+        self.width = self._threads()
         self.name = f"Dask, {self.width} threads"
 
     def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """As they finish, all begun at once. The scheduler gives the job of a worker that died to another one."""
+        """As they finish. The scheduler gives the job of a worker that died to another one.
+
+        There are never more at the scheduler than its workers have threads, so that whoever is free has the next one;
+        and that is sent before what is finished is looked at, so that nobody waits for it.
+        """
+        waiting, futures = iter(jobs), dict[Any, Job]()
+        finished = _distributed().as_completed(loop=self._client.loop)
+
+        def send(job: Job | None = None) -> None:
+            free = self._threads() - len(futures) - (job is not None)
+            for each in [*([] if job is None else [job]), *itertools.islice(waiting, max(0, free))]:
+                futures[future := self._client.submit(_run_settled, each, pure=False)] = each
+                finished.add(future)
+
+        if (first := next(waiting, None)) is None:
+            return
         self._require_same_version()
-        futures = {self._client.submit(_run_settled, job, pure=False): job for job in jobs}
+        send(first)
         try:
-            for future in _distributed().as_completed(list(futures), loop=self._client.loop):
-                yield futures[future], _outcomes(future, futures[future])
+            for future in finished:
+                job = futures.pop(future)
+                outcomes = _outcomes(future, job)
                 future.release()
+                send()
+                yield job, outcomes
+                send()
         finally:
             self._client.cancel(list(futures))
+
+    def _threads(self) -> int:
+        """Of the workers that there are now; they come and go."""
+        with contextlib.suppress(OSError):
+            self.width = max(1, sum(self._client.nthreads().values()))
+        return self.width
 
     def close(self) -> None:
         """Leave the scheduler."""

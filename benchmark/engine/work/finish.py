@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,18 +19,18 @@ from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
 from semstab.engine.observer import Observers
-from semstab.engine.series import FrameRow, to_csv
+from semstab.engine.series import Series
 from semstab.engine.tiling.portion import About, Finished, Portion
 from semstab.engine.work.image_space import COLUMNS
 from semstab.engine.work.jobs import Job, Outcome, shared_marker
 from semstab.engine.work.stream import NoMap, Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
-from semstab.metrics import compare, macro_mean, summarise
+from semstab.metrics import compare, summarise
 from semstab.metrics.matching import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.frames import LeftOut
-from semstab.model.measures import dominant, measures, vss
+from semstab.model.measures import dominant, mean, measures, vss
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
     RECURRENT,
@@ -47,7 +46,7 @@ from semstab.model.results import (
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import Events, VoxelTable
 from semstab.model.voxels.parquet import Tile, names_in
-from semstab.runtime.files import atomic_path, write_text
+from semstab.runtime.files import atomic_path
 from semstab.runtime.process import give_back
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
@@ -160,26 +159,24 @@ def _summary(one: UnitMap, table: VoxelTable, found: Analysis | None, sizes: tup
 
 def unit_summary(
     task: Task,
-    rows: Sequence[FrameRow],
+    rows: Series,
     table: TableSummary,
     statistics: MapStatistics | None,
     reduced: ReducedScores | None,
     sizes: tuple[SizeAlpha, ...],
 ) -> UnitSummary:
     """What is reported of a unit, from its map, its time series and what the statistics say of the map."""
-    each_row = np.dtype((np.float64, len(STAGES)))
-    stages = np.fromiter(([*row.stage_ms().values()] for row in rows), each_row, len(rows)).T.tolist()
     return UnitSummary(
         unit=task.units[0],
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
         table=table,
-        flicker_percent=macro_mean([row.flicker_percent for row in rows]),
-        fuse_ms_per_frame=macro_mean([row.report.seconds * 1e3 for row in rows]),
-        stages_ms={stage: macro_mean(values) for stage, values in zip(STAGES, stages, strict=True)},
-        left_out=sum(row.left_out for row in rows),
+        flicker_percent=mean(rows.column("flicker_percent")),
+        fuse_ms_per_frame=mean(1e3 * rows.column("seconds")),
+        stages_ms={stage: mean(1e3 * rows.column(f"{stage}_seconds")) for stage in STAGES},
+        left_out=int(rows.column("left_out").sum()),
         frames_left_out=task.left_out,
-        frames_empty=sum(row.report.points == 0 for row in rows),
+        frames_empty=int(np.count_nonzero(rows.column("points") == 0)),
         scores_left_out=_scores_left_out(rows),
         statistics=statistics,
         reduced=reduced,
@@ -188,12 +185,10 @@ def unit_summary(
     )
 
 
-def _scores_left_out(rows: Sequence[FrameRow]) -> LeftOut | None:
+def _scores_left_out(rows: Series) -> LeftOut | None:
     """Over all frames that were cut to their largest scores; None where none was."""
-    cut = [row for row in rows if not math.isnan(row.scores_left_out)]
-    if not cut:
-        return None
-    return LeftOut(macro_mean([row.scores_left_out for row in cut]), max(row.most_scores_left_out for row in cut))
+    left_out, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
+    return None if np.isnan(left_out).all() else LeftOut(mean(left_out), float(np.nanmax(most)))
 
 
 def reduced_sums(table: VoxelTable) -> npt.NDArray[np.float64]:
@@ -209,12 +204,13 @@ def reduced_of(sums: npt.NDArray[np.float64]) -> ReducedScores:
     return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
 
 
-def _worst(rows: Sequence[FrameRow]) -> list[FrameDrift]:
+def _worst(rows: Series) -> list[FrameDrift]:
     """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
-    found = [FrameDrift(r.frame, r.drift, r.voxels - r.new_voxels) for r in (row.report for row in rows)]
-    usual = np.median([frame.voxels for frame in found]) if found else 0
-    met = [frame for frame in found if frame.voxels >= max(1, usual)]
-    return sorted(met, key=lambda frame: -frame.drift)[:WORST]
+    known, drift = rows.column("voxels") - rows.column("new_voxels"), rows.drift
+    met = np.flatnonzero(known >= max(1, np.median(known) if len(known) else 0))
+    worst = met[np.argsort(-drift[met], kind="stable")][:WORST]
+    frames = rows.column("frame")
+    return [FrameDrift(int(frames[k]), float(drift[k]), int(known[k])) for k in worst]
 
 
 def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> Outcome:
@@ -229,15 +225,17 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
         checked = None if table is None or one.reference is None else _checked(one, table, one.reference)
     with watch("write"):
         saved, returned = written(job, _portion_savers(stream, one, portion, found))
-        rows = [] if stream.image_space is None else stream.image_space.rows[stream.lead :]
+        image = (
+            np.zeros((0, len(COLUMNS))) if stream.image_space is None else stream.image_space.rows.table(stream.lead)
+        )
         sizes, voxels = () if one.sizes is None else one.sizes.alphas(), 0 if table is None else len(table)
         finished = Finished(
             About(portion.kind, saved, voxels, checked, sizes, _quality(stream)),
             one.rows.numbers,
             {} if found is None else found.sums,
             np.zeros(0) if one.hard is None else reduced_sums(one.hard.table()),
-            np.zeros((0, 4, 4)) if one.request.fuses else np.array(stream.poses),
-            np.array(rows).reshape(-1, len(COLUMNS)),
+            stream.poses,
+            image,
         )
         _, left = written(job, {f"{portion.folder}/{portion.name}.npz": finished.save})
     return Outcome(one.request.identity, portion=portion.name, files=returned | left)
@@ -335,7 +333,7 @@ def _savers(
     )
     if found is not None:
         savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found.sums.save
-    savers[f"{FRAMES}/{unit.slug}.csv"] = partial(_save_text, to_csv(one.rows))
+    savers[f"{FRAMES}/{unit.slug}.csv"] = one.rows.save_csv
     if one.sampler is not None:
         savers[f"{LOOKS}/{unit.slug}.parquet"] = one.sampler.looks(table.classes).save
     events = one.backend.events() if config.events else None
@@ -377,17 +375,13 @@ def further_columns(path: Path) -> list[str]:
     return [name for name in names_in(path) if name not in own]
 
 
-def _save_text(text: str, path: Path) -> None:
-    write_text(path, text)
-
-
 def _save_arrays(arrays: Mapping[str, Any], path: Path) -> None:
     named: dict[str, Any] = dict(arrays)
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, **named)
 
 
-def _up(scene: Scene, table: VoxelTable, poses: Sequence[Any]) -> tuple[float, float, float] | None:
+def _up(scene: Scene, table: VoxelTable, poses: npt.NDArray[np.float64]) -> tuple[float, float, float] | None:
     """The scene's up axis, said or estimated; None where neither works."""
     try:
         up = estimate_up(table, poses) if scene.up is None else scene.up

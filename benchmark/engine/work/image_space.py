@@ -11,6 +11,7 @@ from semstab.metrics import SelfConsistency, VideoConsistency, compensated_flick
 from semstab.model.frames import Frame
 from semstab.model.measures import mean
 from semstab.model.records import ImageSpace
+from semstab.runtime.rows import Rows
 
 CLIPS = (8, 16)
 """Frames a clip, as VSPW reports."""
@@ -26,7 +27,7 @@ class ImageSpaceMeter:
     """Takes the sampled frames of a unit in order; none but the last is kept. rows has COLUMNS of each."""
 
     def __init__(self) -> None:
-        self.rows: list[tuple[float, ...]] = []
+        self.rows = Rows(len(COLUMNS))
         self._previous: Frame | None = None
         self._by_truth = [VideoConsistency(n) for n in CLIPS]
         self._by_itself = [SelfConsistency(n) for n in CLIPS]
@@ -49,7 +50,7 @@ class ImageSpaceMeter:
 
     def result(self, flicker_percent: float) -> ImageSpace:
         """Means over the frames so far, beside the flicker that the unit's summary has."""
-        return image_space_of(np.array(self.rows).reshape(-1, len(COLUMNS)), flicker_percent)
+        return image_space_of(self.rows.table(), flicker_percent)
 
 
 def image_space_of(rows: npt.NDArray[np.float64], flicker_percent: float) -> ImageSpace:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from semstab.check.views import evenly
-from semstab.config import Config, FrameSelection
+from semstab.config import Config, FrameSelection, as_range
 from semstab.engine.observer import Factory
+from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
 from semstab.engine.tiling.portion import SIZES, Portion
 from semstab.engine.tiling.sights import Looking
@@ -32,6 +33,7 @@ class Request:
     regions   whether it is the flicker of regions without classes, and nothing is fused
     portion   what of a unit in tiles is wanted; None for all of a unit
     looking   where only what its frames see is wanted
+    again     where a part of its map is looked at for the second time
     """
 
     identity: str
@@ -44,6 +46,12 @@ class Request:
     regions: bool = False
     portion: Portion | None = None
     looking: Looking | None = None
+    again: Again | None = None
+
+    @property
+    def reads_frames(self) -> bool:
+        """Whether a pass over its frames is wanted."""
+        return not self.regions and self.looking is None and self.again is None
 
     @property
     def within(self) -> Extent | None:
@@ -109,9 +117,14 @@ class Request:
         """What these frames see."""
         return replace(self._of(None, frames), looking=looking)
 
+    def looking_again(self, looks: Iterable[Again]) -> list[Request]:
+        """Second looks at parts, for which no frame is read."""
+        short = self._of(None, (self.config.frames.list or (0,))[:1])
+        return [replace(short, again=each) for each in looks]
+
     def _of(self, portion: Portion | None, frames: Sequence[int]) -> Request:
         """The same, of these frames and that portion alone."""
-        config = self.config.model_copy(update={"frames": FrameSelection(list=tuple(frames))})
+        config = self.config.model_copy(update={"frames": FrameSelection.of(as_range(frames))})
         return replace(self, config=config, portion=portion)
 
     @classmethod
@@ -119,7 +132,7 @@ class Request:
         """What a job is told of it."""
         if not isinstance(planned, PlannedUnit):
             return cls(planned.identity, planned.config, regions=True)
-        frames = FrameSelection(list=tuple(planned.task.indices))
+        frames = FrameSelection.of(planned.task.indices)
         config = planned.config.model_copy(update={"frames": frames})
         wanted = (planned.image_space, planned.kept, planned.judged, planned.sampled)
         return cls(planned.identity, config, *wanted, planned.task.left_out)
@@ -158,6 +171,7 @@ class Outcome:
     cause    the exception, where the unit failed in this very process
     trace    where it was raised, if it is not semstab's own
     seconds  that its pass took, by stage; of the first outcome of a pass only
+    again    what a second look found; None where the voxels are not to be seen from there
     """
 
     identity: str
@@ -169,6 +183,7 @@ class Outcome:
     cause: BaseException | None = field(default=None, compare=False)
     trace: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
+    again: SeenAgain | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Without the exception, which may not travel."""
@@ -180,7 +195,8 @@ def failed(requests: Iterable[Request], error: str | Exception, *, outgrown: boo
     if isinstance(error, str):
         return [Outcome(each.identity, portion=_portion(each), error=error, outgrown=outgrown) for each in requests]
     trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
-    outgrown = isinstance(error, (OutgrownError, MemoryError))
+    if outgrown := isinstance(error, (OutgrownError, MemoryError)):
+        error = error.with_traceback(None)  # it would keep the map, and what halves of it take comes on top
     return [
         Outcome(
             each.identity,
@@ -195,6 +211,8 @@ def failed(requests: Iterable[Request], error: str | Exception, *, outgrown: boo
 
 
 def _portion(request: Request) -> str | None:
+    if request.again is not None:
+        return request.again.name
     return None if request.portion is None else request.portion.name
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from semstab.backends import expected_bytes
+from semstab.backends import expected_bytes, frame_bytes
 from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
 from semstab.engine.work.sizes import sizes_bytes
@@ -19,8 +19,9 @@ GB = 1e9
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first, all new, is not looked at closer."""
 
-LOADED, LOADED_FOR_SCORES = 190e6, 30e6
-"""Bytes of what a run loads once it is planned (compiled loops, formats of files), and of the sample of looks."""
+LOADED, LOADED_FOR_SCORES, LOADED_FOR_TILES = 170e6, 30e6, 30e6
+"""Bytes of what a run loads once it is planned (compiled loops, formats of files), of the sample of looks, and of what
+is left between parts."""
 FRAMES_AT_WORK = 3
 """Frames that are in memory beside those which are read ahead."""
 
@@ -34,6 +35,7 @@ class Kind:
     soft     whether frames have scores, which are fused as labels as well
     logged   whether every observation is kept, and the ground truth fused too
     sampled  whether the reference follows a sample of its voxels
+    touched  voxels that a frame touches
     """
 
     backend: str
@@ -41,6 +43,7 @@ class Kind:
     soft: bool = False
     logged: bool = False
     sampled: bool = False
+    touched: int = 0
 
     def bytes(self, voxels: float, observations: float) -> float:
         """Of a map of so many voxels and observations, with what comes of it."""
@@ -50,7 +53,16 @@ class Kind:
         logs = log_bytes(looks, self.K, soft=self.soft) if self.logged else 0
         followed = expected_bytes("numpy", n // ONE_IN, 0, self.K) if self.sampled else 0  # looks: when the map is gone
         reduced = expected_bytes(self.backend, n, looks, self.K) if self.soft else 0
-        return fused + truth + logs + followed + reduced + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
+        now = frame_bytes(self.backend, min(n, self.touched), self.K)
+        return (
+            fused
+            + truth
+            + logs
+            + followed
+            + reduced
+            + now
+            + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
+        )
 
 
 @dataclass(frozen=True)
@@ -70,18 +82,18 @@ class Load:
     soft: bool
     threads: int | None
 
-    def beside(self, voxels: float, maps: float) -> float:
+    def beside(self, voxels: float, maps: float, *, in_tiles: bool = False) -> float:
         """Beside maps of so many voxels and bytes: what is loaded, and frames.
 
-        And dense rows of statistics, when a map is but its table, or some frames fused once more, before half of what
-        is loaded comes; as far as they are more than what is gone by then, or not yet there.
+        And dense rows, when a tile is looked at again, or some frames fused once more, before half of what is loaded
+        comes; as far as they are more than what is gone by then, or not yet there.
         """
         pixels = self.first.shape[0] * self.first.shape[1]
         threads = default_threads() if self.threads is None else self.threads
         frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
-        dense = 8 * self.K * min(voxels, STRETCH)
+        dense = 8 * self.K * min(voxels, STRETCH) if in_tiles else 0
         sizes = sizes_bytes(self.first, self.frames, self.K, soft=self.soft)
-        loaded = LOADED + self.soft * LOADED_FOR_SCORES
+        loaded = LOADED + self.soft * LOADED_FOR_SCORES + in_tiles * LOADED_FOR_TILES
         return loaded + frames + max(0.0, dense - maps / 2, sizes - LOADED / 2 - maps)
 
 
@@ -98,10 +110,14 @@ def room(config: Config, width: int, taken: float) -> float:
 
 def most_voxels(task: Task, config: Config, first: Frame) -> int:
     """More voxels than a sequence shows, and observations, judged by its first frame."""
+    return DOUBT * len(task.indices) * voxels_of(first.every(2), config.voxel_size, len(task.mapping.target))
+
+
+def voxels_of(frame: Frame, voxel_size: float, num_classes: int) -> int:
+    """How many a frame touches."""
     from semstab.backends.shared.aggregator import Aggregator
 
-    seen = Aggregator(config.voxel_size, len(task.mapping.target)).observe(first.every(2))
-    return DOUBT * len(task.indices) * len(seen.key)
+    return len(Aggregator(voxel_size, num_classes).observe(frame).key)
 
 
 def too_large(

@@ -20,10 +20,11 @@ from semstab.engine.series import FrameRow
 from semstab.engine.work.finish import finish, finish_portion
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
 from semstab.engine.work.looking import look
+from semstab.engine.work.looking_again import looked_again
 from semstab.engine.work.regions import measure_regions
 from semstab.engine.work.room import Room
 from semstab.engine.work.sizes import SizeMaps
-from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, streams_of
+from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, in_order, streams_of
 from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.voxels.extent import Extent
@@ -53,7 +54,8 @@ def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]
         regions = [request for request in requests if request.regions]
         outcomes += [measure_regions(job, scene, request) for request in regions]
         outcomes += [look(job, scene, request) for request in requests if request.looking is not None]
-        requests = tuple(request for request in requests if not request.regions and request.looking is None)
+        outcomes += [looked_again(job, request) for request in requests if request.again is not None]
+        requests = tuple(request for request in requests if request.reads_frames)
         while requests:
             fused = Pass(job, scene, requests, told)
             outcomes += fused.run()
@@ -111,7 +113,7 @@ class Pass:
 
     def run(self) -> list[Outcome]:
         """Fuse and measure; the outcome of every unit that was not put off."""
-        order = sorted(frozenset[int]().union(*(stream.indices for stream in self._streams)))
+        order = in_order(self._streams)
         decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
         watched = [one for stream in self._streams for one in stream.maps if one.request.kept or one.request.shown]
         if watched:
@@ -281,6 +283,8 @@ class Pass:
             return
         with self._failing([largest.request]):
             raise self._room.outgrown(largest)
+        if largest.request.portion is None:  # it may be begun again, in tiles
+            self.observers.tell(lambda observer: observer.advanced(-len(largest.rows), largest.task.scene.name))
         for stream in self._streams:
             stream.maps = [one for one in stream.maps if one is not largest]
 

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import itertools
 import math
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from semstab.backends import create
-from semstab.backends.shared.association import INDEX_LIMIT, back_project, voxel_index
 from semstab.check.views import evenly
 from semstab.config import Config
-from semstab.errors import DataError
 from semstab.model.frames import Frame
+from semstab.model.labels import fixed
 from semstab.model.results import SizeAlpha
-from semstab.model.voxels import VoxelTable
-from semstab.model.voxels.extent import Extent
-from semstab.runtime.process import give_back
-from semstab.statistics.agreement import alpha_of, alpha_sums
+from semstab.statistics.agreement import alpha_of
+from semstab.statistics.ranks import ranked
 from semstab.task import Task
 
 FACTORS = (0.5, 1.0, 2.0)
@@ -28,19 +22,18 @@ FACTORS = (0.5, 1.0, 2.0)
 FRAMES, PIXELS = 16, 2**16
 """At most so many frames, evenly spaced, are fused once more a voxel size, and about so many pixels of each."""
 
-STRIP_BYTES = 2e8
-"""A map of these pixels that would take more is fused strip by strip."""
+ALIGNED = round(FACTORS[-1] / FACTORS[0])
+"""The smallest voxels along an edge of the largest: those of one stay together."""
 
+PIXEL_BYTES = 80
+"""Of a pixel: its voxel and label, and what putting them in order takes."""
 
-def map_bytes(pixels: int, K: int, *, soft: bool) -> int:
-    """Of a map and its table where each pixel is a voxel."""
-    return pixels * (180 + (20 * K if soft else 0))
+Int64 = npt.NDArray[np.int64]
 
 
 def sizes_bytes(first: Frame, frames: int, K: int, *, soft: bool) -> float:
-    """What fusing some of so many frames once more takes: a strip of the map, and the pixels that are kept for it."""
-    pixels = min(frames, FRAMES) * _some(first).depth.size
-    return min(STRIP_BYTES, map_bytes(pixels, K, soft=soft)) + pixels * (6 + (4 * K if soft else 0))
+    """What fusing some of so many frames once more takes."""
+    return min(frames, FRAMES) * _some(first).depth.size * (PIXEL_BYTES + (4 * K if soft else 0))
 
 
 def _some(frame: Frame) -> Frame:
@@ -50,59 +43,89 @@ def _some(frame: Frame) -> Frame:
 
 
 class SizeMaps:
-    """Maps of a task's frames, of some of them and some of their pixels, by voxel size: one after the other."""
+    """Maps of some pixels of some of a task's frames, by voxel size: the smallest voxels make up the larger ones."""
 
     def __init__(self, task: Task, config: Config) -> None:
         self._frames = frozenset(task.indices[k] for k in evenly(len(task.indices), FRAMES))
         self._K = len(task.mapping.target)
         self._sizes = [config.voxel_size * factor for factor in FACTORS]
-        self._kept: list[Frame] = []
+        self._origin: Int64 | None = None
+        self._keys: list[Int64] = []
+        self._said: npt.NDArray[Any] = np.empty(0, np.uint16)
+        self._lost = False
 
     def add(self, index: int, frame: Frame) -> None:
         """Keep some pixels of the frame of that index, if it is one of them."""
         if index not in self._frames:
             return
         some = _some(frame)
-        self._kept.append(
-            replace(
-                some,
-                depth=some.depth.copy(),
-                labels=None if some.labels is None else some.labels.copy(),
-                scores=None if some.scores is None else some.scores.copy(),
-                color=None,
-                mask=None,
-                left_out=None,
+        keys = self._placed(some)
+        here = keys >= 0
+        self._keep(some.labels if some.scores is None else some.scores, here)
+        self._keys.append(keys[here])
+
+    def _keep(self, said: Any, here: npt.NDArray[np.bool_]) -> None:
+        """Labels (n,) or scores (n, K) of pixels behind those that are there: once, as they may be most of memory."""
+        n, kind = sum(map(len, self._keys)), np.uint16 if said.ndim == 2 else np.promote_types(said.dtype, np.float32)
+        rows = said.astype(kind, copy=False)[here]  # compiled loops know no half precision
+        if not n:
+            self._said = np.empty((len(self._frames) * here.size, *rows.shape[1:]), kind)
+        if (self._said.ndim, self._said.dtype) == (rows.ndim, rows.dtype) and n + len(rows) <= len(self._said):
+            self._said[n : n + len(rows)] = rows
+        else:  # frames of several kinds or sizes
+            parts, soft = (self._said[:n], rows), 2 in (self._said.ndim, rows.ndim)
+            self._said = np.concatenate(
+                [_one_hot(part, self._K) if soft and part.ndim == 1 else part for part in parts]
             )
+
+    def _placed(self, frame: Frame) -> Int64:
+        """Packed keys (H, W) of the smallest voxels that its pixels show, -1 where one is not valid."""
+        from semstab.backends.shared.pixels.pixel_keys import frame_terms
+        from semstab.engine.work.size_loops import keys_of
+
+        (H, W), camera, T_wc, size = frame.shape, frame.intrinsics, fixed(frame.T_wc), self._sizes[0]
+        if self._origin is None:
+            self._origin = ALIGNED * np.floor(T_wc[:3, 3] / (ALIGNED * size)).astype(np.int64)
+        ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
+        keys, valid = np.empty((H, W), np.int64), fixed(frame.valid).view(np.uint8)
+        lost = keys_of(
+            fixed(frame.depth), valid, ray_x, ray_y, T_wc, size, self._origin, *frame_terms(ray_x, T_wc, size), keys
         )
+        self._lost = self._lost or bool(lost)
+        return keys
 
     def alphas(self) -> tuple[SizeAlpha, ...]:
-        """One a voxel size; none of a size at which the scene is larger than a map."""
-        found = []
-        for size in self._sizes:
-            with contextlib.suppress(DataError):
-                found.append(SizeAlpha(size, len(self._frames), self._alpha(size)))
-            give_back()
-        return tuple(found)
+        """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
+        if self._lost or not self._keys:
+            return ()
+        keys, frame = np.concatenate(self._keys), np.repeat(np.arange(len(self._keys)), list(map(len, self._keys)))
+        code = _codes(keys)
+        order = ranked(code)
+        code, frame = code[order], frame[order]
+        sums = (self._sums(code, 3 * level, frame, order) for level in range(len(FACTORS)))
+        return tuple(
+            SizeAlpha(size, len(self._frames), float(alpha_of(of))) for size, of in zip(self._sizes, sums, strict=True)
+        )
 
-    def _alpha(self, voxel_size: float) -> float:
-        """Krippendorff's alpha of the map, one strip of space after the other."""
-        strips = (alpha_sums(self._fused(voxel_size, within)) for within in self._strips(voxel_size))
-        return float(alpha_of(functools.reduce(np.add, strips)))
+    def _sums(self, code: Int64, shift: int, frame: Int64, order: Int64) -> Any:
+        """(3 + K,) what alpha is a function of, of the map whose voxels are the codes without their last bits."""
+        from semstab.engine.work.size_loops import sums_of_labels, sums_of_scores
 
-    def _strips(self, voxel_size: float) -> list[Extent | None]:
-        """Along ix, with as many pixels each: of soft scores each voxel has a dense row of evidence."""
-        soft = any(frame.scores is not None for frame in self._kept)
-        count = math.ceil(map_bytes(sum(frame.depth.size for frame in self._kept), self._K, soft=soft) / STRIP_BYTES)
-        if count < 2:
-            return [None]
-        columns = [voxel_index(back_project(frame.every(4)), voxel_size, frame)[0] for frame in self._kept]
-        cuts = np.unique(np.quantile(np.concatenate(columns), np.arange(1, count) / count).astype(np.int64)).tolist()
-        x, y, z = voxel_index(self._kept[0].T_wc[:3, 3:], voxel_size, self._kept[0])[:, 0].tolist()
-        edges = [-INDEX_LIMIT, *cuts, INDEX_LIMIT]
-        return [Extent((low, -INDEX_LIMIT), (high, INDEX_LIMIT), (x, y, z)) for low, high in itertools.pairwise(edges)]
+        if self._said.ndim == 1:
+            return sums_of_labels(code, shift, frame, self._said[order], len(self._keys), self._K)
+        return sums_of_scores(code, shift, frame, order, self._said, len(self._keys))
 
-    def _fused(self, voxel_size: float, within: Extent | None) -> VoxelTable:
-        fused = create("numba", voxel_size=voxel_size, num_classes=self._K, within=within)  # few pixels: no blocks
-        for frame in self._kept:
-            fused.integrate(frame)
-        return fused.table()
+
+def _codes(keys: Int64) -> Int64:
+    """See `interleave`: from the lowest voxel of each axis on, so that codes are short."""
+    from semstab.backends.shared.pixels.keys import HALF
+    from semstab.engine.work.size_loops import interleave
+
+    code, mask = np.empty_like(keys), 2 * HALF - 1
+    low = [int(part.min(initial=mask)) // ALIGNED * ALIGNED for part in (keys >> 42, (keys >> 21) & mask, keys & mask)]
+    interleave(keys, np.array(low, np.uint64), code)
+    return code
+
+
+def _one_hot(labels: npt.NDArray[Any], K: int) -> Any:
+    return np.eye(K, dtype=np.float32)[labels]

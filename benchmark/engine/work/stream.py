@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.backends import FusionBackend
 from semstab.backends.numpy_reference import NumpySample
@@ -21,9 +22,13 @@ from semstab.metrics import FrameJudge, flicker_percent
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Events, VoxelTable
+from semstab.runtime.rows import Rows
 from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Sampler
 from semstab.task import Task, prepare
+
+AXES = 9
+"""Numbers that tell where a camera is, which way it looks and how it is rolled."""
 
 SHOWN_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
@@ -108,20 +113,26 @@ class Stream:
         )
         self.whole = any(one.request.within is None for one in maps)
         self.pixel_stride = maps[0].request.config.pixel_stride
-        self.indices = frozenset(self.task.indices)
+        frames = self.task.indices
+        self.indices: range | frozenset[int] = frames if isinstance(frames, range) else frozenset(frames)
         self.previous: Frame | None = None
         self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
         wanted = self.image_space is not None and maps[0].request.config.frame_quality
         self.judge = FrameJudge(len(self.task.mapping.target)) if wanted else None
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
         self.truth_task = truth_task(self.task) if takes_truth else None
-        self.poses: list[Any] = []
+        self._poses = Rows(AXES) if self.image_space is not None and self.task.scene.up is None else None
         stretch = maps[0].request.stretch
         self.lead = 0 if stretch is None else stretch.lead
         self.ahead = frozenset(self.task.indices[: self.lead])  # seen for the sake of those after them
         middle = self.task.indices[len(self.task.indices) // 2]
         self.shown = None if self.image_space is None else middle if stretch is None else stretch.shown
         self.overview: dict[str, Any] = {}
+
+    @property
+    def poses(self) -> npt.NDArray[np.float64]:
+        """(F, 3, 3) down, forward and centre of each camera in the world; of none where up need not be estimated."""
+        return np.zeros((0, 3, 3)) if self._poses is None else self._poses.table().reshape(-1, 3, 3)
 
     def next_frame(self, decoded: Decoded, watch: Stopwatch, *, color: bool) -> Prepared:
         """The frame as the stream's units fuse it; with its colour only where somebody but the figures wants it."""
@@ -142,8 +153,8 @@ class Stream:
         if decoded.index == self.shown and decoded.index not in self.ahead:
             self.overview = _overview(self.task, decoded.frame)
             frame = frame if color else dataclasses.replace(frame, color=None)
-        if decoded.index not in self.ahead:
-            self.poses.append(frame.T_wc)
+        if self._poses is not None and decoded.index not in self.ahead:
+            self._poses.append(frame.T_wc[:3, 1:].ravel())
         self.previous = frame
         return Prepared(frame, truth, flicker, lap.seconds)
 
@@ -159,8 +170,15 @@ def streams_of(maps: Iterable[UnitMap]) -> list[Stream]:
     for one in maps:
         config = one.request.config
         same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
-        groups.setdefault((*same, tuple(one.task.indices)), []).append(one)
+        frames = one.task.indices
+        groups.setdefault((*same, frames if isinstance(frames, range) else tuple(frames)), []).append(one)
     return [Stream(group) for group in groups.values()]
+
+
+def in_order(streams: Iterable[Stream]) -> Sequence[int]:
+    """The frames of all of them."""
+    first, *others = {stream.indices for stream in streams} or {range(0)}
+    return first if isinstance(first, range) and not others else sorted({*first}.union(*others))
 
 
 def _flicker_between(previous: Frame | None, frame: Frame) -> float:

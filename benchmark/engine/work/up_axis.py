@@ -42,7 +42,7 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
     """The world's up axis (3,), a unit vector: the normal, towards the cameras, of the plane that is likely the ground.
 
     points  a fused map, whose voxels count by area; or world points (n, 3), metres
-    poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes
+    poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes; or (m, 3, 3): down, forward and centre
 
     The cameras alone do not tell: up in their images is up in the world for a level camera, and straight ahead for one
     that looks down. So the largest planes of the map are found (RANSAC, seeded: the same input gives the same answer),
@@ -54,9 +54,9 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
     Raises DataError where there are fewer than 3 points, or no plane with the cameras above it.
     """
     at = points.centers if isinstance(points, VoxelTable) else np.asarray(points, dtype=np.float64)
-    T_wc = np.asarray(poses, dtype=np.float64)
-    prior = _unit(-(2 * T_wc[:, :3, 1] + T_wc[:, :3, 2]).mean(axis=0))
-    planes = list(_planes(at, T_wc[:, :3, 3])) if len(at) >= 3 else []
+    down, forward, centre = np.asarray(poses, dtype=np.float64)[:, :3, -3:].transpose(2, 0, 1)
+    prior = _unit(-(2 * down + forward).mean(axis=0))
+    planes = list(_planes(at, centre)) if len(at) >= 3 else []
     scores = [plane.share * float(plane.normal @ prior) for plane in planes]
     if max(scores, default=0.0) <= 0:
         raise DataError(f"no ground plane found under the cameras in {len(at)} points; say which axis is up (up_axis)")

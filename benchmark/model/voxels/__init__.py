@@ -97,6 +97,10 @@ class VoxelTable:
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
         return replace(self, **columns, evidence=self.evidence.take(rows))
 
+    def measured(self) -> VoxelTable:
+        """The same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
+        return self if self.evidence.known is not None else replace(self, evidence=self.evidence.measured())
+
     def to_arrow(self) -> pa.Table:
         """Columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
         return tabular.to_arrow(self._columns())
@@ -239,9 +243,14 @@ class Events:
         return self.evidence.K
 
     @cached_property
+    def bounds(self) -> Int64:
+        """(n + 1,) first row of each voxel, then how many rows there are."""
+        return np.append(np.flatnonzero(np.diff(self.voxel, prepend=-1)), len(self))
+
+    @property
     def starts(self) -> Int64:
         """(n,) first row of each voxel."""
-        return np.flatnonzero(np.diff(self.voxel, prepend=-1))
+        return self.bounds[:-1]
 
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
@@ -268,9 +277,8 @@ class Events:
         """The logs of voxels one after the other, of as many as have little evidence when it is dense."""
         edges = np.array([some.start for some in self.evidence.chunks()])
         cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
-        bounds = np.append(self.starts, len(self)).tolist()
         for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
-            own, of = slice(bounds[first], bounds[last]), slice(first, last)
+            own, of = slice(self.bounds[first], self.bounds[last]), slice(first, last)
             columns: dict[str, Any] = {name: getattr(self, name)[of] for name in _INDEX_TYPES}
             columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
             yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))

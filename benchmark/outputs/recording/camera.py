@@ -21,6 +21,7 @@ from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.entities import path
+from semstab.runtime.rows import Rows
 
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""
@@ -82,8 +83,7 @@ class CameraLog:
 
     def __init__(self, scene: Scene, translation: npt.NDArray[np.floating[Any]], frames: int) -> None:
         self.scene = scene
-        self.poses: list[npt.NDArray[np.float64]] = []
-        """(4, 4) each, relative to the map's origin."""
+        self._poses = Rows(16)
         self.unread: str | None = None
         """Why a colour image is missing, where one is."""
         self._translation = translation
@@ -92,6 +92,11 @@ class CameraLog:
         self._overlay = Overlay()
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
         self._depth_unit: float | None = None
+
+    @property
+    def poses(self) -> npt.NDArray[np.float64]:
+        """(n, 4, 4) so far, relative to the map's origin."""
+        return self._poses.table().reshape(-1, 4, 4)
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, track: bool = True) -> None:
         """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
@@ -105,22 +110,22 @@ class CameraLog:
 
     def follow(self, indices: Sequence[int]) -> Iterator[int]:
         """Read the poses of frames that are not logged here, one by one, unless they are known."""
-        for index in indices if not self.poses else ():
+        for index in indices if not self._poses else ():
             self._follow(self.scene.T_wc(index))
             yield index
 
     def log_track(self, stream: rr.RecordingStream) -> None:
         """Log where it has been so far, unless the frames are so many that this one is left out."""
-        n = len(self.poses)
+        n = len(self._poses)
         if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
-            track = np.array([p[:3, 3] for p in self.poses])
+            track = self.poses[:, :3, 3]
             stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
 
     def _follow(self, T_wc: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The next pose, relative to the map's origin."""
         pose = T_wc.copy()
         pose[:3, 3] -= self._translation
-        self.poses.append(pose)
+        self._poses.append(pose.ravel())
         return pose
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:

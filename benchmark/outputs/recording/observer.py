@@ -302,9 +302,8 @@ class Recording(Observer):
         first = scene not in known.sceneries and len(table) > 0
         if first:
             some = table.index[:: math.ceil(len(table) / SAMPLE)]
-            poses = np.reshape(self._cameras[scene].poses, (-1, 4, 4))
             points = ((some - group.origin + 0.5) * table.voxel_size).astype(np.float64)
-            known.sceneries[scene] = Scenery(points, poses, group.task.scene.up)
+            known.sceneries[scene] = Scenery(points, self._cameras[scene].poses, group.task.scene.up)
         self._show_chunks(stream, scene, group.voxels, anyway=first or compared or used != legend.used)
 
     def _log_numbers(self, stream: rr.RecordingStream, group: GroupLog, summary: UnitSummary) -> None:

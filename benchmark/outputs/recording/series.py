@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from semstab.errors import DataError, one_line
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.results import RECURRENT, Unit
 from semstab.outputs.recording.entities import Clock, path
+from semstab.runtime.rows import Rows
 from semstab.task import Task
 
 SERIES = {
@@ -69,23 +71,31 @@ def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, row: Mapping[str
 
 
 def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> list[dict[str, float]]:
-    """Log a whole time series from its CSV, and return its values. Raises DataError where it is damaged."""
+    """Log a whole time series from its CSV; its least values, and its largest. Raises DataError where it is damaged."""
+    found = Rows(2 + len(SERIES))
     try:
         with file.open(encoding="utf-8", newline="") as lines:
-            rows = list(csv.DictReader(lines))
-        numbers = [int(np.int64(int(row["frame"]))) for row in rows]
-        stamps = [float(row["timestamp"]) if row["timestamp"] else None for row in rows]
-        found = [values(row) for row in rows]
+            for row in csv.DictReader(lines):
+                stamp = float(row["timestamp"]) if row["timestamp"] else math.nan
+                cells = values(row)
+                found.append([int(np.int64(int(row["frame"]))), stamp, *(cells.get(name, math.nan) for name in SERIES)])
     except (OSError, LookupError, TypeError, ArithmeticError, ValueError, csv.Error) as error:
         raise DataError(
             f"{file}: not a time series of a run ({one_line(error)}); delete the run folder's units/"
         ) from error
-    for name in columns(unit, task):
-        at = [i for i, row in enumerate(found) if name in row]
-        if at:
-            times = clock.columns([numbers[i] for i in at], [stamps[i] for i in at])
-            stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=[found[i][name] for i in at]))
-    return found
+    frames, stamps = found.column(0).astype(np.int64), found.column(1)
+    least, largest, wanted = {}, {}, columns(unit, task)
+    for k, name in enumerate(SERIES, start=2):
+        column = found.column(k)
+        at = ~np.isnan(column)
+        if not at.any():
+            continue
+        least[name], largest[name] = float(column[at].min()), float(column[at].max())
+        if name in wanted:
+            known = [None if math.isnan(stamp) else stamp for stamp in stamps[at].tolist()]
+            times = clock.columns(frames[at].tolist(), known)
+            stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=column[at]))
+    return [least, largest]
 
 
 def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:

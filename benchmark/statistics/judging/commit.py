@@ -19,7 +19,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import write_text
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth
-from semstab.statistics.sampling.collect import cell_edge, cells_of
+from semstab.statistics.sampling.cubes import cell_edge, cells_of
 from semstab.statistics.sampling.intervals import of_places
 
 Float64 = npt.NDArray[np.float64]

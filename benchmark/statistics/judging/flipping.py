@@ -43,11 +43,10 @@ class FlippingSums:
 
     @classmethod
     def _of_few(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
-        rows = np.flatnonzero(~np.isnan(stable))
-        unsteady = np.round((1 - stable[rows]) / UNIT) * UNIT
-        places = Places(table.index[rows], table.voxel_size, edge)
-        share = PlaceSums(places.cell, edge, {"": places.sums(np.stack([unsteady, np.ones(len(rows))], axis=1))})
-        return cls(share, int(np.count_nonzero(table.op[rows] >= ENOUGH)), _together(table, rows, unsteady))
+        unsteady = np.round((1 - stable) / UNIT) * UNIT
+        places = Places.of(table, edge)
+        share = PlaceSums(places.cell, edge, places.means({"": unsteady}))
+        return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
 
     @classmethod
     def merged(cls, parts: Sequence[FlippingSums]) -> FlippingSums:
@@ -68,15 +67,10 @@ class FlippingSums:
         return Flipping(share, seen, names[int(a)], names[int(b)], float(self.together[a, b]) / total)
 
 
-def _together(table: VoxelTable, rows: npt.NDArray[np.int64], unsteady: Float64) -> Float64:
-    """(K, K) of these rows (m,), which are unsteady with that probability (m,)."""
-    from scipy.sparse import csr_array
+def _together(table: VoxelTable, unsteady: Float64) -> Float64:
+    """(K, K) of voxels that are unsteady with that probability (n,), NaN for those that do not count."""
+    from semstab.statistics.loops.rows import add_pairs
 
-    evidence = table.evidence.take(rows)
-    count, shape = np.diff(evidence.starts), evidence.shape
-    belief = evidence.weight / np.repeat(table.op[rows], count)
-    weighted = np.repeat(unsteady, count) * belief
-    left, right = (csr_array((own, evidence.label, evidence.starts), shape=shape) for own in (weighted, belief))
-    together = (left.T @ right).toarray()
-    upper: Float64 = np.triu(together, 1)
-    return upper
+    pairs = np.zeros((table.K, table.K))
+    add_pairs(table.evidence.entries, table.op, unsteady, pairs)
+    return pairs

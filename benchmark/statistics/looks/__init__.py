@@ -3,7 +3,18 @@
 from semstab.statistics.looks.common import Common, common
 from semstab.statistics.looks.correlogram import correlogram
 from semstab.statistics.looks.entries import Looks, Sample, View
-from semstab.statistics.looks.reach import reach_from, reach_of
+from semstab.statistics.looks.reach import reach_by, reach_from, reach_of
 from semstab.statistics.looks.sampler import Sampler
 
-__all__ = ["Common", "Looks", "Sample", "Sampler", "View", "common", "correlogram", "reach_from", "reach_of"]
+__all__ = [
+    "Common",
+    "Looks",
+    "Sample",
+    "Sampler",
+    "View",
+    "common",
+    "correlogram",
+    "reach_by",
+    "reach_from",
+    "reach_of",
+]

@@ -13,15 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics.matching import shared_observations
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
 from semstab.statistics.looks.entries import Sample
-from semstab.statistics.sampling.collect import cell_edge, cells_of
+from semstab.statistics.sampling.cubes import cell_edge, cells_of
 from semstab.statistics.sampling.influence import MOST_GROUPS
-from semstab.statistics.sampling.intervals import of_looks
+from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -37,33 +36,57 @@ MOST_CUBES, MOST_SUMS = 160, 2**17
 
 
 @dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Pairs of looks (m,) at one voxel each: the cube it is in, how far apart they are by axis, and their sums.
+class _Looks:
+    """Looks (m,) by the entries of their evidence, with ||s||^2 of each."""
 
-    group  of the frames of the first looks, and of the second ones
-    seen   (m, 3 + K) what `between_of` is a function of, of the first looks and of the second ones
-    limit  (m, 3 + K) of both together, in the limit
+    entries: tuple[Int64, npt.NDArray[np.uint16], Float64]
+    squares: Float64
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> _Looks:
+        squares = cls(evidence.entries, np.zeros(0)).products(np.arange(len(evidence)), 0)
+        return cls(evidence.entries, squares)
+
+    def products(self, first: Int64, lag: int) -> Float64:
+        """s . s' of each of these and the look that is `lag` later."""
+        from semstab.statistics.looks.pairing import products
+
+        found = np.empty(len(first))
+        products(*self.entries, first, lag, found)
+        return found
+
+    def add(self, sums: Float64, which: Int64, into: Int64, product: Float64) -> None:
+        """Add these looks to the rows of the sums (rows, 3 + K), see `add_looks`."""
+        from semstab.statistics.looks.pairing import add_looks
+
+        add_looks(sums, which, into, product, self.squares, *self.entries)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs of looks (m,) at one voxel each: their numbers, how far they are apart by axis, and s . s' of each.
+
+    seen, limit  all looks, as they were and in the limit, and the products of these pairs
     """
 
-    cube: Int64
+    first: Int64
+    second: Int64
     apart: dict[str, Float64]
-    group: tuple[Int64, Int64]
-    seen: tuple[Float64, Float64]
-    limit: Float64
+    seen: tuple[_Looks, Float64]
+    limit: tuple[_Looks, Float64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
     """Cubes (G, 3) and groups of frames (F,) that are kept apart.
 
-    of     (n,) the cube of each voxel, group (m,) the group of each observation
+    of     (m,) the cube and group of each observation, as one number
     edge   of a cube in metres, step frames of a group
     """
 
     at: npt.NDArray[np.int32]
     frames: npt.NDArray[np.int32]
     of: Int64
-    group: Int64
     edge: float
     step: int
 
@@ -77,7 +100,8 @@ class _Cells:
         step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(at), 1) * (3 + seen.K))))
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2
-        return cls(at, frames, of, np.searchsorted(frames, seen.frame // step), edge, step)
+        group = np.searchsorted(frames, seen.frame // step)
+        return cls(at, frames, of[seen.voxel] * len(frames) + group, edge, step)
 
 
 EDGES: dict[str, tuple[float, ...]] = {
@@ -96,13 +120,17 @@ def correlogram(sample: Sample) -> Correlogram:
     of the pairs in the bin. Bands are at 95 %, for the next flight where the frames of a bin tell of it, else for this
     map.
     """
-    seen, limit = _of_seen_classes(*shared_observations(sample.seen, sample.limit))
+    seen, limit = _of_seen_classes(*sample.shared())
     cells = _Cells.over(seen)
     bins = {axis: _Bins(edges, cells, 3 + seen.K) for axis, edges in (*EDGES.items(), ("standard", STANDARD))}
-    for pairs in _pairs(sample, seen, limit, cells):
+    for pairs in _pairs(sample, seen, limit):
         for axis, into in bins.items():
             into.add(pairs.apart["angle" if axis == "standard" else axis], pairs)
-    found = {axis: tuple(into.found()) for axis, into in bins.items()}
+    there = [(axis, *own) for axis, into in bins.items() for own in into.found()]
+    alphas = answers(asked for _, _, asked in there)
+    found: dict[str, tuple[LagBin, ...]] = dict.fromkeys(bins, ())
+    for (axis, own, _), alpha in zip(there, alphas, strict=True):
+        found[axis] += (dataclasses.replace(own, alpha=alpha),)
     nothing = LagBin(*STANDARD, math.nan, 0, UNKNOWN, math.nan)
     (standard,) = found.pop("standard") or (nothing,)
     return Correlogram(**found, standard=standard)
@@ -114,7 +142,7 @@ def _of_seen_classes(*logs: Events) -> Iterator[Events]:
     return (dataclasses.replace(log, evidence=log.evidence.only(labels), classes=()) for log in logs)
 
 
-def _pairs(sample: Sample, seen: Events, limit: Events, cells: _Cells) -> Iterator[_Pairs]:
+def _pairs(sample: Sample, seen: Events, limit: Events) -> Iterator[_Pairs]:
     """The pairs of looks that are 1, 2, 4, ... looks apart, one lag after the other."""
     order = {view.frame: rank for rank, view in enumerate(sample.views)}
     rank = np.array([order[frame] for frame in seen.frame.tolist()], dtype=np.int64)
@@ -122,6 +150,7 @@ def _pairs(sample: Sample, seen: Events, limit: Events, cells: _Cells) -> Iterat
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     ray = camera - ((index + 0.5) * seen.voxel_size)[seen.voxel]
     reach = np.linalg.norm(ray, axis=1)
+    own, still = _Looks.of(seen.evidence), _Looks.of(limit.evidence)
     lag = 1
     while len(first := np.flatnonzero(seen.voxel[lag:] == seen.voxel[:-lag])):
         second = first + lag
@@ -132,19 +161,8 @@ def _pairs(sample: Sample, seen: Events, limit: Events, cells: _Cells) -> Iterat
             "range": np.maximum(reach[first], reach[second]) / np.minimum(reach[first], reach[second]),
             "baseline": np.linalg.norm(camera[second] - camera[first], axis=1),
         }
-        groups = cells.group[first], cells.group[second]
-        one, other = _sums(limit.evidence, first, second)
-        looks = _sums(seen.evidence, first, second)
-        yield _Pairs(cells.of[seen.voxel[first]], apart, groups, looks, one + other)
+        yield _Pairs(first, second, apart, *((looks, looks.products(first, lag)) for looks in (own, still)))
         lag *= 2
-
-
-def _sums(evidence: Evidence, first: Int64, second: Int64) -> tuple[Float64, Float64]:
-    """(m, 3 + K) of each look of pairs: s . s' with the other one, how many, ||s||^2 and s."""
-    a, b = evidence[first], evidence[second]
-    both = (a * b).sum(axis=1), np.ones(len(a))
-    one, other = (np.concatenate([np.stack([*both, (own**2).sum(axis=1)], axis=1), own], axis=1) for own in (a, b))
-    return one, other
 
 
 class _Bins:
@@ -154,35 +172,34 @@ class _Bins:
         n = len(edges) - 1
         self.edges = np.array(edges)
         self.cells = cells
-        self._looks = np.zeros((columns, n, len(cells.at), len(cells.frames)))
-        self._limit = np.zeros((columns, n))
+        self._looks = np.zeros((n, len(cells.at), len(cells.frames), columns))
+        self._limit = np.zeros((n, columns))
         self._pairs, self._apart = np.zeros(n), np.zeros(n)
 
     def add(self, apart: Float64, pairs: _Pairs) -> None:
         """Pairs (m,) that are so far apart; those beyond the edges are left out."""
         n, of = len(self._pairs), np.searchsorted(self.edges, apart, side="right") - 1
-        inside = (of >= 0) & (of < n)
-        of = of[inside]
-        self._pairs += np.bincount(of, minlength=n)
-        self._apart += np.bincount(of, weights=apart[inside], minlength=n)
-        for to, column in zip(self._limit, pairs.limit.T, strict=True):
-            to += np.bincount(of, weights=column[inside], minlength=n)  # noqa: PLW2901 - in place
-        shape = self._looks.shape[1:]
-        for group, looks in zip(pairs.group, pairs.seen, strict=True):
-            cell = np.ravel_multi_index((of, pairs.cube[inside], group[inside]), shape)
-            for to, column in zip(self._looks, looks.T, strict=True):
-                to += np.bincount(cell, weights=column[inside], minlength=to.size).reshape(shape)  # noqa: PLW2901
+        of[of == n] = -1
+        known = of >= 0
+        self._pairs += np.bincount(of[known], minlength=n)
+        self._apart += np.bincount(of[known], weights=apart[known], minlength=n)
+        (seen, product), (limit, still) = pairs.seen, pairs.limit
+        cells, columns = self._looks[0].size // self._looks.shape[-1], self._looks.shape[-1]
+        for looks in (pairs.first, pairs.second):
+            into = np.where(known, of * cells + self.cells.of[looks], -1)
+            seen.add(self._looks.reshape(-1, columns), looks, into, product)
+            limit.add(self._limit, looks, of, still)
 
-    def found(self) -> Iterator[LagBin]:
-        """The bins in which there is enough."""
+    def found(self) -> Iterator[tuple[LagBin, Asked]]:
+        """The bins in which there is enough, and what is asked of each."""
         for k in np.flatnonzero(self._pairs >= LEAST_PAIRS):
-            columns = self._looks[:, k].transpose(1, 2, 0)
+            columns = self._looks[k]
             cube, group = np.nonzero(columns[:, :, 1])
             if len(np.unique(cube)) < LEAST_CUBES:
                 continue
             own, looks = self.cells, columns[cube, group]
             whole = looks[:, :2]  # of its agreement with the other one, neither look has half for itself alone
-            alpha = of_looks(own.at[cube], own.frames[group], own.edge, own.step, looks, whole, between_of)
+            alpha = asked_of_looks(own.at[cube], own.frames[group], own.edge, own.step, looks, whole, between_of)
             low, high, pairs = float(self.edges[k]), float(self.edges[k + 1]), self._pairs[k]
-            ceiling = float(between_of(self._limit[:, k]))
-            yield LagBin(low, high, float(self._apart[k] / pairs), int(pairs), alpha, ceiling)
+            ceiling = float(between_of(self._limit[k]))
+            yield LagBin(low, high, float(self._apart[k] / pairs), int(pairs), UNKNOWN, ceiling), alpha

@@ -20,6 +20,7 @@ from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
 from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
+from semstab.statistics.ranks import ranked
 
 CELLS = 4
 """Cells along a voxel's edge."""
@@ -27,7 +28,7 @@ CELLS = 4
 LEAST_FRAMES = 2
 """What a cell shows counts where so many frames saw it: its label is to be more than one frame's own."""
 
-SCHEMA = 1
+SCHEMA = 2
 OWN, TRUTH = "its own labels in finer cells", "the ground truth"
 
 Float64 = npt.NDArray[np.float64]
@@ -98,14 +99,13 @@ class Looks:
 
     def sample(self) -> Sample:
         """Observations of the voxels, and those of labels that do not depend on the view."""
-        cell = places_of(self.cell)
-        look, pixels = _looked(cell, self.view, self.weight)
-        often = np.bincount(cell[np.unique(look, return_index=True)[1]]) >= LEAST_FRAMES
-        shown = _dominant(cell, self.label, self.weight / pixels[look], self.K)
-        kept = often[cell]
-        own = self.only(kept)
-        limit = dataclasses.replace(own, label=shown[cell[kept]])
-        return Sample(own.observations(), limit.observations(), self.views, self.soft)
+        from semstab.statistics.looks.observing import settle
+
+        own, voxel, child = self._in_order()
+        kept, shown = np.empty(len(own), np.bool_), np.empty(len(own), np.int64)
+        settle(voxel, own.view, child, own.label, own.weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
+        limit = dataclasses.replace(own, label=shown)
+        return Sample(own._looks(voxel, kept), limit._looks(voxel, kept), self.views, self.soft)
 
     def only(self, rows: npt.NDArray[Any]) -> Looks:
         """Some of the entries."""
@@ -114,22 +114,33 @@ class Looks:
 
     def observations(self) -> Events:
         """The log of the sampled voxels: what the entries of a voxel and a frame say together."""
-        index = self.cell // CELLS
-        voxel = places_of(index)
-        look, total = _looked(voxel, self.view, self.weight)
-        first = np.unique(look, return_index=True)[1]
-        pairs, pair = np.unique(look * self.K + self.label, return_inverse=True)
-        of, label = np.divmod(pairs, self.K)
-        share = np.bincount(pair, weights=self.weight) / total[of]
-        starts = np.searchsorted(of, np.arange(len(total) + 1))
+        own, voxel, _ = self._in_order()
+        return own._looks(voxel, np.ones(len(own), np.bool_))
+
+    def _in_order(self) -> tuple[Looks, Int64, Int64]:
+        """The same by voxel and frame, entries of one as they come; the key of each voxel, the number of each cell."""
+        (voxel,) = voxel_keys(self.cell // CELLS)
+        order = _order(voxel, self.view)
+        own = self.only(order)
+        x, y, z = (own.cell % CELLS).T
+        return own, voxel[order], (x * CELLS + y) * CELLS + z
+
+    def _looks(self, voxel: Int64, kept: npt.NDArray[np.bool_]) -> Events:
+        """The log of the kept entries, which are in order."""
+        from semstab.statistics.looks.observing import look
+
+        n = len(self)
+        first, of, starts, label = (np.empty(n + more, np.int64) for more in (0, 0, 1, 0))
+        pixels, share = np.empty(n), np.empty(n)
+        n, m = look(voxel, self.view, self.label, self.weight, kept, self.K, first, of, pixels, starts, label, share)
         frames = np.array([view.frame for view in self.views], dtype=np.int32)
-        distinct = np.unique(voxel, return_index=True)[1]
+        first, of = first[:n], of[:n]
         return Events(
-            **index_columns(index[distinct]),
-            voxel=voxel[first],
+            **index_columns(self.cell[first[np.flatnonzero(np.diff(of, prepend=-1))]] // CELLS),
+            voxel=of,
             frame=frames[self.view[first]],
-            evidence=Evidence(starts, label.astype(np.uint16), share, self.K),
-            pixels=np.rint(total).astype(np.int64),
+            evidence=Evidence(starts[: n + 1], label[:m].astype(np.uint16), share[:m], self.K),
+            pixels=np.rint(pixels[:n]).astype(np.int64),
             voxel_size=self.voxel_size,
             classes=self.classes,
         )
@@ -159,7 +170,7 @@ class Looks:
             content = pq.read_table(path)
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("Looks", SCHEMA):
-                raise DataError("of another kind or version")
+                raise DataError("of another kind, or of another version, which sampled other voxels: run it again")
             views = tuple(View(int(row[0]), np.array(row[1:4]), float(row[4])) for row in about.pop("views"))
             about["classes"] = tuple(about["classes"])
             x, y, z, view, label, weight, drawn = (column.to_numpy() for column in content.columns)
@@ -171,25 +182,9 @@ class Looks:
             raise DataError(f"{path}: not a file of sampled looks ({one_line(error)})") from error
 
 
-def places_of(index: Int64) -> Int64:
-    """A number (m,) for each row of indices (m, 3), ascending with (ix, iy, iz), without gaps."""
-    (key,) = voxel_keys(index)
-    return np.unique(key, return_inverse=True)[1].astype(np.int64)
-
-
-def _looked(place: Int64, view: Int64, weight: Float64) -> tuple[Int64, Float64]:
-    """The number (m,) of each entry's place and frame, ascending, and the pixels of each such look."""
+def _order(place: Int64, view: Int64) -> Int64:
+    """What sorts entries by place and view, stably."""
     views = int(view.max(initial=0)) + 1
-    look = np.unique(place * views + view, return_inverse=True)[1].astype(np.int64)
-    pixels: Float64 = np.bincount(look, weights=weight).astype(np.float64)
-    return look, pixels
-
-
-def _dominant(cell: Int64, label: Int64, share: Float64, K: int) -> Int64:
-    """The class of the largest sum of shares of each cell, the lowest on ties."""
-    pairs, pair = np.unique(cell * K + label, return_inverse=True)
-    evidence = np.bincount(pair, weights=share)
-    order = np.lexsort((pairs % K, -evidence, pairs // K))
-    _, first = np.unique(pairs[order] // K, return_index=True)
-    classes: Int64 = pairs[order][first] % K
-    return classes
+    if (int(place.max(initial=0)) + 1) * views >= 2**63:
+        place = np.unique(place, return_inverse=True)[1]
+    return ranked(place * views + view)

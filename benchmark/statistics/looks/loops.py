@@ -1,55 +1,140 @@
-"""The compiled pass over a frame's pixels that finds those which show a sampled voxel."""
+"""Compiled passes over a frame's pixels: which show a sampled voxel, and which of those are of one cell and class."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.hashing import mix
 from semstab.backends.shared.pixels.pixel_keys import in_voxels
 from semstab.runtime.compiled import serial
 from semstab.statistics.looks.entries import CELLS
 
+ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uint32(0x8CB92BA7)
+"""Weights of a voxel's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no
+plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectiveness of Quasirandom Sequences)."""
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
 
 @serial
-def draw(depth, valid, ray_x, ray_y, T, size, origin, reach, share, cell, drawn, pixel):
-    """The cell, hash and number of each pixel that shows a sampled voxel; returns how many there are.
+def hash_row(at_x, at_y, at_z, hashed):
+    """The hash (n,) of voxels, uint32: of the weighted sum of their indices modulo 2^32, one of its own for each sum.
 
-    A cell's key is its voxel's (19 bits an axis) with 2 bits an axis more.
+    It is mixed as in lowbias32 (Wellons 2018, Prospecting for Hash Functions). Products of 32 bits are vector
+    instructions on every processor, those of 64 are not.
     """
+    for u in range(len(hashed)):
+        x, y, z = np.uint32(at_x[u]), np.uint32(at_y[u]), np.uint32(at_z[u])
+        h = np.uint32(np.uint32(x * ALONG_X) + np.uint32(y * ALONG_Y) + np.uint32(z * ALONG_Z))
+        h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x7FEB352D))
+        h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x846CA68B))
+        hashed[u] = h ^ (h >> np.uint32(16))
+
+
+@serial
+def draw(depth, valid, labels, ray_x, ray_y, T, size, share, points, drawn, label, pixel):
+    """The pixels that show a sampled voxel: point in camera axes, hash, label and number; returns how many they are."""
     n = 0
     H, W = depth.shape
-    at, hashed = np.empty((3, W)), np.empty(W, np.uint32)
+    at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
+    found = np.empty(W, np.int32)
     for v in range(H):
-        place_row(depth[v], valid[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2], hashed)
-        for u in range(W):
-            if not valid[v, u] or hashed[u] >= share:
-                continue
-            key, child, inside = np.int64(0), np.int64(0), True
-            for i in range(3):
-                index = np.floor(at[i, u])
-                relative = np.int64(index) - origin[i] + reach
-                inside = inside and relative >= 0 and relative < 2 * reach
-                key = (key << np.int64(19)) | relative
-                child = child * CELLS + min(np.int64((at[i, u] - index) * CELLS), np.int64(CELLS - 1))
-            if inside:
-                cell[n], drawn[n], pixel[n] = (key << np.int64(6)) | child, hashed[u], v * W + u
-                n += 1
+        place_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
+        hash_row(at[0], at[1], at[2], hashed)
+        end = 0
+        for u in range(W):  # without a branch: where depth is noisy, none can be foretold
+            found[end] = u
+            end += hashed[u] <= last
+        for u in found[:end]:
+            z = np.float64(depth[v, u])
+            points[0, n], points[1, n], points[2, n] = ray_x[u] * z, ray_y[v] * z, z
+            drawn[n], label[n], pixel[n] = hashed[u], labels[v, u], v * W + u
+            n += valid[v, u]
     return n
 
 
 @serial
-def place_row(depth, valid, ray_x, ray_y, T, size, at_x, at_y, at_z, hashed):
-    """Where a row's pixels lie, in voxels, and the hash of each one's voxel; without a branch, for vectors."""
+def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
+    """The voxel of each pixel of a row, of invalid ones any; without a branch, for vectors."""
     x0, x1, x2, x3 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     y0, y1, y2, y3 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     z0, z1, z2, z3 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for u in range(len(depth)):
-        z = np.float64(depth[u]) if valid[u] else 0.0
+        z = np.float64(depth[u])
         x, y = ray_x[u] * z, ray_y * z
-        at_x[u] = in_voxels(x0, x1, x2, x3, x, y, z, size)
-        at_y[u] = in_voxels(y0, y1, y2, y3, x, y, z, size)
-        at_z[u] = in_voxels(z0, z1, z2, z3, x, y, z, size)
-        h = mix(np.uint64(np.int64(np.floor(at_x[u]))))
-        h = mix(h ^ np.uint64(np.int64(np.floor(at_y[u]))))
-        h = mix(h ^ np.uint64(np.int64(np.floor(at_z[u]))))
-        hashed[u] = h >> np.uint64(32)
+        at_x[u] = np.int32(np.floor(in_voxels(x0, x1, x2, x3, x, y, z, size)))
+        at_y[u] = np.int32(np.floor(in_voxels(y0, y1, y2, y3, x, y, z, size)))
+        at_z[u] = np.int32(np.floor(in_voxels(z0, z1, z2, z3, x, y, z, size)))
+
+
+@serial
+def cells_of(points, T, size, origin, reach, key):
+    """Keys (n,) of the cells of points (3, n): the voxel's, 19 bits an axis, and 2 bits more; -1 out of reach."""
+    x0, x1, x2, x3, low_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3], float(origin[0] - reach)
+    y0, y1, y2, y3, low_y = T[1, 0], T[1, 1], T[1, 2], T[1, 3], float(origin[1] - reach)
+    z0, z1, z2, z3, low_z = T[2, 0], T[2, 1], T[2, 2], T[2, 3], float(origin[2] - reach)
+    span = float(2 * reach)
+    for n in range(len(key)):
+        x, y, z = points[0, n], points[1, n], points[2, n]
+        a = in_voxels(x0, x1, x2, x3, x, y, z, size)
+        b = in_voxels(y0, y1, y2, y3, x, y, z, size)
+        c = in_voxels(z0, z1, z2, z3, x, y, z, size)
+        i, j, k = np.floor(a), np.floor(b), np.floor(c)
+        child = (digit(a - i) << np.int64(4)) | (digit(b - j) << np.int64(2)) | digit(c - k)
+        i, j, k = i - low_x, j - low_y, k - low_z
+        near = (i >= 0.0) & (i < span) & (j >= 0.0) & (j < span) & (k >= 0.0) & (k < span)
+        i, j, k = i if near else 0.0, j if near else 0.0, k if near else 0.0
+        voxel = (
+            (np.int64(np.int32(i)) << np.int64(38)) | (np.int64(np.int32(j)) << np.int64(19)) | np.int64(np.int32(k))
+        )
+        key[n] = (voxel << np.int64(6)) | child if near else np.int64(-1)
+
+
+@serial
+def digit(part):
+    """Which of the cells along a voxel's edge a part of it, from 0 to 1, falls in."""
+    cell = part * CELLS
+    return np.int64(np.int32(cell if cell < CELLS else CELLS - 1.0))
+
+
+@serial
+def grouped(cell, label, drawn, of, pixels):
+    """The number (n,) of each pixel's cell and label in order of appearance, and how many pixels each of these has.
+
+    Cells, labels and hashes move to the front, once each; returns how many they are. Those of one voxel lie side by
+    side in the table, as they do in the image.
+    """
+    bits = 7
+    while len(cell) > 1 << bits:
+        bits += 1
+    table, mask, shift = np.full(2 << bits, -1, np.int32), (2 << bits) - 1, np.uint64(69 - bits)
+    n = 0
+    for i in range(len(cell)):
+        own, its_label = cell[i], label[i]
+        slot = np.int64((np.uint64((own >> 6) ^ (np.int64(its_label) << 48)) * GOLDEN) >> shift) << 6 | (own & 63)
+        while table[slot] >= 0 and (cell[table[slot]] != own or label[table[slot]] != its_label):
+            slot = (slot + 1) & mask
+        if table[slot] < 0:
+            table[slot], cell[n], label[n], drawn[n], pixels[n] = n, own, its_label, drawn[i], 0.0
+            n += 1
+        pixels[table[slot]] += 1.0
+        of[i] = table[slot]
+    return n
+
+
+@serial
+def add_rows(rows, of, sums):
+    """Add rows (n, K) to those of the sums (m, K) that they are of."""
+    for i in range(len(rows)):
+        for k in range(rows.shape[1]):
+            sums[of[i], k] += rows[i, k]
+
+
+@serial
+def keep(share, entries, key, view, label, weight, drawn):
+    """Move the entries whose hash is below `share` to the front; returns how many they are."""
+    n = 0
+    for i in range(entries):
+        if drawn[i] < share:
+            key[n], view[n], label[n], weight[n], drawn[n] = key[i], view[i], label[i], weight[i], drawn[i]
+            n += 1
+    return n

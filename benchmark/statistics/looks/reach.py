@@ -6,15 +6,15 @@ as voxels grow. The share of it that a model reaches does not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.statistics import ClassReach, Reach
+from semstab.model.statistics import ClassReach, Interval, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.looks.entries import Sample
-from semstab.statistics.sampling import InfluenceSums, estimate, influence_sums, question_of, value
+from semstab.statistics.sampling import Asked, InfluenceSums, answers, asked_of, influence_sums, question_of, value
 
 SUPPORT = 100.0
 """Places from which on a class matters to the verdict, where no critical classes are named."""
@@ -37,29 +37,46 @@ def reach_of(
     sums = influence_sums(table, sample=sample.shared()) if sums is None else sums
     repeated = table.op >= 2
     places = (table.evidence[repeated] / table.op[repeated, None]).sum(axis=0)
-    return reach_from(sample.by, places, sums, critical=critical, least=least)
+    found = answers(reach_by(sums, table.K))
+    return reach_from(sample.by, places, sums, found, critical=critical, least=least)
+
+
+def reach_by(sums: InfluenceSums, K: int) -> Iterator[Asked]:
+    """For `answers`: alpha in the sample, its ceiling, and what share of it is reached, by K classes together and by
+    each."""
+    assert sums.seen is not None
+    assert sums.limit is not None
+    question = question_of(sums)
+    yield asked_of(sums.seen, "alpha_between", question=question)
+    yield asked_of(sums.limit, "alpha_between", question=question)
+    for k in (None, *range(K)):
+        yield asked_of(sums, "reached", k, question)
 
 
 def reach_from(
     by: str,
     places: npt.NDArray[np.float64],
     sums: InfluenceSums,
+    found: Sequence[Interval],
     *,
     critical: Sequence[str] = (),
     least: float = SUPPORT,
 ) -> Reach:
-    """The same from the sums of a map with a sample, whose limit has labels `by` whom; places (K,) of each class."""
+    """The same from the sums of a map with a sample, whose limit has labels `by` whom; places (K,) of each class.
+
+    found  the answers to `reach_by`
+    """
     assert sums.seen is not None
     assert sums.limit is not None
-    question = question_of(sums)
     names = sums.classes or tuple(str(k) for k in range(len(places)))
     named = set(critical) & set(names)
+    alpha, ceiling, reached, *of_classes = found
     return Reach(
         by=by,
         voxels=round(float(sums.seen["voxels"].sum())),
-        alpha=estimate(sums.seen, "alpha_between", question=question),
-        ceiling=estimate(sums.limit, "alpha_between", question=question),
-        reached=estimate(sums, "reached", question=question),
+        alpha=alpha,
+        ceiling=ceiling,
+        reached=reached,
         classes=tuple(
             ClassReach(
                 name,
@@ -67,7 +84,7 @@ def reach_from(
                 name in named if named else bool(places[k] >= least),
                 value(sums.seen, "alpha_between", k),
                 value(sums.limit, "alpha_between", k),
-                estimate(sums, "reached", k, question),
+                of_classes[k],
             )
             for k, name in enumerate(names)
         ),

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
+from semstab.statistics.ranks import numbered
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
@@ -30,8 +32,30 @@ SIDE = 640
 REACH = 1 << 18
 """Voxels from the first camera within which there is a sample."""
 
+COLUMNS = np.int64, np.int32, np.uint16, np.float64, np.uint32
+"""Of entries: the key of the cell, the row of the frame, the class, its pixels or sum of scores, the voxel's hash."""
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+UInt32 = npt.NDArray[np.uint32]
+Entries = tuple[Int64, npt.NDArray[np.uint16], Float64, UInt32]
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Pixels (n,) that show sampled voxels: keys of the cells, hashes of the voxels, labels, and numbers."""
+
+    cell: Int64
+    drawn: UInt32
+    label: npt.NDArray[np.uint16]
+    pixel: npt.NDArray[np.int32]
+
+    def grouped(self) -> tuple[int, Int64, Float64]:
+        """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels."""
+        from semstab.statistics.looks.loops import grouped
+
+        of, pixels = np.empty(len(self.cell), np.int64), np.empty(len(self.cell))
+        return grouped(self.cell, self.label, self.drawn, of, pixels), of, pixels
 
 
 class Sampler:
@@ -50,15 +74,13 @@ class Sampler:
         self.voxel_size, self.K, self.budget = voxel_size, num_classes, budget
         self._share = 1 << 32
         self._origin: Int64 | None = None if origin is None else np.array(origin, dtype=np.int64)
-        self._parts: list[tuple[npt.NDArray[Any], ...]] = []
+        self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in COLUMNS)
         self._entries = 0
         self._views: list[View] = []
         self._soft = False
 
     def add(self, frame: Frame) -> None:
         """What the frame's valid pixels show of the sampled voxels."""
-        from semstab.statistics.looks.loops import draw
-
         frame = frame.every(math.ceil(max(frame.shape) / SIDE))
         centre = frame.T_wc[:3, 3]
         if self._origin is None:
@@ -66,32 +88,41 @@ class Sampler:
         when = math.nan if frame.timestamp is None else frame.timestamp
         self._views.append(View(frame.index, centre, when))
         self._soft = self._soft or frame.scores is not None
-        H, W = frame.shape
-        camera = frame.intrinsics
-        cell, drawn, pixel = np.empty(H * W, np.int64), np.empty(H * W, np.uint32), np.empty(H * W, np.int64)
-        n = draw(
-            fixed(frame.depth), fixed(frame.valid), (np.arange(W) - camera.cx) / camera.fx,
-            (np.arange(H) - camera.cy) / camera.fy, fixed(frame.T_wc), self.voxel_size, self._origin, REACH,
-            self._share, cell, drawn, pixel,
-        )  # fmt: skip
-        for piece in self._pieces(frame, cell[:n]):
-            some = piece[drawn[piece] < self._share]  # less than before, where the pieces before it were too many
-            entries_of = self._labels if frame.scores is None else self._scores
-            key, label, weight, first = entries_of(frame, cell[some], pixel[some])
-            when_seen = np.full(len(key), len(self._views) - 1, dtype=np.int32)
-            self._parts.append((key, when_seen, label.astype(np.uint16), weight, drawn[some][first]))
-            self._entries += len(key)
-            while self._entries > self.budget:
-                self._halve()
+        entries_of = self._labels if frame.scores is None else self._scores
+        for key, label, weight, drawn in entries_of(frame, self._drawn(frame)):
+            self._take(key, np.full(len(key), len(self._views) - 1, np.int32), label, weight, drawn)
 
-    def _pieces(self, frame: Frame, cell: Int64) -> list[Int64]:
-        """Pixels of whole cells, in their order, so few at a time that their scores take little memory."""
-        if frame.scores is None:
-            return [np.arange(len(cell))]
-        order = np.argsort(cell, kind="stable")
-        first = np.flatnonzero(np.diff(cell[order], prepend=-1))
-        cuts = np.searchsorted(first, np.arange(PIECE // self.K, len(cell), max(1, PIECE // self.K)))
-        return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
+    def _drawn(self, frame: Frame) -> Pixels:
+        """The frame's valid pixels in sampled voxels; the label of soft ones is the same for all."""
+        from semstab.statistics.looks.loops import cells_of, draw
+
+        (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
+        ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
+        points, drawn = np.empty((3, H * W)), np.empty(H * W, np.uint32)
+        label, pixel = np.empty(H * W, np.uint16), np.empty(H * W, np.int32)
+        valid = fixed(frame.valid)
+        labels = valid.view(np.uint8) if frame.labels is None else fixed(frame.labels)
+        n = draw(
+            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share,
+            points, drawn, label, pixel,
+        )  # fmt: skip
+        cell = np.empty(n, np.int64)
+        cells_of(points[:, :n], T_wc, self.voxel_size, self._origin, REACH, cell)
+        near = slice(n) if cell.min(initial=0) >= 0 else np.flatnonzero(cell >= 0)
+        return Pixels(cell[near], drawn[near], label[near], pixel[near])
+
+    def _take(self, *part: npt.NDArray[Any]) -> None:
+        """Take entries in; where they would be too many, every second voxel goes until they are not."""
+        from semstab.statistics.looks.loops import keep
+
+        more = keep(self._share, len(part[0]), *part)  # a part of the frame that came before may have lowered it
+        while self._entries + more > self.budget:
+            self._share //= 2
+            self._entries = keep(self._share, self._entries, *self._columns)
+            more = keep(self._share, more, *part)
+        for column, values in zip(self._columns, part, strict=True):
+            column[self._entries : self._entries + more] = values[:more]
+        self._entries += more
 
     def sample(self) -> Sample:
         """What is there so far, as observations of the sampled voxels."""
@@ -99,46 +130,51 @@ class Sampler:
 
     def looks(self, classes: tuple[str, ...] = ()) -> Looks:
         """What is there so far, cell by cell."""
-        nothing = [np.zeros(0, dtype) for dtype in (np.int64, np.int64, np.int64, np.float64, np.int64)]
-        key, view, label, weight, drawn = (np.concatenate(column) for column in zip(nothing, *self._parts, strict=True))
+        key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
         return Looks(
-            self._cells(key), view, label, weight, drawn, tuple(self._views), self.voxel_size, self.K, self._share,
-            self._soft, classes,
+            self._cells(key), view.astype(np.int64), label.astype(np.int64), weight.copy(), drawn.astype(np.int64),
+            tuple(self._views), self.voxel_size, self.K, self._share, self._soft, classes,
         )  # fmt: skip
 
-    def _labels(self, frame: Frame, cell: Int64, pixel: Int64) -> tuple[Int64, Int64, Float64, Int64]:
-        """Entries (cell, class, pixels) of a frame's labels, and a pixel of each."""
-        assert frame.labels is not None
-        label = frame.labels.reshape(-1)[pixel].astype(np.int64)
-        order = np.lexsort((label, cell))
-        cell, label = cell[order], label[order]
-        new = np.flatnonzero((np.diff(cell, prepend=-1) != 0) | (np.diff(label, prepend=-1) != 0))
-        pixels = np.diff(np.append(new, len(cell))).astype(np.float64)
-        return cell[new], label[new], pixels, order[new].astype(np.int64)
+    def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
+        """Entries (cell, class, pixels, hash) of a frame's labels."""
+        m, _, count = pixels.grouped()
+        yield pixels.cell[:m], pixels.label[:m], count[:m], pixels.drawn[:m]
 
-    def _scores(self, frame: Frame, cell: Int64, pixel: Int64) -> tuple[Int64, Int64, Float64, Int64]:
-        """Entries (cell, class, sum of scores) of a frame's scores, and a pixel of each."""
+    def _scores(self, frame: Frame, pixels: Pixels) -> Iterator[Entries]:
+        """Entries (cell, class, sum of scores, hash) of a frame's scores, of a few cells at a time."""
+        from semstab.statistics.looks.loops import add_rows
+
         assert frame.scores is not None
-        s = frame.scores.reshape(-1, self.K)[pixel].astype(np.float64)
-        s /= s.sum(axis=1, keepdims=True)
-        cells, first, of = np.unique(cell, return_index=True, return_inverse=True)
-        sums: Float64 = np.stack([np.bincount(of, weights=column, minlength=len(cells)) for column in s.T], axis=1)
-        row, label = np.nonzero(sums)
-        weight: Float64 = sums[row, label]
-        return cells[row], label.astype(np.int64), weight, first[row].astype(np.int64)
-
-    def _halve(self) -> None:
-        self._share //= 2
-        kept = [tuple(column[part[4] < self._share] for column in part) for part in self._parts]
-        self._parts = kept
-        self._entries = sum(len(part[0]) for part in kept)
+        _, of, _ = pixels.grouped()
+        for piece in _pieces(of, max(1, PIECE // self.K)):
+            some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
+            s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)
+            s /= s.sum(axis=1, keepdims=True)
+            own, number = numbered(of[some])
+            sums = np.zeros((len(own), self.K))
+            add_rows(s, number, sums)
+            row, label = np.nonzero(sums)
+            yield pixels.cell[own[row]], label.astype(np.uint16), sums[row, label], pixels.drawn[own[row]]
 
     def _cells(self, key: Int64) -> Int64:
         """Indices (n, 3) of cells by their keys: three voxel indices of 19 bits, three digits of 2 bits."""
-        of_voxel = np.stack([key >> 44, (key >> 25) & (2 * REACH - 1), (key >> 6) & (2 * REACH - 1)], axis=1) - REACH
-        child = np.stack([(key >> 4) & 3, (key >> 2) & 3, key & 3], axis=1)
         origin = np.zeros(3, dtype=np.int64) if self._origin is None else self._origin
-        return CELLS * (of_voxel + origin) + child
+        cells = np.empty((len(key), 3), np.int64)
+        for axis, (bits, digit) in enumerate(((44, 4), (25, 2), (6, 0))):
+            voxel = ((key >> bits) & (2 * REACH - 1)) + (origin[axis] - REACH)
+            cells[:, axis] = CELLS * voxel + ((key >> digit) & (CELLS - 1))
+        return cells
+
+
+def _pieces(of: Int64, most: int) -> list[Int64]:
+    """Pixels by the number of their cell: of whole cells, in order, about so many at a time."""
+    if len(of) <= most:
+        return [np.arange(len(of))]
+    order = np.argsort(of, kind="stable")
+    first = np.flatnonzero(np.diff(of[order], prepend=-1))
+    cuts = np.searchsorted(first, np.arange(most, len(of), most))
+    return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
 
 
 def merged(stretches: Sequence[Looks], budget: int = BUDGET) -> Looks:

@@ -16,6 +16,10 @@ def in_chunks(loop: Any, *arguments: Any) -> None:
 
     Such loops hold no lock. numba's own parallel form of them would take three times as long to compile.
     """
-    with ThreadPoolExecutor(nb.get_num_threads()) as pool:
+    if (threads := nb.get_num_threads()) == 1:
+        for chunk in range(CHUNKS):
+            loop(chunk, *arguments)
+        return
+    with ThreadPoolExecutor(threads) as pool:
         for done in [pool.submit(loop, chunk, *arguments) for chunk in range(CHUNKS)]:
             done.result()

@@ -1,4 +1,4 @@
-"""Compiled loops over the log of observations, voxel by voxel: its changes of class, its squares."""
+"""Compiled loops over the log of observations, voxel by voxel: its changes of class."""
 
 from __future__ import annotations
 
@@ -20,41 +20,33 @@ def argmax(log, row):
 
 
 @serial
-def count_flips(chunk, starts, frame, log, K, changes, differing, since):
-    """By voxel (n,): changes of the predicted class, pairs of observations that differ in it, frames since then.
+def count_flips(chunk, starts, frame, log, K, rate, null, since):
+    """By voxel (n,): the share of steps at which the predicted class changes, of pairs that differ, and frames since.
 
-    starts (n + 1,) bounds its observations. since is left as it is where the class never changed.
+    starts (n + 1,) bounds its observations. NaN where there is no pair, and no change to count from.
     """
+    begin, end = chunk * rate.shape[0] // CHUNKS, (chunk + 1) * rate.shape[0] // CHUNKS
     votes, longest = np.zeros(K, np.int64), 0
-    for i in range(chunk, changes.shape[0], CHUNKS):
+    for i in range(begin, end):
         longest = max(longest, starts[i + 1] - starts[i])
     voted = np.empty(longest, np.int64)
-    for i in range(chunk, changes.shape[0], CHUNKS):
-        before, last, same = np.int64(-1), np.int64(-1), np.int64(0)
+    for i in range(begin, end):
+        rate[i] = null[i] = since[i] = np.nan
+        T = starts[i + 1] - starts[i]
+        if T < 2:
+            continue
+        before, last, same, changes = np.int64(-1), np.int64(-1), np.int64(0), 0
         for row in range(starts[i], starts[i + 1]):
             k = argmax(log, row)
             if before >= 0 and k != before:
-                changes[i] += 1
+                changes += 1
                 last = row
             same += votes[k]
             votes[k] += 1
             before = voted[row - starts[i]] = k
-        T = starts[i + 1] - starts[i]
-        differing[i] = T * (T - 1) // 2 - same
+        pairs = T * (T - 1) // 2
+        rate[i], null[i] = changes / (T - 1), (pairs - same) / pairs
         if last >= 0:
             since[i] = frame[starts[i + 1] - 1] - frame[last]
         for t in range(T):
             votes[voted[t]] = 0
-
-
-@serial
-def sum_squares(chunk, starts, log, K, voxels, squares):
-    """For each entry of the voxels' evidence, given as the log is: the sum over frames of its share's square (m,)."""
-    place = np.full(K, -1)
-    at, label, weight = log
-    first, own, _ = voxels
-    for i in range(chunk, first.shape[0] - 1, CHUNKS):
-        for e in range(first[i], first[i + 1]):
-            place[own[e]] = e
-        for e in range(at[starts[i]], at[starts[i + 1]]):
-            squares[place[label[e]]] += weight[e] * weight[e]

@@ -48,3 +48,25 @@ def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
                 log_p += log_factorial[rest] - log_factorial[t - c] - log_factorial[rest - t + c]
                 total += np.exp(log_p) * drifts[c, t]
         out[i] = n[i] / T[i] * total
+
+
+@serial
+def seen_counts(evidence, T, known, seen):
+    """Mark in seen (longest + 1, longest + 1) the pairs n, T of classes of the voxels for which `known` (m,) holds."""
+    starts, _, weight = evidence
+    for i in range(T.shape[0]):
+        if known[i]:
+            for e in range(starts[i], starts[i + 1]):
+                seen[np.int64(np.rint(weight[e])), T[i]] = 1.0
+
+
+@serial
+def add_expected(evidence, T, known, part, expected):
+    """The mean drift (m,) of these voxels in random order, from that part (n, T) of its sum that each class causes."""
+    starts, _, weight = evidence
+    for i in range(T.shape[0]):
+        if known[i]:
+            total = 0.0
+            for e in range(starts[i], starts[i + 1]):
+                total += part[np.int64(np.rint(weight[e])), T[i]]
+            expected[i] = total / (T[i] - 1)

@@ -117,12 +117,13 @@ def _observe(e, end, label, weight, classes, a, floor, certain, totals, lane):
 
 
 @serial
-def fuse_by_rules(chunk, rank, starts, log, K, first, classes, most, rules, floor, belief, rest, drift_sum):
+def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules, floor, belief, rest, drift_sum):
     """Fuse each voxel's observations by each of the rules (R,).
 
-    rank (n,) sorts the voxels by OP and how many classes they saw, at most `most`: classes[first[i] : first[i + 1]].
-    belief (R, m) takes the beliefs in these after the last observation, rest (R, n) that in each of the others, which
-    are all alike, drift_sum (R, n) the sum of the Jensen-Shannon divergences of successive beliefs, bits.
+    starts, ends (n,) bound their rows of the log. rank (n,) sorts them by OP and how many classes they saw, at most
+    `most`: classes[first[i] : first[i + 1]]. belief (R, m) takes the beliefs in these after the last observation, rest
+    (R, n) that in each of the others, which are all alike, drift_sum (R, n) the sum of the Jensen-Shannon divergences
+    of successive beliefs, bits.
     """
     at, label, weight = log
     certain = -np.log2(floor) if rules.max() >= PRODUCT else 0.0
@@ -134,8 +135,8 @@ def fuse_by_rules(chunk, rank, starts, log, K, first, classes, most, rules, floo
     begin, end = chunk * rank.shape[0] // CHUNKS, (chunk + 1) * rank.shape[0] // CHUNKS
     while begin < end:
         voxels = rank[begin : min(begin + LANES, end)]
-        T, lanes = starts[voxels[0] + 1] - starts[voxels[0]], 0
-        while lanes < voxels.shape[0] and starts[voxels[lanes] + 1] - starts[voxels[lanes]] == T:
+        T, lanes = ends[voxels[0]] - starts[voxels[0]], 0
+        while lanes < voxels.shape[0] and ends[voxels[lanes]] - starts[voxels[lanes]] == T:
             row[lanes], own[lanes] = starts[voxels[lanes]], first[voxels[lanes]]
             lanes += 1
         A = first[voxels[lanes - 1] + 1] - own[lanes - 1]  # the last one saw the most classes

@@ -80,17 +80,16 @@ def expected_sbd(table: VoxelTable) -> Float64:
     """
     from semstab.statistics.loops import chunks, one_hot
 
-    T = table.op.astype(np.int64)
-    known = (T >= 2) & (T <= one_hot.LONGEST_TABLE) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
-    entries = table.evidence.take(known)
-    count, voxel = np.rint(entries.weight).astype(np.int64), np.repeat(np.arange(len(entries)), np.diff(entries.starts))
-    base = one_hot.LONGEST_TABLE + 1
-    pairs, of = np.unique(count * base + T[known][voxel], return_inverse=True)
-    part = np.zeros(len(pairs))
-    drifts = one_hot.one_hot_drifts(int(T[known].max(initial=2)))
-    chunks.in_chunks(one_hot.expected_one_hot, *np.divmod(pairs, base), _log_factorials(base), drifts, part)
-    expected = np.bincount(voxel, weights=part[of], minlength=len(entries)) / (T[known] - 1)
-    return _spread_out(expected, known)
+    T, longest = table.op, one_hot.LONGEST_TABLE
+    known = (T >= 2) & (longest >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
+    count = np.zeros((longest + 1, longest + 1))
+    one_hot.seen_counts(table.evidence.entries, T, known, count)
+    pairs, part = np.nonzero(count), count[count > 0]
+    drifts = one_hot.one_hot_drifts(int(T.max(initial=2, where=known)))
+    chunks.in_chunks(one_hot.expected_one_hot, *pairs, _log_factorials(longest + 1), drifts, part)
+    count[pairs], expected = part, np.full(len(table), np.nan)
+    one_hot.add_expected(table.evidence.entries, T, known, count, expected)
+    return expected
 
 
 def voxel_drift(
@@ -238,40 +237,30 @@ def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -
     return rows
 
 
-def trend_columns(table: VoxelTable, drift: VoxelDrift) -> Float64:
-    """(n, 3): by its sum, the disagreement that goes one way in time, that in random order, and all of it."""
-    known = ~np.isnan(drift.trend)
-    parts = np.stack([drift.trend, drift.trend_null, np.ones(len(table))], axis=1) * variation(table)[:, None]
-    return np.where(known[:, None], parts, 0.0)
+def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]:
+    """The rows (r,) of the voxels that tell of a trend, and (r, 3) of each.
+
+    By its sum: the disagreement that goes one way in time, that in random order, and all of it.
+    """
+    rows = np.flatnonzero(~np.isnan(drift.trend))
+    parts = (drift.trend[rows], drift.trend_null[rows], np.ones(len(rows)))
+    return rows, np.stack(parts, axis=1) * variation(table)[rows, None]
 
 
 def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
     from semstab.statistics.loops import chunks, log_kernels
 
-    n, bounds = len(events.ix), np.append(events.starts, len(events))
-    changes, differing, since = np.zeros(n), np.zeros(n), np.full(n, np.nan)
-    chunks.in_chunks(
-        log_kernels.count_flips,
-        bounds,
-        events.frame,
-        events.evidence.entries,
-        events.evidence.K,
-        changes,
-        differing,
-        since,
-    )
-    op = np.diff(bounds).astype(np.float64)
-    again = op >= 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rate = np.where(again, changes / (op - 1), np.nan)
-        null = np.where(again, differing / (op * (op - 1) / 2), np.nan)
+    bounds = events.bounds
+    rate, null, since = (np.empty(len(events.ix)) for _ in range(3))
+    log = events.evidence
+    chunks.in_chunks(log_kernels.count_flips, bounds, events.frame, log.entries, log.K, rate, null, since)
     return Flips(rate, null, since)
 
 
 def variation(table: VoxelTable) -> Float64:
     """(n,) how far a voxel's observations are from their mean: sum over frames of ||s_t - mean||^2."""
-    squares: Float64 = table.self_sum - table.evidence.rowwise(lambda e: (e**2).sum(axis=1)) / table.op
+    squares: Float64 = table.self_sum - table.evidence.concentration.squares / table.op
     return np.maximum(squares, 0.0)
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
-from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.information import normalise
+from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
 from semstab.statistics.ranks import ranked
@@ -31,6 +30,11 @@ class Belief(Evidence):
     """Beliefs (n, K) by the classes that each voxel saw; `rest` (n,) is that in each of the others."""
 
     rest: Float64
+
+    @property
+    def unseen(self) -> Float64:
+        """(n,) what each class without an entry has."""
+        return self.rest
 
     def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
         dense = super()._stretch(first, last)
@@ -75,24 +79,34 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
 
 
 def fuse_all(
-    events: Events, rules: Sequence[str], *, floor: float | None = None, evidence: Evidence | None = None
+    events: Events,
+    rules: Sequence[str],
+    *,
+    floor: float | None = None,
+    evidence: Evidence | None = None,
+    rows: Int64 | None = None,
 ) -> list[Fused]:
     """What `fuse` makes of a log by each of some rules, in one pass.
 
     evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
+    rows      (n,) which voxels of the log these are, where they are not all
     """
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
 
-    K = events.evidence.K
-    bounds, log = np.append(events.starts, len(events)), events.evidence.entries
+    K, log = events.evidence.K, events.evidence.entries
     first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
-    belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(first) - 1, len(first) - 1))
-    op, count = np.diff(bounds), np.diff(first)
+    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.bounds[1:]))
+    belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(starts), len(starts)))
+    op, count = ends - starts, np.diff(first)
+    alike, model, models = (_NONE,) * 3 if evidence is None else _alike(op, evidence)
+    each = np.concatenate([np.delete(np.arange(len(op)), alike), models])
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
-    rank = ranked(op * (most + 1) + count)
-    chunks.in_chunks(loops.fuse_by_rules, rank, bounds, log, K, *seen, *how, belief, rest, drift_sum)
+    rank = each[ranked((op * (most + 1) + count)[each])]
+    chunks.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, rest, drift_sum)
+    for own, to, by in ((belief, first[alike], first[model]), (rest, alike, model), (drift_sum, alike, model)):
+        own[:, to] = own[:, by]
     return [
         Fused(Belief(first, label, belief[r], K, rest[r]), op.astype(np.int32), drift_sum[r]) for r in range(len(rules))
     ]
@@ -103,7 +117,7 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
 
-    bounds, log = np.append(events.starts, len(events)), events.evidence.entries
+    bounds, log = events.bounds, events.evidence.entries
     count = np.zeros(len(bounds), np.int64)
     chunks.in_chunks(loops.count_classes, bounds, log, events.evidence.K, count)
     first: Int64 = np.cumsum(count)
@@ -112,12 +126,26 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     return first, label
 
 
+_NONE = np.zeros(0, np.int64)
+
+
+def _alike(op: Int64, evidence: Evidence) -> tuple[Int64, Int64, Int64]:
+    """Voxels (a,) of which all frames saw one class, and nothing else, one of as many frames (a,) for each, and those.
+
+    What a rule says of such a voxel depends on its OP only.
+    """
+    single = np.flatnonzero(np.diff(evidence.starts) == 1)
+    alike = single[evidence.weight[evidence.starts[single]] == op[single]]
+    by_op = np.full(int(op.max(initial=0)) + 1, -1)
+    by_op[op[alike]] = alike
+    return alike, by_op[op[alike]], by_op[by_op >= 0]
+
+
 def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:
     """Class (n,) of the largest belief of evidence (n, K), the lowest of those that tie: rounding decides none."""
-    return np.concatenate([_label(normalise(evidence[some])) for some in row_chunks(*evidence.shape)])
+    from semstab.statistics.loops.rows import label_near
 
-
-def _label(belief: Float64) -> npt.NDArray[np.int64]:
-    near: npt.NDArray[np.bool_] = belief >= belief.max(axis=1, keepdims=True) - ONE_HOT
-    highest: npt.NDArray[np.int64] = near.argmax(axis=1)
-    return highest
+    kept = Evidence.of(evidence)
+    rest, found = kept.unseen, np.empty(len(kept), np.int64)
+    label_near(kept.entries, np.zeros(0) if rest is None else rest, kept.K, ONE_HOT, found)
+    return found

@@ -68,10 +68,8 @@ def benjamini_hochberg(p: Float64) -> Float64:
     NaN is not a test. It holds for independent tests and for those that depend positively (Benjamini and Yekutieli
     2001), as neighbouring voxels do.
     """
-    from scipy.stats import false_discovery_control
-
-    adjusted = np.full(len(p), np.nan)
-    tested = np.flatnonzero(~np.isnan(p))
-    if len(tested):
-        adjusted[tested] = false_discovery_control(p[tested])
+    adjusted, descending = np.full(len(p), np.nan), np.argsort(-p)  # NaN comes last
+    tested = descending[: np.count_nonzero(~np.isnan(p))]
+    rank = np.arange(len(tested), 0, -1)
+    adjusted[tested] = np.minimum(np.minimum.accumulate(p[tested] * (len(tested) / rank)), 1.0)
     return adjusted

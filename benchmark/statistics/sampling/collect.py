@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics.matching import voxel_keys
-from semstab.model.evidence import row_chunks, stretches
+from semstab.model.concentration import by_group
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.agreement import ONE_HOT, psa
-from semstab.statistics.ranks import numbered, ranked
-from semstab.statistics.sampling.influence import MOST_CELLS, InfluenceSums, most_groups
+from semstab.statistics.agreement import one_hot_where, psa
+from semstab.statistics.ranks import SPARSE, distinct, ranked
+from semstab.statistics.sampling.cubes import cell_edge, cells_of, cubes
+from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
 
@@ -65,9 +64,8 @@ def with_sample(whole: InfluenceSums, sample: tuple[Events, Events], *, logged: 
 
 
 def _of_table(table: VoxelTable, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
-    again = np.flatnonzero(table.op >= 2)
-    at, of = cells_of(table.index[again], table.voxel_size, edge)
-    columns = _sums_of_table(table, again, of, len(at), true_label, likely)
+    at, of, _ = cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, table.op >= 2)
+    columns = _sums_of_table(table, of, len(at), true_label, likely)
     unknown = np.full(len(at), -1, dtype=np.int32)
     return InfluenceSums(
         at, unknown, columns, edge, 0, table.voxel_size, table.K, table.classes, true_label is not None
@@ -76,13 +74,13 @@ def _of_table(table: VoxelTable, true_label: Int64 | None, edge: float, likely: 
 
 def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
     starts = events.starts
-    op = np.diff(np.append(starts, len(events)))
+    op = np.diff(events.bounds)
     again = np.flatnonzero(op >= 2)
     index = np.stack([events.ix, events.iy, events.iz], axis=1)
     at, of = cells_of(index[again], events.voxel_size, edge)
     K = int(events.evidence.shape[1])
     step = _step(events.frame, K)
-    frames, group = numbered(events.frame // step)
+    frames, group = frame_groups(events.frame, step)
     sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
@@ -126,21 +124,18 @@ def _with_places(
     sums: InfluenceSums, table: VoxelTable, true_label: Int64 | None, sbd_excess: Float64 | None
 ) -> InfluenceSums:
     """With rows for the sums that belong to no frame: SBD less that in random order, and how far beliefs are right."""
-    again = np.flatnonzero(table.op >= 2)
-    at, of = cells_of(table.index[again], table.voxel_size, sums.edge)
+    at, of, _ = cubes((table.ix, table.iy, table.iz), table.voxel_size, sums.edge, table.op >= 2)
     columns, own = np.zeros((len(at), sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
     if sbd_excess is not None:
-        known = ~np.isnan(sbd_excess[again])
-        for name, values in zip(OF_PLACES[:2], (np.nan_to_num(sbd_excess[again]), known), strict=True):
-            columns[:, own[name]] = np.bincount(of, weights=values, minlength=len(at))[:, None]
+        for name, values in zip(OF_PLACES[:2], by_group(of, [sbd_excess], len(at)), strict=True):
+            columns[:, own[name]] = values
     if true_label is not None:
-        label, e = true_label[again], table.evidence.take(again)
-        confidence = e.max(axis=1) / e.sum(axis=1)
-        known, right = label >= 0, dominant(table)[again] == label
+        confidence, right = vss(table), dominant(table) == true_label
         bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
-        gap = np.bincount(of * BINS + bins, weights=known * (right - confidence), minlength=len(at) * BINS)
+        judged = np.where((of >= 0) & (true_label >= 0), of * BINS + bins, -1)
+        gap, known = by_group(judged, [right - confidence], len(at) * BINS)
         columns[:, own["gap"]] = gap.reshape(-1, BINS)
-        columns[:, own["judged"]] = np.bincount(of, weights=known, minlength=len(at))[:, None]
+        columns[:, own["judged"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
     some = columns.any(axis=1)
     return dataclasses.replace(
         sums,
@@ -150,46 +145,22 @@ def _with_places(
     )
 
 
-def cells_of(
-    index: npt.NDArray[np.int32], voxel_size: float, edge: float
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """The cubes (G, 3) that hold voxels (n, 3), and which of them each is in."""
-    parts = [_distinct(_at(index[some], voxel_size, edge)) for some in stretches(len(index))]
-    cells, of = _distinct(np.concatenate(parts)), np.empty(len(index), dtype=np.int64)
-    for some in stretches(len(index)):
-        keys, sorted_keys = voxel_keys(_at(index[some], voxel_size, edge), cells)
-        of[some] = np.searchsorted(sorted_keys, keys)
-    return cells.astype(np.int32), of
-
-
-def cell_edge(index: npt.NDArray[np.int32], voxel_size: float) -> float:
-    """The smallest power of 2, in metres and no smaller than a voxel, that leaves at most MOST_CELLS cubes."""
-    edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
-    cells = np.zeros((0, 3), dtype=np.int64)
-    for some in stretches(len(index)):
-        cells = _distinct(np.concatenate([cells, _at(index[some], voxel_size, edge)]))
-        while len(cells) > MOST_CELLS:
-            cells, edge = _distinct(cells // 2), 2 * edge
-    return edge
-
-
-def _at(index: npt.NDArray[np.int32], voxel_size: float, edge: float) -> Int64:
-    """The cube (n, 3) that each voxel is in."""
-    cell: Int64 = np.floor((index + 0.5) * (voxel_size / edge)).astype(np.int64)
-    return cell
-
-
-def _distinct(cells: Int64) -> Int64:
-    """Each of the cubes (n, 3) once, sorted."""
-    (key,) = voxel_keys(cells)
-    return cells[np.unique(key, return_index=True)[1]]
-
-
 def _step(frame: npt.NDArray[np.int32], K: int) -> int:
-    step, distinct = 1, numbered(frame)[0]
-    while len(distinct) > most_groups(K):
-        step, distinct = 2 * step, np.unique(distinct // 2)
+    step, seen = 1, distinct(frame)
+    while len(seen) > most_groups(K):
+        step, seen = 2 * step, np.unique(seen // 2)
     return step
+
+
+def frame_groups(frame: npt.NDArray[np.int32], step: int) -> tuple[Int64, Int64]:
+    """The groups of so many frames, ascending, and which of them each frame (m,) is in."""
+    seen = distinct(frame)
+    groups, number = np.unique(seen // step, return_inverse=True)
+    if not len(seen) or seen[0] < 0 or seen[-1] > SPARSE * len(frame):
+        return groups, np.searchsorted(groups, frame // step)
+    of = np.zeros(int(seen[-1]) + 1, np.int64)
+    of[seen] = number
+    return groups, of[frame]
 
 
 def _sums_of_log(
@@ -232,50 +203,61 @@ def _sums_of_log(
     return sums
 
 
-def _sums_of_table(
-    table: VoxelTable, again: Int64, of: Int64, cells: int, true_label: Int64 | None, likely: Float64
-) -> Float64:
-    """(cells, C) from the voxels' rows alone; sums by class are NaN for evidence that is not one-hot."""
-    one_hot = bool((np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[again].all())
-    sums = np.zeros((cells, width(table.K, truth=true_label is not None)))
-    for some in row_chunks(len(again), table.K):
-        rows = again[some]
-        label = None if true_label is None else true_label[rows]
-        columns = _columns_of_table(table.rows(rows), label, likely[rows], one_hot=one_hot)
-        for to, column in zip(sums.T, columns.T, strict=True):
-            to += np.bincount(of[some], weights=column, minlength=cells)  # noqa: PLW2901 - in place
-    return sums
+def _sums_of_table(table: VoxelTable, of: Int64, cells: int, true_label: Int64 | None, likely: Float64) -> Float64:
+    """(cells, C) from the rows of the voxels that are in one of (n,); by class NaN for evidence that is not one-hot."""
+    from semstab.statistics.loops.rows import add_apart
 
-
-def _columns_of_table(table: VoxelTable, true_label: Int64 | None, likely: Float64, *, one_hot: bool) -> Float64:
-    """(n, C) of voxels with OP >= 2; what a class has is known where all evidence is one-hot."""
-    T, e = table.op.astype(np.float64), table.evidence[:]
-    agreement, recurrent = psa(table), (table.op >= RECURRENT).astype(np.float64)
-    twice = np.where(T == 2, T, 0.0)
+    K, T, agreement = table.K, table.op.astype(np.float64), psa(table)
+    recurrent, twice = (table.op >= RECURRENT).astype(np.float64), np.where(table.op == 2, T, 0.0)
     values: dict[str, npt.NDArray[Any]] = {
         "voxels": np.ones(len(T)), "psa": agreement, "observations": T, "agreeing": T * agreement,
         "own": table.self_sum, "twice": twice, "twice_agreeing": twice * agreement, "recurrent": recurrent,
-        "vss": recurrent * vss(table), "entropy": entropy(table), "evidence": e,
+        "vss": recurrent * vss(table), "entropy": entropy(table),
     }  # fmt: skip
-    if table.K <= MOST_CLASSES:
-        squares = e if one_hot else np.full_like(e, np.nan)
-        values["class_own"] = squares
-        values["class_apart"] = 2 * ((T[:, None] - 1) * e - e**2 + squares) / (T[:, None] - 1)
+    shares, apart = np.zeros((cells, K)), np.zeros((cells, K))
+    add_apart(of, table.evidence.entries, table.op, shares, apart)
+    by_class = {"evidence": shares}
+    if K <= MOST_CLASSES:
+        one_hot = one_hot_where(table, of >= 0)
+        by_class |= {"class_own": shares, "class_apart": apart} if one_hot else _unknown(shares)
     if true_label is not None:
-        label = true_label
-        known, right = label >= 0, label == dominant(table)
-        stable = known * likely * recurrent
-        looks = np.take_along_axis(e, np.maximum(label, 0)[:, None], axis=1)[:, 0]
-        values |= {
-            "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
-            "stable": stable, "stable_wrong": stable * ~right,
-        }  # fmt: skip
-        if table.K <= MOST_CLASSES:
-            true = (label[:, None] == np.arange(table.K)).astype(np.float64)
-            predicted = known[:, None] * (dominant(table)[:, None] == np.arange(table.K))
-            values |= {"class_known": true, "class_right": true * right[:, None], "class_predicted": predicted}
-    columns = np.zeros((len(T), width(table.K, truth=true_label is not None)))
-    for name, own in layout(table.K, truth=true_label is not None).items():
-        if name not in OF_PLACES:
-            columns[:, own] = np.asarray(values[name], float).reshape(len(T), own.stop - own.start)
-    return columns
+        plain, further = _with_truth(table, of, cells, true_label, likely * recurrent)
+        values, by_class = values | plain, by_class | further
+    sums, own = np.zeros((cells, width(K, truth=true_label is not None))), layout(K, truth=true_label is not None)
+    for name, column in zip(values, by_group(of, [*values.values()], cells)[0].T, strict=True):
+        sums[:, own[name].start] = column
+    for name, columns in by_class.items():
+        sums[:, own[name]] = columns
+    return sums
+
+
+def _unknown(shares: Float64) -> dict[str, Float64]:
+    return {name: np.full_like(shares, np.nan) for name in ("class_own", "class_apart")}
+
+
+def _with_truth(
+    table: VoxelTable, of: Int64, cells: int, label: Int64, likely: Float64
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Float64]]:
+    """What of `_sums_of_table` needs the true classes (n,): of each voxel (n,), and sums by class (cells, K)."""
+    from semstab.statistics.loops.rows import weight_of
+
+    looks, found, T = np.empty(len(label)), dominant(table), table.op
+    weight_of(table.evidence.entries, label, looks)
+    known, right = label >= 0, label == found
+    stable, counted = known * likely, known & (of >= 0)
+    values: dict[str, npt.NDArray[Any]] = {
+        "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
+        "stable": stable, "stable_wrong": stable * ~right,
+    }  # fmt: skip
+
+    def by_class(which: Int64, where: npt.NDArray[np.bool_]) -> Float64:
+        count = np.bincount(of[where] * table.K + which[where], minlength=cells * table.K)
+        return count.reshape(cells, table.K).astype(np.float64)
+
+    if table.K > MOST_CLASSES:
+        return values, {}
+    return values, {
+        "class_known": by_class(label, counted),
+        "class_right": by_class(label, counted & right),
+        "class_predicted": by_class(found, counted),
+    }

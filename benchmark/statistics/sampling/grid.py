@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +11,10 @@ import numpy.typing as npt
 
 from semstab.model.statistics import THIS_MAP, Question
 from semstab.statistics.blocks import gradient_of
+from semstab.statistics.sampling.arrangement import Cells, arranged
 from semstab.statistics.sampling.influence import Statistic
-from semstab.statistics.sampling.reach import Arrangement, Spread, arrangement, one_thread
+from semstab.statistics.sampling.reach import Errors, Spread, one_thread, spreads
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 
@@ -68,44 +70,32 @@ class Grid:
         )
 
 
-def influences(
-    cell: npt.NDArray[np.integer],
-    frame: npt.NDArray[np.integer],
-    columns: Float64,
-    of: Statistic,
-    edge: float,
-    step: int,
-    halves: Float64 | None = None,
-) -> Grid | None:
-    """The influences of sums (m, C) by cube (m, 3) and group of frames (m,), -1 where that is not known.
+def influences(where: Where, columns: Float64, of: Statistic, halves: Float64 | None = None) -> Grid | None:
+    """The influences of sums (m, C) by cube and group of frames.
 
     halves (m, 2): of places that two frames saw, what of the first two sums both are held for, instead of half each.
     """
     total = columns.sum(axis=0)
     gradient = gradient_of(of, total)
-    places, row = np.unique(cell.astype(np.int64), axis=0, return_inverse=True)
-    row = row.ravel()
-    everything = np.abs(_sums(row, columns[:, 1], len(places)))
+    everything = np.abs(where.by_place(columns[:, 1]))
     some = everything > TINY * everything.sum()
     if some.sum() < 2 or not np.isfinite(gradient).all():
         return None
     own: Float64 = columns @ gradient
-    block = _sums(row, own, len(places))
     shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
-    known = (frame >= 0) | (step == 0)
-    frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
-    by_frame, size = np.zeros((len(places), len(frames))), np.zeros((len(places), len(frames)))
-    np.add.at(by_frame, (row[known], column), shared[known])
-    np.add.at(size, (row[known], column), np.abs(columns[known, 1]))
+    by_frame, size = where.by_both(shared), where.by_both(np.abs(columns[:, 1]))
     seen = size.sum(axis=0) > 0
-    at = np.ix_(some, seen)
-    one_off = abs(float(gradient[0] * total[1]))
-    return Grid(places[some], frames[seen], block[some], by_frame[at], size[at], everything[some], edge, step, one_off)
-
-
-def _sums(row: npt.NDArray[np.int64], values: Float64, rows: int) -> Float64:
-    sums: Float64 = np.bincount(row, weights=values, minlength=rows).astype(np.float64)
-    return sums
+    return Grid(
+        where.places[some],
+        where.frames[seen],
+        where.by_place(own)[some],
+        by_frame[np.ix_(some, seen)],
+        size[np.ix_(some, seen)],
+        everything[some],
+        where.edge,
+        where.step,
+        one_off=abs(float(gradient[0] * total[1])),
+    )
 
 
 # --- Variance ---------------------------------------------------------------------------------------------------------
@@ -146,39 +136,50 @@ class TwoWay:
 NO_FRAMES = Spread(0.0, math.inf, 1.0)
 
 
-def two_way(grid: Grid, question: Question) -> TwoWay:
+def two_way(grids: Sequence[Grid], questions: Sequence[Question]) -> list[TwoWay]:
     """V_frame + V_block - V_cell (Cameron, Gelbach, Miller 2011): pairs that share a frame or a block count once."""
-    places = arrangement(grid.places)
-    by_place = places.spread(grid.block, grid.all)
-    if question == THIS_MAP or len(grid.frames) < 2:
-        return TwoWay(by_place, NO_FRAMES)
-    return TwoWay(by_place, _beyond_places(grid, places, by_place))
-
-
-def _beyond_places(grid: Grid, places: Arrangement, by_place: Spread) -> Spread:
-    """What frames add: the influences that one frame, and those near it, have in places far from each other."""
-    frames = arrangement(grid.frames[:, None])
-    influence, size = grid.cell.sum(axis=0), grid.size.sum(axis=0)
-    influence = influence - size / size.sum() * influence.sum()  # of a sample they do not sum to 0
-    by_frame = frames.spread(influence, size, modelled=True)
-    if not by_frame.variance > 0:
-        return NO_FRAMES
+    cells = arranged([grid.places for grid in grids])
+    errors = [Errors(at, grid.block, grid.all) for at, grid in zip(cells, grids, strict=True)]
     with one_thread():
-        together = grid.cell.T @ places.mean_kernel(by_place.parts) @ grid.cell
-    parts = []
-    for part in by_frame.parts:
-        kernel = frames.kernel(part.block)
-        plain, inside = float(influence @ kernel @ influence), float((kernel * together).sum())
-        beyond = max(1 - inside / plain, 0.0) if plain > 0 else 0.0
-        parts.append(dataclasses.replace(part, variance=part.variance * beyond))
-    return Spread.mean(parts)
+        found = [TwoWay(own, NO_FRAMES) for own in spreads(errors)]
+        of_flight = [k for k, grid in enumerate(grids) if questions[k] != THIS_MAP and len(grid.frames) > 1]
+        beyond = _beyond_places([(grids[k], cells[k], found[k].places) for k in of_flight])
+    for k, frames in zip(of_flight, beyond, strict=True):
+        found[k] = TwoWay(found[k].places, frames)
+    return found
+
+
+def _beyond_places(grids: Sequence[tuple[Grid, Cells, Spread]]) -> list[Spread]:
+    """What frames add: the influences that one frame, and those near it, have in places far from each other."""
+    errors = []
+    for cells, (grid, _, _) in zip(arranged([grid.frames[:, None] for grid, _, _ in grids]), grids, strict=True):
+        influence, size = grid.cell.sum(axis=0), grid.size.sum(axis=0)
+        influence = influence - size / size.sum() * influence.sum()  # of a sample they do not sum to 0
+        errors.append(Errors(cells, influence, size))
+    found = spreads(errors, modelled=True)
+    return [
+        _less_of_places(own, frames, grid, places, by_place) if frames.variance > 0 else NO_FRAMES
+        for own, frames, (grid, places, by_place) in zip(errors, found, grids, strict=True)
+    ]
+
+
+def _less_of_places(errors: Errors, frames: Spread, grid: Grid, places: Cells, by_place: Spread) -> Spread:
+    """The variance that comes from frames less what is within places that err alike."""
+    order, influence = errors.cells.order, errors.influence[errors.cells.order]
+    cell = grid.cell[np.ix_(places.order, order)]
+    together = cell.T @ places.kernel(by_place.parts.block, by_place.parts.weight) @ cell
+    blocks, of = np.unique(frames.parts.block, return_inverse=True)
+    kernels = [errors.cells.of.kernel(block)[: len(order), : len(order)] for block in blocks.tolist()]
+    plain = np.array([influence @ kernel @ influence for kernel in kernels])
+    inside = np.array([(kernel * together).sum() for kernel in kernels])
+    beyond = np.where(plain > 0, np.maximum(1 - inside / np.where(plain > 0, plain, 1.0), 0.0), 0.0)
+    return Spread.mean(frames.parts.times(beyond[of]))
 
 
 def apart(one: Grid, other: Grid, question: Question) -> TwoWay:
     """Of two flights over the same places: each adds the variance of its own frames."""
-    both = two_way(one.minus(other), THIS_MAP)
+    both, first, second = two_way([one.minus(other), one, other], [THIS_MAP, question, question])
     if question == THIS_MAP:
         return both
-    added = [two_way(grid, question).frames for grid in (one, other)]
-    joined = TwoWay(added[0], added[1])
-    return TwoWay(both.places, Spread(joined.total, joined.degrees, added[0].block))
+    joined = TwoWay(first.frames, second.frames)
+    return TwoWay(both.places, Spread(joined.total, joined.degrees, first.frames.block))

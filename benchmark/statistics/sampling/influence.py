@@ -6,6 +6,7 @@ They add up over parts of a map, and are a small file: comparisons and gates nee
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,7 @@ from semstab.runtime.json_form import from_json
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
 from semstab.statistics.ranks import distinct_rows
 from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
@@ -85,15 +87,20 @@ class InfluenceSums:
         """Sums (m, C) of several names side by side."""
         return np.concatenate([self[name] for name in names], axis=1)
 
+    @functools.cached_property
+    def where(self) -> Where:
+        """Which cube and which group of frames each row is of."""
+        return Where.of(self.cell, self.frame, self.edge, self.step)
+
     @property
     def frames(self) -> int:
         """How many groups of frames there are; 0 where they are not known."""
-        return len(np.unique(self.frame[self.frame >= 0])) if self.step else 0
+        return len(self.where.frames) if self.step else 0
 
     @property
     def cells(self) -> int:
         """How many cubes hold a voxel that was seen twice."""
-        return len(np.unique(self.cell, axis=0))
+        return len(self.where.places)
 
     def coarsened(self, edge: float, step: int) -> InfluenceSums:
         """With larger cubes, or groups of frames; step 0 forgets the frames."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,7 @@ from semstab.statistics.sampling.influence import (
     parts_of,
     value,
 )
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 
@@ -43,7 +46,53 @@ LEAST_OF_PLACES = 1.0
 AS_FAR = "errors reach as far as the scene: fly more of it"
 AS_LONG = "the quality of frames lasts about as long as the flight: fly longer"
 TOO_FEW = "too few frames to tell of the next flight: fly {least} or more"
+TOGETHER = 64
+"""Numbers that are worked on together: of thousands of classes not all influences are there at once."""
+
 NO_PLACES = "nothing was seen twice in two places: fly with more overlap"
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A number and the influences on it, None where it is undefined or all is in one cube; how its interval is made."""
+
+    value: float
+    grid: Grid | None
+    question: Question
+    scale: Scale
+    bounds: tuple[float, float]
+    level: float = LEVEL
+
+    @property
+    def answered(self) -> Question:
+        """Of a single group of frames nothing is said about the next flight."""
+        told = self.grid is not None and self.grid.step and len(self.grid.frames) > 1
+        return self.question if told else THIS_MAP
+
+
+def answers(asked: Iterable[Asked]) -> list[Interval]:
+    """Numbers with their intervals; those of one map together, as most of the work is the same for all of them."""
+    found: list[Interval] = []
+    asked = iter(asked)
+    while some := list(itertools.islice(asked, TOGETHER)):
+        known = [own.grid for own in some if own.grid is not None]
+        spread = iter(two_way(known, [own.answered for own in some if own.grid is not None]))
+        found += [_nowhere(own.value) if own.grid is None else _answer(own, own.grid, next(spread)) for own in some]
+    return found
+
+
+def answered(*groups: Iterable[Asked]) -> list[list[Interval]]:
+    """The same for groups of numbers of one map."""
+    counts = [0] * len(groups)
+
+    def all_of_them() -> Iterator[Asked]:
+        for k, group in enumerate(groups):
+            for own in group:
+                counts[k] += 1
+                yield own
+
+    found = iter(answers(all_of_them()))
+    return [list(itertools.islice(found, count)) for count in counts]
 
 
 def estimate(
@@ -54,8 +103,16 @@ def estimate(
     'this map': what other places like these would give in these very frames. 'the next flight': what other frames like
     these would give, too; where the frames are not known the interval is for this map, and says so.
     """
-    grid, number = grid_of(sums, key, k), functional(key, k)
-    return _with_interval(value(sums, key, k), grid, question, number.scale, (number.low, number.high), level)
+    return answers([asked_of(sums, key, k, question, level)])[0]
+
+
+def asked_of(
+    sums: InfluenceSums, key: str, k: int | None = None, question: Question = NEXT_FLIGHT, level: float = LEVEL
+) -> Asked:
+    """For `answers`, see `estimate`."""
+    number = functional(key, k)
+    bounds = number.low, number.high
+    return Asked(value(sums, key, k), grid_of(sums, key, k), question, number.scale, bounds, level)
 
 
 def difference(
@@ -81,18 +138,17 @@ def difference(
         return none(estimate(a, key, k, question, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
-        return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
+        return _nowhere(found)
     question = question if a.step else THIS_MAP
     paired = np.array_equal(np.unique(a.frame), np.unique(b.frame)) if same_frames is None else same_frames
-    spread = two_way(one.minus(other), question) if paired else apart(one, other, question)
+    between = one.minus(other)
+    spread = two_way([between], [question])[0] if paired else apart(one, other, question)
     half = spread.half(level)
     low, high = found - half, found + half
     if spread.total <= TINY:
-        ends = [estimate(sums, key, k, question, level) for sums in (a, b)]
+        ends = answers(asked_of(sums, key, k, question, level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    return dataclasses.replace(
-        _interval(found, low, high, one.minus(other), spread, question), p_value=_p_value(found, spread)
-    )
+    return dataclasses.replace(_interval(found, low, high, between, spread, question), p_value=_p_value(found, spread))
 
 
 def identical(a: InfluenceSums, b: InfluenceSums, key: str, k: int | None = None) -> bool:
@@ -124,12 +180,23 @@ def of_places(
 
     The second column counts what the first is a sum of.
     """
-    found = float(statistic(columns.sum(axis=0)))
-    grid = influences(cell, np.full(len(cell), -1), columns, statistic, edge, 0)
-    return _with_interval(found, grid, THIS_MAP, scale, bounds, level)
+    return answers([asked_of_places(Where.of(cell, None, edge), columns, statistic, scale, bounds, level)])[0]
 
 
-def of_looks(
+def asked_of_places(
+    where: Where,
+    columns: Float64,
+    statistic: Statistic,
+    scale: Scale,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+    level: float = LEVEL,
+) -> Asked:
+    """For `answers`, see `of_places`."""
+    grid = influences(where, columns, statistic)
+    return Asked(float(statistic(columns.sum(axis=0))), grid, THIS_MAP, scale, bounds, level)
+
+
+def asked_of_looks(
     cell: npt.NDArray[np.integer],
     frame: npt.NDArray[np.integer],
     edge: float,
@@ -138,15 +205,15 @@ def of_looks(
     halves: Float64,
     statistic: Statistic,
     level: float = LEVEL,
-) -> Interval:
-    """An agreement of sums (m, C) of cubes and groups of frames, see `influences`.
+) -> Asked:
+    """For `answers`: an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
 
     Its interval is for the next flight where frames tell of it, else for this map.
     """
     found = float(statistic(columns.sum(axis=0)))
-    grid = influences(cell, frame, columns, statistic, edge, step, halves)
+    grid = influences(Where.of(cell, frame, edge, step), columns, statistic, halves)
     told = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
-    return _with_interval(found, grid, NEXT_FLIGHT if told else THIS_MAP, "agreement", (-1.0, 1.0), level)
+    return Asked(found, grid, NEXT_FLIGHT if told else THIS_MAP, "agreement", (-1.0, 1.0), level)
 
 
 def question_of(sums: InfluenceSums) -> Question:
@@ -154,33 +221,27 @@ def question_of(sums: InfluenceSums) -> Question:
     return NEXT_FLIGHT if sums.frames * sums.step >= LEAST_FRAMES else THIS_MAP
 
 
-def judged_of(sums: InfluenceSums) -> Judged:
-    """The numbers that a verdict on a map rests on."""
+def judged_by(sums: InfluenceSums) -> Iterator[Asked]:
+    """For `answers`: the numbers that a verdict on a map rests on, in the order of `Judged`."""
     question = question_of(sums)
-    keys = [field.name for field in dataclasses.fields(Judged)]
-    return Judged(**{key: estimate(sums, key, question=question) for key in keys})
+    return (asked_of(sums, field.name, question=question) for field in dataclasses.fields(Judged))
 
 
-def _with_interval(
-    found: float, grid: Grid | None, question: Question, scale: Scale, bounds: tuple[float, float], level: float
-) -> Interval:
-    if grid is None:
-        return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
-    question = question if grid.step and len(grid.frames) > 1 else THIS_MAP
-    spread = _of_flight(grid) if question == NEXT_FLIGHT else two_way(grid, question)
+def _nowhere(found: float) -> Interval:
+    return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
+
+
+def _answer(asked: Asked, grid: Grid, spread: TwoWay) -> Interval:
+    found, question, level = asked.value, asked.answered, asked.level
+    if question == NEXT_FLIGHT:  # with no more degrees of freedom than a quality that lasts may leave
+        spread = dataclasses.replace(spread, most=max(len(grid.frames) * grid.step / LASTING, LEAST_DEGREES))
     if math.isnan(found) or not spread.degrees > 0:
         low, high = math.nan, math.nan
-    elif scale == "share":
+    elif asked.scale == "share":
         low, high = _share_ends(found, spread, grid.units(question), level)
     else:
-        low, high = _ends(found, spread, grid.unseen(question, level), scale, level)
-    return _interval(found, max(low, bounds[0]), min(high, bounds[1]), grid, spread, question)
-
-
-def _of_flight(grid: Grid) -> TwoWay:
-    """For the next flight, with no more degrees of freedom than a quality that lasts may leave."""
-    most = max(len(grid.frames) * grid.step / LASTING, LEAST_DEGREES)
-    return dataclasses.replace(two_way(grid, NEXT_FLIGHT), most=most)
+        low, high = _ends(found, spread, grid.unseen(question, level), asked.scale, level)
+    return _interval(found, max(low, asked.bounds[0]), min(high, asked.bounds[1]), grid, spread, question)
 
 
 def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
@@ -190,7 +251,7 @@ def grid_of(sums: InfluenceSums, key: str, k: int | None = None) -> Grid | None:
         return None
     rows = parts_of(sums, number)[0]
     halves = rows.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-    return influences(rows.cell, rows.frame, columns, number.of, rows.edge, rows.step, halves)
+    return influences(rows.where, columns, number.of, halves)
 
 
 # --- Ends -------------------------------------------------------------------------------------------------------------
@@ -252,58 +313,3 @@ def _interval(found: float, low: float, high: float, grid: Grid, spread: TwoWay,
         degrees=spread.degrees,
         undecided="; ".join(reasons),
     )
-
-
-# --- Of several numbers -----------------------------------------------------------------------------------------------
-
-
-def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
-    """A number less another one of which nothing is shared, from their intervals (Zou and Donner 2008)."""
-    found = a.value - b.value
-    low = found - math.hypot(a.value - a.low, b.high - b.value)
-    high = found + math.hypot(a.high - a.value, b.value - b.low)
-    return _combined(found, low, high, (a, b), 1.0, level)
-
-
-def mean_of(found: Sequence[Interval], level: float = LEVEL) -> Interval:
-    """The mean of numbers, of scenes for example, of which each errs by itself."""
-    n = len(found)
-    value = sum(own.value for own in found) / n
-    low = value - math.hypot(*(own.value - own.low for own in found)) / n
-    high = value + math.hypot(*(own.high - own.value for own in found)) / n
-    return found[0] if n == 1 else _combined(value, low, high, found, 1 / n, level)
-
-
-def _combined(
-    value: float, low: float, high: float, parts: Sequence[Interval], weight: float, level: float
-) -> Interval:
-    """The p-value by the variances that the parts' intervals stand for, each with its degrees of freedom."""
-    from scipy import special
-
-    variances = [(weight * standard_error(own, level)) ** 2 for own in parts]
-    spread = sum(v**2 / own.degrees for v, own in zip(variances, parts, strict=True) if v > 0 and own.degrees > 0)
-    total = sum(variances)
-    degrees = max(total**2 / spread, 1.0) if spread > 0 else math.inf
-    p = float(2 * special.stdtr(degrees, -abs(value) / math.sqrt(total))) if total > 0 else math.nan
-    questions = {own.question for own in parts}
-    return Interval(
-        value,
-        low,
-        high,
-        question=NEXT_FLIGHT if questions == {NEXT_FLIGHT} else THIS_MAP,
-        frames=min(own.frames for own in parts),
-        places=sum(own.places for own in parts),
-        block_size=max(own.block_size for own in parts),
-        degrees=degrees,
-        undecided="; ".join(dict.fromkeys(own.undecided for own in parts if own.undecided)),
-        p_value=p,
-    )
-
-
-def standard_error(found: Interval, level: float = LEVEL) -> float:
-    """That which an interval by Student's t stands for."""
-    from scipy import special
-
-    if not found.degrees > 0:
-        return (found.high - found.low) / 2 / float(special.ndtri((1 + level) / 2))
-    return (found.high - found.low) / 2 / float(special.stdtrit(found.degrees, (1 + level) / 2))

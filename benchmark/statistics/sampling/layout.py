@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 import numpy.typing as npt
 
@@ -23,7 +27,8 @@ OF_PLACES = (*DRIFT, "judged", "gap")
 """Sums that belong to no frame: they stand in rows whose frame is -1."""
 
 
-def layout(K: int, *, truth: bool) -> dict[str, slice]:
+@functools.lru_cache(maxsize=16)
+def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
     """Which columns of the sums each name stands for; those by class have K columns, `gap` one for each bin."""
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
@@ -34,7 +39,8 @@ def layout(K: int, *, truth: bool) -> dict[str, slice]:
         widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
         widths += [("judged", 1), ("gap", BINS)]
     ends = np.cumsum([width for _, width in widths])
-    return {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+    found = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+    return MappingProxyType(found)
 
 
 def width(K: int, *, truth: bool) -> int:

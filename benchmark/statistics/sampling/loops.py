@@ -105,6 +105,69 @@ def _add_truth(sums, base, rows, first, T, group, truth, likely, total, active, 
 
 
 @serial
+def _agreement(total, squares, T, active, A, surprise, apart):
+    """The agreement of two observations; of each class how surprising it is, and how far apart two of them are."""
+    agreed = 0.0
+    for j in range(A):
+        k = active[j]
+        pairs = total[k] ** 2 - squares[k]
+        agreed += pairs
+        surprise[k] = -np.log(total[k] / T) / np.log(surprise.shape[0]) / T if total[k] > 0.0 else 0.0
+        apart[k] = 2.0 * (total[k] / T - pairs / (T * (T - 1.0)))
+    return agreed / (T * (T - 1.0))
+
+
+@serial
+def _one_class(log, first, T):
+    """The class that all of a voxel's observations are of, and of nothing else; -1 where there is none."""
+    at, label, weight = log
+    k = np.int64(label[at[first]])
+    if at[first + T] - at[first] != T:
+        return -1
+    for e in range(at[first], at[first + T]):
+        if label[e] != k or weight[e] != 1.0:
+            return -1
+    return k
+
+
+@serial
+def _add_agreed(sums, base, k, first, T, group, truth, likely, column, K, by_class):
+    """Add a voxel whose observations are all of class k: they agree with each other, and leaving one out changes none.
+
+    column is the first with ground truth, where that is known; K classes.
+    """
+    share, right = 1.0 / T, 1.0 if k == truth else 0.0
+    for t in range(first, first + T):
+        r = base + group[t]
+        sums[r, VOXELS] += share
+        sums[r, PSA] += share
+        sums[r, OBSERVATIONS] += 1.0
+        sums[r, AGREEING] += 1.0
+        sums[r, OWN] += 1.0
+        sums[r, ENTROPY + 1 + k] += 1.0
+        if by_class:
+            sums[r, ENTROPY + 1 + 2 * K + k] += 1.0
+        if T == 2:
+            sums[r, TWICE] += 1.0
+            sums[r, TWICE_AGREEING] += 1.0
+        else:
+            sums[r, RECURRENT] += share
+            sums[r, VSS] += share
+        if truth >= 0:
+            sums[r, column + KNOWN] += share
+            sums[r, column + RIGHT] += share * right
+            sums[r, column + LOOKS] += 1.0
+            sums[r, column + LOOKS_RIGHT] += right
+            if T > 2:
+                sums[r, column + STABLE] += likely * share
+                sums[r, column + STABLE_WRONG] += likely * share * (1.0 - right)
+            if by_class:
+                sums[r, column + 6 + truth] += share
+                sums[r, column + 6 + K + truth] += share * right
+                sums[r, column + 6 + 2 * K + k] += share
+
+
+@serial
 def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likely, by_class, with_truth, groups, sums):
     """Add the observations of the voxels with T >= 2 to `sums` (cells * groups, C).
 
@@ -120,7 +183,6 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
     total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
     own, without, mean = np.empty(longest), np.empty(longest, np.int64), np.empty(K)
     surprise, apart = np.empty(K), np.empty(K)
-    scale = 1.0 / np.log(K)
     first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
@@ -128,16 +190,13 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
             first, T = starts[i], op[i]
             if T < 2:
                 continue
+            k = _one_class(log, first, T)
+            if k >= 0:
+                known = truth[i] if with_truth else -1
+                _add_agreed(sums, cell * groups, k, first, T, group, known, likely[i], first_truth, K, by_class)
+                continue
             A = _classes_of(log, first, T, rows, total, squares, own, active)
-            best = _label(total, active, A)
-            agreed = 0.0
-            for j in range(A):
-                k = active[j]
-                pairs = total[k] ** 2 - squares[k]
-                agreed += pairs
-                surprise[k] = -np.log(total[k] / T) * scale / T if total[k] > 0.0 else 0.0
-                apart[k] = 2.0 * (total[k] / T - pairs / (T * (T - 1.0)))
-            agreed /= T * (T - 1.0)
+            best, agreed = _label(total, active, A), _agreement(total, squares, T, active, A, surprise, apart)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             for t in range(T):
                 r = cell * groups + group[first + t]

@@ -2,29 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.model.concentration import by_group
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import Interval
-from semstab.statistics.blocks import Blocks
-from semstab.statistics.sampling.collect import cell_edge, cells_of
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import ratio_of
+from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
-from semstab.statistics.sampling.intervals import of_places
+from semstab.statistics.sampling.intervals import Asked, answers, asked_of_places
+from semstab.statistics.sampling.where import Where
 
 Float64 = npt.NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
 class Places:
-    """The cubes of voxels (n, 3), at most MOST_CELLS unless their edge is given, in metres."""
+    """The cubes of voxels, and sums over those in each.
 
-    def __init__(self, index: npt.NDArray[np.int32], voxel_size: float, edge: float | None = None) -> None:
-        self.edge = cell_edge(index, voxel_size) if edge is None else edge
-        self.cell, of = cells_of(index, voxel_size, self.edge)
-        self._blocks = Blocks(of, len(self.cell), self.edge)
+    cell  (G, 3) int32 the cubes, sorted
+    at    (n,) int64 which of them each voxel is in, -1 for those that are left out
+    edge  metres, a power of 2
+    """
+
+    cell: npt.NDArray[np.int32]
+    at: npt.NDArray[np.int64]
+    edge: float
+
+    @classmethod
+    def of(cls, table: VoxelTable, edge: float | None = None, *, where: npt.NDArray[np.bool_] | None = None) -> Places:
+        """Of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
+
+        There are at most MOST_CELLS cubes, unless their edge is given, in metres.
+        """
+        some = table.op >= 2 if where is None else where
+        return cls(*cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
+
+    def rows(self, rows: npt.NDArray[np.int64]) -> Places:
+        """The same cubes, for some of the voxels."""
+        return replace(self, at=self.at[rows])
 
     @property
     def count(self) -> int:
@@ -32,16 +55,21 @@ class Places:
         return len(self.cell)
 
     def sums(self, columns: Float64) -> Float64:
-        """(G, C) over the voxels of each cube of columns (n, C)."""
-        return self._blocks.sums(columns.astype(np.float64))
+        """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
+        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
 
-    def sums_by_class(self, evidence: Evidence, weights: Float64) -> Float64:
-        """(G, K) over the voxels of each cube of their evidence (n, K), each by its weight (n,)."""
-        count = np.diff(evidence.starts)
-        at = np.repeat(self._blocks.of * evidence.K, count) + evidence.label
-        values, size = np.repeat(weights, count) * evidence.weight, self.count * evidence.K
-        sums: Float64 = np.bincount(at, weights=values, minlength=size).astype(np.float64).reshape(-1, evidence.K)
-        return sums
+    def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
+        """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
+        both = by_group(self.at, [*values.values()], self.count)
+        return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
+
+    def sums_by_class(self, evidence: Evidence, op: npt.NDArray[np.int32]) -> tuple[Float64, Float64]:
+        """(G, K) over the voxels of each cube of their evidence (n, K), and of that / OP."""
+        from semstab.statistics.loops.rows import add_classes
+
+        by_look, by_place = (np.zeros((self.count, evidence.K)) for _ in range(2))
+        add_classes(self.at, evidence.entries, op, by_look, by_place)
+        return by_look, by_place
 
     def estimate(
         self,
@@ -55,6 +83,24 @@ class Places:
         Where no scale is given, what goes from 0 to 1 is a share.
         """
         return PlaceSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A statistic of sums (..., C) by name, the second of which counts: a mean, or any other.
+
+    Where no scale is given, what goes from 0 to 1 is a share.
+    """
+
+    sums: str
+    of: Statistic = ratio_of
+    bounds: tuple[float, float] = (0.0, 1.0)
+    scale: Scale | None = None
+
+    @property
+    def kind(self) -> Scale:
+        """The scale of its interval."""
+        return self.scale or ("share" if self.bounds == (0.0, 1.0) else "plain")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +130,23 @@ class PlaceSums:
         bounds: tuple[float, float] = (0.0, 1.0),
         scale: Scale | None = None,
     ) -> Interval:
-        """The statistic of sums (..., C), the second of which counts, with its interval.
+        """The statistic of sums (..., C), the second of which counts, with its interval; see `Mean`."""
+        return self.estimates({name: Mean(name, statistic, bounds, scale)})[name]
 
-        Where no scale is given, what goes from 0 to 1 is a share.
-        """
-        kind: Scale = scale or ("share" if bounds == (0.0, 1.0) else "plain")
-        return of_places(self.cell, self.edge, self.sums[name], statistic, kind, bounds)
+    def estimates(self, means: Mapping[str, Mean]) -> dict[str, Interval]:
+        """Several of them, together."""
+        return dict(zip(means, answers(self.asked(means)), strict=True))
+
+    def asked(self, means: Mapping[str, Mean]) -> Iterator[Asked]:
+        """For `answers`."""
+        return (self._asked(own) for own in means.values())
+
+    def _asked(self, mean: Mean) -> Asked:
+        return asked_of_places(self._where, self.sums[mean.sums], mean.of, mean.kind, mean.bounds)
+
+    @functools.cached_property
+    def _where(self) -> Where:
+        return Where.of(self.cell, None, self.edge)
 
     @classmethod
     def merged(cls, parts: Sequence[PlaceSums]) -> PlaceSums:

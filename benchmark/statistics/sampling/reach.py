@@ -17,14 +17,14 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
+from semstab.statistics.sampling.arrangement import GROWTH, REACHES, Arrangement, Cells
+
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
-REACHES = (0.4, 0.5, 0.6, 0.75, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
-"""How far errors may reach, in cells, besides not at all."""
-
-ALONE, DOUBT = (0.0, 0.5), 4.0
-"""Shares of a cell's variance that it may have for itself, and by how much the log likelihood must be better for that:
-a weak correlation that reaches far is seldom real, and leaves hardly anything to say."""
+DOUBT = 4.0
+"""By how much the log likelihood must be better for a share of a cell's variance that it has for itself: a weak
+correlation that reaches far is seldom real, and leaves hardly anything to say."""
 
 FAR = 0.5
 """Of places, a reach counts with this power of its length besides: one that is found too short does more harm."""
@@ -35,34 +35,43 @@ UNLIKELY = 1e-3
 ROUNDING = 1e-13
 """Influences below are rounding's."""
 
-SINGULAR = 1e-9
-"""What is added to the variance of each cell, so that smooth correlations have an inverse."""
 
-BLOCK = 4.0
-"""The edge of a block, in reaches."""
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Influences (n,) of cells on a sum, which are centred, and how much is in each cell (n,)."""
 
-GROWTH = 0.75
-"""A cell's standard deviation grows with this power of what is in it: between independent parts and equal ones."""
+    cells: Cells
+    influence: Float64
+    size: Float64
 
-MOST_KNOWN = 96
-"""So many answers of an arrangement are kept for the next number of the same map."""
+    @property
+    def told(self) -> bool:
+        """Whether there is anything to tell of."""
+        return len(self.cells) > 1 and bool(np.abs(self.influence).max() >= ROUNDING)
 
 
-@dataclass(frozen=True)
-class Part:
-    """The variance of a sum as it is under one reach: its weight, degrees of freedom, and the block, in cells.
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The variance of a sum as it is under each of the reaches (m,): weights, degrees of freedom, blocks, in cells.
 
     alike  how much larger than that of independent cells
     """
 
-    weight: float
-    variance: float
-    degrees: float
-    block: float
-    alike: float = 1.0
+    weight: Float64
+    variance: Float64
+    degrees: Float64
+    block: Float64
+    alike: Float64
+
+    def times(self, factor: Float64) -> Parts:
+        """With variances so many times as large."""
+        return Parts(self.weight, self.variance * factor, self.degrees, self.block, self.alike)
 
 
-@dataclass(frozen=True)
+NONE = Parts(*(np.zeros(0) for _ in range(5)))
+
+
+@dataclass(frozen=True, eq=False)
 class Spread:
     """The variance of a sum, the degrees of freedom of that number, and the likeliest block, in cells.
 
@@ -72,211 +81,133 @@ class Spread:
     variance: float
     degrees: float
     block: float
-    parts: tuple[Part, ...] = ()
+    parts: Parts = NONE
 
     @classmethod
-    def mean(cls, parts: Sequence[Part]) -> Spread:
+    def mean(cls, parts: Parts) -> Spread:
         """The mean of the variances; degrees say how well its logarithm is known, with the doubt about the reach.
 
         The variance of the logarithm of an estimate of d degrees is about 2 / d; to it is added how far the logarithms
         of the parts lie apart (as in a mean over models: Hoeting et al. 1999, Statistical Science 14).
         """
-        block = max(parts, key=lambda part: part.weight).block
-        weight = np.array([part.weight for part in parts])
-        variance = np.array([part.variance for part in parts])
-        found = float(weight @ variance)
+        if not len(parts.weight):
+            return cls(math.nan, 0.0, 1.0)
+        block = float(parts.block[parts.weight.argmax()])
+        found = float(parts.weight @ parts.variance)
         if not found > 0:
-            return cls(0.0, math.inf, block, tuple(parts))
-        logs = np.log(np.maximum(variance, 1e-3 * found))
-        doubt = 2 / np.array([part.degrees for part in parts]) + (logs - weight @ logs) ** 2
-        return cls(found, 2 / float(weight @ doubt), block, tuple(parts))
+            return cls(0.0, math.inf, block, parts)
+        logs = np.log(np.maximum(parts.variance, 1e-3 * found))
+        doubt = 2 / parts.degrees + (logs - parts.weight @ logs) ** 2
+        return cls(found, 2 / float(parts.weight @ doubt), block, parts)
 
     def with_fewer(self, degrees: float) -> float:
         """The weight of the parts that have fewer degrees of freedom."""
-        return sum(part.weight for part in self.parts if part.degrees < degrees)
+        return float(self.parts.weight[self.parts.degrees < degrees].sum())
 
     def with_more_alike(self, times: float) -> float:
         """The weight of the parts whose variance is more than so many times that of independent cells."""
-        return sum(part.weight for part in self.parts if part.alike > times)
+        return float(self.parts.weight[self.parts.alike > times].sum())
 
 
-@dataclass(frozen=True)
-class _Correlation:
-    """Correlations of cells of a reach: Gaussian or exponential."""
+def spreads(errors: Sequence[Errors], *, modelled: bool = False) -> list[Spread]:
+    """Of the sums over cells of several errors.
 
-    reach: float
-    gaussian: bool
-
-    def __call__(self, distance: Float64) -> Float64:
-        """(G, G) of cells that are so far apart."""
-        if not self.reach:
-            return np.eye(len(distance))
-        far = distance / self.reach
-        correlations: Float64 = np.exp(-0.5 * far**2) if self.gaussian else np.exp(-far)
-        return correlations
-
-
-@dataclass(frozen=True)
-class _Likely:
-    """A correlation by its number, what a cell has for itself, its weight, and the variance of a cell of size 1."""
-
-    number: int
-    alone: float
-    weight: float
-    scatter: float
+    modelled  as the correlation has it, instead of by a kernel: where there are too few blocks for one
+    """
+    found = [Spread(0.0, len(own.cells) - 1.0, 1.0) if len(own.cells) > 1 else Spread.mean(NONE) for own in errors]
+    for arrangement in {id(own.cells.of): own.cells.of for own in errors}.values():
+        some = [k for k, own in enumerate(errors) if own.told and own.cells.of is arrangement]
+        if some:
+            together = _Together(arrangement, [errors[k] for k in some])
+            parts = together.modelled() if modelled else together.by_kernel()
+            for k, own in zip(some, parts, strict=True):
+                found[k] = Spread.mean(own)
+    return found
 
 
-class Arrangement:
-    """Cells of a grid, at (G, D) whole numbers: cubes of space, or groups of frames in their order."""
-
-    def __init__(self, at: npt.NDArray[np.integer]) -> None:
-        self.at = at.astype(np.float64)
-        self.count = len(at)
-        self._far = FAR if at.shape[1] > 1 else 0.0
-        self._known: dict[tuple[int, float, bytes], tuple[float, float, float]] = {}
-        self._kernels: dict[float, Float64] = {}
-
-    @functools.cached_property
-    def _distance(self) -> Float64:
-        distance: Float64 = np.sqrt(((self.at[:, None] - self.at[None]) ** 2).sum(axis=2))
-        return distance
-
-    @functools.cached_property
-    def _correlations(self) -> list[_Correlation]:
-        far = max(self._distance.max(initial=0.0), REACHES[0])
-        reaches = [reach for reach in REACHES if reach <= far]
-        return [_Correlation(0.0, True), *(_Correlation(reach, form) for reach in reaches for form in (False, True))]
-
-    def kernel(self, block: float) -> Float64:
-        """(G, G) in how many of the shifted grids of blocks of that edge, in cells, two cells share a block."""
-        if block not in self._kernels:
-            shared = np.ones((self.count, self.count))
-            for axis in self.at.T:
-                shared *= np.maximum(1.0 - np.abs(axis[:, None] - axis) / block, 0.0)
-            self._kernels[block] = shared
-        return self._kernels[block]
-
-    def mean_kernel(self, parts: Sequence[Part]) -> Float64:
-        """The mean (G, G) of the kernels of parts."""
-        total = np.zeros((self.count, self.count))
-        for part in parts:
-            total += part.weight * self.kernel(part.block)
-        return total
-
-    def spread(self, influence: Float64, size: Float64, *, modelled: bool = False) -> Spread:
-        """Of the sum over cells of influences (G,), which are centred; size (G,) is how much is in each cell.
-
-        modelled  as the correlation has it, instead of by a kernel: where there are too few blocks for one
-        """
-        if self.count < 2:
-            return Spread(math.nan, 0.0, 1.0)
-        if np.abs(influence).max() < ROUNDING:
-            return Spread(0.0, self.count - 1.0, 1.0)
-        with one_thread():
-            parts = (self._modelled if modelled else self._parts)(influence, size)
-        return Spread.mean(parts) if parts else Spread(math.nan, 0.0, 1.0)
-
-    def longest(self, influence: Float64, size: Float64, level: float) -> float:
-        """The reach, in cells, that errors exceed with no more than the weight 1 - level; 0 where they do not reach."""
-        if self.count < 2 or np.abs(influence).max() < ROUNDING:
-            return 0.0
-        with one_thread():
-            weights = self._weights(influence, size)
-        reaches, shares = np.array(sorted((self._correlations[own.number].reach, own.weight) for own in weights)).T
-        return float(reaches[min(np.searchsorted(np.cumsum(shares), level), len(reaches) - 1)])
-
-    def _parts(self, influence: Float64, size: Float64) -> list[Part]:
-        """What the variance is under each reach that is not unlikely, by its kernel."""
-        most, found = carriers(influence), []
-        for own in self._weights(influence, size):
-            block = self._block(own)
-            _, missed, degrees = self._under(own, size)
-            variance = float(influence @ self.kernel(block) @ influence) * missed
-            if variance > 0 and degrees > 0:
-                found.append(Part(own.weight, variance, min(degrees, most), block))
-        total = sum(part.weight for part in found)
-        return [Part(part.weight / total, part.variance, part.degrees, part.block) for part in found]
-
-    def _modelled(self, influence: Float64, size: Float64) -> list[Part]:
-        """The same as its correlation has it."""
-        degrees = min(self.count - 1.0, carriers(influence))
-        alone, found = float((size ** (2 * GROWTH)).sum()), []
-        for own in self._weights(influence, size):
-            total = self._under(own, size)[0]
-            found.append(Part(own.weight, own.scatter * total, degrees, self._block(own), total / alone))
-        return found
-
-    def _block(self, of: _Likely) -> float:
-        return max(1.0, BLOCK * self._correlations[of.number].reach)
-
-    def _under(self, of: _Likely, size: Float64) -> tuple[float, float, float]:
-        """The variance of the sum where that of a cell of size 1 is 1, by how much the kernel falls short of it, and
-        the degrees of freedom of that."""
-        key = (of.number, of.alone, size.tobytes())
-        if key not in self._known:
-            scale = size**GROWTH
-            covariance = (1 - of.alone) * self._correlations[of.number](self._distance) * scale[:, None] * scale
-            covariance[np.diag_indices(self.count)] += of.alone * scale**2
-            seen = _centred(self.kernel(self._block(of)), size) @ covariance
-            total, expected = float(covariance.sum()), float(np.trace(seen))
-            some = expected > 0
-            degrees = expected**2 / float((seen * seen.T).sum()) if some else 0.0
-            if len(self._known) >= MOST_KNOWN:
-                self._known.clear()
-            self._known[key] = total, total / expected if some else math.nan, degrees
-        return self._known[key]
-
-    def _weights(self, influence: Float64, size: Float64) -> list[_Likely]:
-        """How likely each correlation is (REML)."""
-        scale = size**GROWTH
-        seen, mean = influence / scale, size / scale
-        number, alone, whitens, logs, before = self._alternatives
-        a, b = np.moveaxis(whitens @ np.stack([seen, mean], axis=1), -1, 0)
-        within = (b * b).sum(axis=1)
-        left = (a * a).sum(axis=1) - (a * b).sum(axis=1) ** 2 / within
-        some = np.flatnonzero(left > 0)
-        log = logs[some] + np.log(within[some]) + (self.count - 1) * np.log(left[some])
-        likely = before[some] - 0.5 * log
-        weight = np.exp(likely - likely.max(initial=-math.inf))
-        weight = np.where(weight < UNLIKELY * weight.sum(), 0.0, weight)
-        found = zip(number[some], alone[some], weight / weight.sum(), left[some] / (self.count - 1), strict=True)
-        return [_Likely(int(k), float(own), float(w), float(scatter)) for k, own, w, scatter in found if w > 0]
-
-    @functools.cached_property
-    def _alternatives(self) -> tuple[npt.NDArray[np.int64], Float64, Float64, Float64, Float64]:
-        """Numbers of correlations (A,), with what a cell has for itself (A,).
-
-        Then what makes cells that correlate so independent (A, G, G), the logarithms of the determinants of their
-        covariances (A,) and what counts besides (A,).
-        """
-        from scipy.linalg.lapack import dtrtri
-
-        pairs = [
-            (number, alone)
-            for number, correlation in enumerate(self._correlations)
-            for alone in (ALONE if correlation.reach else (0.0,))
-        ]
-        number, alone = np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
-        whitens, logs = np.empty((len(pairs), self.count, self.count)), np.empty(len(pairs))
-        for own, (k, part) in enumerate(pairs):
-            covariance = (1 - part) * self._correlations[k](self._distance)
-            covariance[np.diag_indices(self.count)] += part + SINGULAR
-            factor = np.linalg.cholesky(covariance)
-            logs[own] = 2 * np.log(np.diag(factor)).sum()
-            whitens[own] = dtrtri(factor, lower=1)[0]
-        reach = np.array([of.reach for of in self._correlations])[number]
-        before = self._far * np.log(np.maximum(reach, REACHES[0])) - np.where(alone > 0, DOUBT, 0.0)
-        return number, alone, whitens, logs, before
+def longest(errors: Errors, level: float) -> float:
+    """The reach, in cells, that errors exceed with no more than the weight 1 - level; 0 where they do not reach."""
+    if not errors.told:
+        return 0.0
+    arrangement = errors.cells.of
+    with one_thread():
+        weight, reach = _Together(arrangement, [errors]).weight[:, 0], arrangement.reach[arrangement.number]
+    some = np.flatnonzero(weight)  # alternatives are in the order of their reaches
+    at = int(np.searchsorted(np.cumsum(weight[some]), level))
+    return float(reach[some[min(at, len(some) - 1)]])
 
 
-@functools.lru_cache(maxsize=4)
-def _arrangement(at: bytes, axes: int) -> Arrangement:
-    return Arrangement(np.frombuffer(at, dtype=np.int64).reshape(-1, axes))
+class _Together:
+    """Errors (N,) of cells of one arrangement; matrices have zeros where cells are not theirs.
 
+    weight   (A, N) of each alternative
+    scatter  (A, N) the variance of a cell of size 1 under it
+    """
 
-def arrangement(at: npt.NDArray[np.integer]) -> Arrangement:
-    """Of cells at (G, D); the last few are at hand, as many numbers of one map are asked for."""
-    return _arrangement(np.ascontiguousarray(at, dtype=np.int64).tobytes(), at.shape[1])
+    def __init__(self, arrangement: Arrangement, errors: Sequence[Errors]) -> None:
+        self._of = arrangement
+        self._count = np.array([len(own.cells) for own in errors])
+        shape = len(errors), len(arrangement.at)
+        self._influence, self._size = np.zeros(shape), np.zeros(shape)
+        for k, own in enumerate(errors):
+            self._influence[k, : len(own.cells)] = own.influence[own.cells.order]
+            self._size[k, : len(own.cells)] = own.size[own.cells.order]
+        self._scale = self._size**GROWTH
+        self.weight, self.scatter = self._likely()
+
+    def _likely(self) -> tuple[Float64, Float64]:
+        """How likely each alternative is (REML)."""
+        of, there = self._of, self._size > 0
+        seen = np.divide(self._influence, self._scale, out=np.zeros_like(self._scale), where=there)
+        mean = np.divide(self._size, self._scale, out=np.zeros_like(self._scale), where=there)
+        white = of.whitened(np.concatenate([seen, mean])).reshape(len(of.number), 2, *there.shape) * there
+        a, b = white[:, 0], white[:, 1]
+        within = (b * b).sum(axis=2)
+        left = (a * a).sum(axis=2) - (a * b).sum(axis=2) ** 2 / within
+        reach = of.reach[of.number]
+        far = np.maximum([of.far(count) for count in self._count], REACHES[0])
+        some = (left > 0) & (reach[:, None] <= far)
+        log = of.logarithms(self._count) + np.log(within) + (self._count - 1) * np.log(np.where(some, left, 1.0))
+        before = np.where(of.alone > 0, -DOUBT, 0.0)
+        if of.at.shape[1] > 1:
+            before += FAR * np.log(np.maximum(reach, REACHES[0]))
+        likely = np.where(some, before[:, None] - 0.5 * log, -math.inf)
+        weight = np.exp(likely - np.maximum(likely.max(axis=0), -1e300))
+        weight[weight < UNLIKELY * weight.sum(axis=0)] = 0.0
+        return weight / np.maximum(weight.sum(axis=0), 1.0), left / (self._count - 1)
+
+    def by_kernel(self) -> list[Parts]:
+        """What the variances are under each reach that is not unlikely, by its kernel."""
+        block = self._of.blocks[self._of.number]
+        plain = np.zeros_like(self.weight)
+        for edge in set(block[self.weight.any(axis=1)].tolist()):
+            plain[block == edge] = ((self._influence @ self._of.kernel(edge)) * self._influence).sum(axis=1)
+        return [self._by_kernel(k, plain[:, k]) for k in range(len(self._count))]
+
+    def _by_kernel(self, k: int, plain: Float64) -> Parts:
+        of, some, size = self._of, np.flatnonzero((self.weight[:, k] > 0) & (plain > 0)), self._size[k]
+        total, expected, square = of.moments(of.number[some], size[: self._count[k]]).at(of.alone[some])
+        there = expected > 0
+        some, total, expected, square = some[there], total[there], expected[there], square[there]
+        weight, degrees = self.weight[some, k], np.minimum(expected**2 / square, carriers(self._influence[k]))
+        variance = plain[some] * total / expected
+        return Parts(weight / weight.sum(), variance, degrees, of.blocks[of.number[some]], np.ones(len(some)))
+
+    def modelled(self) -> list[Parts]:
+        """The same as the correlations have it."""
+        of, alone = self._of, (self._scale**2).sum(axis=1)
+        alike = ((of.correlations @ self._scale.T) * self._scale.T).sum(axis=1)[of.number]
+        share = of.alone[:, None]
+        total = (1 - share) * alike + share * alone
+        most = [min(count - 1.0, carriers(own)) for count, own in zip(self._count, self._influence, strict=True)]
+        parts = []
+        for k, degrees in enumerate(most):
+            some = np.flatnonzero(self.weight[:, k])
+            variance, block = self.scatter[some, k] * total[some, k], of.blocks[of.number[some]]
+            parts.append(
+                Parts(self.weight[some, k], variance, np.full(len(some), degrees), block, total[some, k] / alone[k])
+            )
+        return parts
 
 
 @functools.cache
@@ -294,11 +225,3 @@ def carriers(influence: Float64) -> float:
     """How many cells carry the variance, less one: all of them where influences are normal, 2 where one is all."""
     fourth = float((influence**4).sum())
     return 3 * float((influence**2).sum()) ** 2 / fourth - 1 if fourth > 0 else math.inf
-
-
-def _centred(kernel: Float64, size: Float64) -> Float64:
-    """M' K M, where M takes the mean out: of each cell, as much as it holds."""
-    share = size / size.sum()
-    left = kernel @ share
-    centred: Float64 = kernel - left[:, None] - left[None] + share @ left
-    return centred

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.ranks import added, distinct_rows
-from semstab.statistics.sampling.collect import cells_of
+from semstab.statistics.ranks import distinct_rows, numbered, ranked
+from semstab.statistics.sampling.collect import frame_groups
+from semstab.statistics.sampling.cubes import cells_of
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
 
@@ -21,7 +22,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 AT_ONCE = 1 << 21
-"""Observations that are looked at together."""
+"""Sums that are made together."""
 
 SEEN, MOST, WRONG = 4, 5, 6
 """Columns of the keys, after cube and frame."""
@@ -51,21 +52,16 @@ class StableLooks:
         T, wrong = some.op.astype(np.int64), dominant(some) != true_label[counted]
         longest = int(T.max(initial=0)) + 1
         packed = ((of * longest + T) * longest + np.rint(vss(some) * T).astype(np.int64)) * 2 + wrong
-        kinds, kind = np.unique(packed, return_inverse=True)
+        kinds, kind = numbered(packed)
         pairs, is_wrong = np.divmod(kinds, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
         keys = np.column_stack([cell[ofs], np.full(len(kinds), -1), *np.divmod(votes, longest), is_wrong])
         if events is None:
             return cls(keys.astype(np.int32), np.bincount(kind, minlength=len(kinds)).astype(np.float64), edge, 0)
-        groups = int(events.frame.max(initial=0)) // step + 1
-        bounds = np.searchsorted(np.cumsum(T), np.arange(AT_ONCE, T.sum(), AT_ONCE))
-        parts = []
-        for rows in np.split(np.arange(len(T)), bounds):
-            group = _frames_of(events, counted[rows], T[rows]) // step
-            parts.append(added(np.repeat(kind[rows], T[rows]) * groups + group, np.repeat(1.0 / T[rows], T[rows])))
-        key, weight = added(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-        own = keys[key // groups]
-        own[:, 3] = key % groups
+        groups, group = frame_groups(events.frame, step)
+        key, weight = _by_frame(events, counted, kind, group, len(groups))
+        own = keys[key // max(len(groups), 1)]
+        own[:, 3] = groups[key % max(len(groups), 1)]
         return cls(own.astype(np.int32), weight, edge, step)
 
     @classmethod
@@ -97,11 +93,23 @@ class StableLooks:
         ).coarsened(sums.edge, sums.step)
 
 
-def _frames_of(events: Events, voxels: Int64, T: Int64) -> Int64:
-    """The frames that saw these voxels (n,), T each, one after the other."""
-    of = np.repeat(np.arange(len(T)), T)
-    frames: Int64 = events.frame[np.arange(len(of)) + (events.starts[voxels] - np.cumsum(T) + T)[of]].astype(np.int64)
-    return frames
+def _by_frame(events: Events, voxels: Int64, kind: Int64, group: Int64, groups: int) -> tuple[Int64, Float64]:
+    """What kinds (n,) of voxels which groups (m,) of frames saw: kind * groups + group, and how many places these are.
+
+    A place counts 1 / T for each of its T frames.
+    """
+    from semstab.statistics.loops.cubes import add_looks
+
+    starts, ends, order = events.starts[voxels], events.bounds[1:][voxels], ranked(kind)
+    step, kinds, found = max(1, AT_ONCE // max(groups, 1)), int(kind.max(initial=-1)) + 1, [(kind[:0], np.zeros(0))]
+    for first in range(0, kinds, step):
+        low, high = np.searchsorted(kind, [first, first + step], sorter=order)
+        total = np.zeros(min(step, kinds - first) * groups)
+        add_looks(order[low:high], kind, first, starts, ends, group, groups, total)
+        key = np.flatnonzero(total)
+        found.append((key + first * groups, total[key]))
+    keys, weights = zip(*found, strict=True)
+    return np.concatenate(keys), np.concatenate(weights)
 
 
 def _distinct(key: npt.NDArray[np.int32], weight: Float64) -> tuple[npt.NDArray[np.int32], Float64]:

@@ -5,6 +5,6 @@ stable, and into which cubes space is cut. With that the second one is taken.
 """
 
 from semstab.statistics.sums.first import FirstSums, first_look
-from semstab.statistics.sums.second import SecondSums, Whole, second_look
+from semstab.statistics.sums.second import Overall, SecondSums, Whole, second_look
 
-__all__ = ["FirstSums", "SecondSums", "Whole", "first_look", "second_look"]
+__all__ = ["FirstSums", "Overall", "SecondSums", "Whole", "first_look", "second_look"]

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import row_chunks
-from semstab.model.measures import Beliefs, Rows
+from semstab.model.evidence import stretches
+from semstab.model.measures import Beliefs, Voxels
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
-from semstab.statistics.map_sums import Maps, mean_columns
+from semstab.statistics.map_sums import Maps
 from semstab.statistics.order import fusion_rules
 from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns
 from semstab.statistics.order.p_values import PValues
@@ -53,23 +53,21 @@ class LogSums:
         changes: Flips,
         truth: Truth | None,
         seed: int,
-        edge: float,
+        places: Places,
     ) -> LogSums:
-        """Of a table, with cubes of that edge in metres."""
-        again = table.op >= 2
-        places = Places(table.index[again], table.voxel_size, edge)
-        trend = trend_columns(table, drift)
+        """Of a table, with the cubes of its voxels with OP >= 2."""
+        rows, trend = trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
             "flip_null": changes.null,
             "flip_excess": changes.rate - changes.null,
             "frames_since": changes.since,
         }
-        columns = {name: mean_columns(values) for name, values in means.items()}
-        columns["trend_excess"] = np.stack([trend[:, 0] - trend[:, 1], trend[:, 2]], axis=1)
+        trends = places.rows(rows).sums(trend)
+        excess = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
         return cls(
-            PlaceSums(places.cell, places.edge, {name: places.sums(own[again]) for name, own in columns.items()}),
-            trend.sum(axis=0),
+            PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
+            trends.sum(axis=0),
             PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
             _rules(table, events, truth),
             *sampled(table, events, seed),
@@ -114,16 +112,19 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
 
 
 def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
-    """(R, 2 + C), of beliefs that are dense a few at a time."""
-    again, usual, rows = table.op >= 2, fusion_rules.labels(table.evidence), []
+    """(R, 2 + C), over the voxels with OP >= 2, some after the others."""
     _, *others = fusion_rules.RULES  # the map's own rule is the first
-    by_rule: list[Beliefs] = [table, *fusion_rules.fuse_all(events, others, evidence=table.evidence)]
-    for fused in by_rule:
-        total = np.zeros(())
-        for some in row_chunks(*fused.evidence.shape):
-            dense, where = Rows(fused.op[some], fused.evidence[some], fused.drift_sum[some]), again[some]
-            relabelled = (fusion_rules.labels(dense.evidence) != usual[some])[where]
-            own = rule_sums(dense, where, None if truth is None else Truth(truth.known[some], truth.label[some]))
-            total = total + np.concatenate([[relabelled.sum(), len(relabelled)], own])
-        rows.append(total)
-    return np.stack(rows)
+    total, seen = np.zeros(()), np.flatnonzero(table.op >= 2)
+    for some in stretches(len(seen)):
+        own = seen[some]
+        part = Voxels(table.op[own], table.evidence.take(own), table.drift_sum[own])
+        usual, every = fusion_rules.labels(part.evidence), np.ones(len(own), np.bool_)
+        known = None if truth is None else Truth(truth.known[own], truth.label[own])
+        by_rule: list[Beliefs] = [part]
+        by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
+        rows = []
+        for fused in by_rule:
+            relabelled = np.count_nonzero(fusion_rules.labels(fused.evidence) != usual)
+            rows.append(np.concatenate([[relabelled, len(own)], rule_sums(fused, every, known)]))
+        total = total + np.stack(rows)
+    return total

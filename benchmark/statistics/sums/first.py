@@ -10,15 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.summary import STRATA
-from semstab.model.measures import dominant
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.array_form import from_arrays, to_arrays
 from semstab.statistics.blocks import Occupied
-from semstab.statistics.correctness import Judged, Truth, judged_sums, stratum_sums
+from semstab.statistics.correctness import Judged, Truth, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
-from semstab.statistics.map_sums import Maps, MapSums, mean_columns
+from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.order.drift import flips, voxel_drift
-from semstab.statistics.sampling import Places, PlaceSums
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums
 from semstab.statistics.sampling.stable_looks import StableLooks
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
@@ -43,17 +42,22 @@ class TruthSums:
 
     @classmethod
     def of(
-        cls, table: VoxelTable, events: Events | None, truth: Truth, edges: Sequence[int], sums: MapSums
+        cls,
+        table: VoxelTable,
+        events: Events | None,
+        truth: Truth,
+        edges: Sequence[int],
+        places: Places,
+        influence: InfluenceSums,
     ) -> TruthSums:
-        """Of a table whose other sums these are."""
-        again, counted = table.op >= 2, truth.known & (table.op >= 2)
-        places = Places(table.index[again], table.voxel_size, sums.places.edge)
-        right = mean_columns(np.where(truth.known, dominant(table) == truth.label, np.nan))
+        """Of a table whose other sums these are, with the cubes of its voxels with OP >= 2."""
+        judged = Judged.of(table.evidence, truth.label)
+        right = {"right": np.where(truth.known, judged.right, np.nan)}
         return cls(
-            PlaceSums(places.cell, places.edge, {"right": places.sums(right[again])}),
-            stratum_sums(table, truth, edges),
-            judged_sums(Judged.of(table.evidence.take(counted), truth.label[counted])),
-            StableLooks.of(table, events, truth.label, sums.influence.edge, sums.influence.step),
+            PlaceSums(places.cell, places.edge, places.means(right)),
+            judged_strata(judged, table.op, truth.known, edges),
+            judged_where(judged, truth.known & (table.op >= 2)),
+            StableLooks.of(table, events, truth.label, influence.edge, influence.step),
         )
 
     @classmethod
@@ -123,20 +127,24 @@ def first_look(
 
     See `analyse` for what it takes.
     """
+    table = table.measured()
     drift = None if events is None else voxel_drift(table, events, seed=seed, sample=0)
     label = None if truth is None else truth.label
     null = None if drift is None else drift.null
     own = MapSums.of(table, edges, events=events, true_label=label, null=null)
+    if events is None and truth is None and limit is None:
+        return FirstSums(own, Votes.of(table)), {}, None
+    places = Places.of(table, own.places.edge)
     log, more = None, {}
     if events is not None and drift is not None:
         changes = flips(events)
-        log = LogSums.of(table, events, drift, changes, truth, seed, own.places.edge)
+        log = LogSums.of(table, events, drift, changes, truth, seed, places)
         more = log_maps(drift, changes)
     found = FirstSums(
         own,
         Votes.of(table),
         log,
-        None if truth is None else TruthSums.of(table, events, truth, edges, own),
+        None if truth is None else TruthSums.of(table, events, truth, edges, places, own.influence),
         None if limit is None else Occupied.of(table.index[repeated(table, limit)[0]]),
     )
     return found, more | ({} if truth is None else {"true_label": truth.label}), null

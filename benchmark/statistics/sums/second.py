@@ -12,12 +12,12 @@ from semstab.metrics.matching import shared_rows
 from semstab.model.statistics import DriftTests
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.correctness import Truth, quadrant_sums, stable_wrong
+from semstab.statistics.correctness import Truth, quadrant_sums, wrong_of_steady
 from semstab.statistics.judging.ceiling import loss_sums
 from semstab.statistics.judging.flipping import FlippingSums
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order.drift import TESTABLE
-from semstab.statistics.order.p_values import benjamini_hochberg
+from semstab.statistics.order.p_values import PValues, benjamini_hochberg
 from semstab.statistics.ranks import distinct_rows
 from semstab.statistics.sampling import InfluenceSums, PlaceSums
 from semstab.statistics.steady import Votes, steady
@@ -48,16 +48,64 @@ class SecondSums:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class RareOrders:
+    """Whose order of observations is rare, of all voxels of a map.
+
+    table  the voxels whose SBD was tested, p (n,) how likely it is by chance, q (n,) the same as false discoveries
+    trend  p-values of the trends
+    """
+
+    table: VoxelTable
+    p: Float64
+    q: Float64
+    trend: PValues
+
+    def maps(self, table: VoxelTable, maps: Maps) -> Maps:
+        """Of a part, from what its first look says of each voxel (n,)."""
+        rows, drawn = shared_rows(table, self.table)
+        p, q = maps["drift_p"].copy(), np.full(len(table), np.nan)
+        p[rows], q[rows] = self.p[drawn], self.q[drawn]
+        tested = np.where(table.op >= TESTABLE, maps["trend_p"], np.nan)
+        return {"drift_p": p, "drift_q": q, "trend_q": self.trend.adjusted(tested)}
+
+
+@dataclass(frozen=True, eq=False)
+class Overall:
+    """What the second look at a part takes from all of them: little, so that it can be sent to who takes it.
+
+    shares     how often the dominant class is seen, over all places: see `steady`
+    edge       of the cubes of its places, metres
+    loss_edge  of those of a ceiling, voxels; None without one
+    true       whether ground truth is known
+    orders     with a log
+    """
+
+    shares: Float64
+    edge: float
+    loss_edge: int | None
+    true: bool
+    orders: RareOrders | None
+
+    def maps(self, table: VoxelTable, maps: Maps) -> Maps:
+        """Of a part, from what its first look says of each voxel (n,), what hangs on all: which orders are rare."""
+        return {} if self.orders is None else self.orders.maps(table, maps)
+
+
 class Whole:
     """What the first look at all parts of a map tells of it: how likely places are stable, which orders are rare."""
 
     def __init__(self, first: FirstSums, seed: int = 0) -> None:
         self.first, self.seed = first, seed
-        self.shares = first.votes.shares()
         self.loss_edge = None if first.limited is None else first.limited.edge()
+        orders = None
         if first.log is not None:
-            self.order, self._drift_p = first.log.tested(seed)
-            self._drift_q = benjamini_hochberg(np.where(first.log.table.op >= TESTABLE, self._drift_p, np.nan))
+            self.order, p = first.log.tested(seed)
+            q = benjamini_hochberg(np.where(first.log.table.op >= TESTABLE, p, np.nan))
+            orders = RareOrders(first.log.table, p, q, first.log.p)
+        self.overall = Overall(
+            first.votes.shares(), first.own.places.edge, self.loss_edge, first.truth is not None, orders
+        )
 
     @property
     def influence(self) -> InfluenceSums:
@@ -67,12 +115,13 @@ class Whole:
 
     def _likely(self, seen: Int64, most: Int64) -> Float64:
         pairs, of = distinct_rows(np.stack([seen, most], axis=1))  # many places have the same
-        return Votes(pairs[:, 0], pairs[:, 1], np.ones(len(pairs), np.int64)).stable(self.shares)[of]
+        return Votes(pairs[:, 0], pairs[:, 1], np.ones(len(pairs), np.int64)).stable(self.overall.shares)[of]
 
     def drift_tests(self) -> DriftTests:
         """Of a map with its log."""
-        log = self.first.log
+        log, orders = self.first.log, self.overall.orders
         assert log is not None
+        assert orders is not None
         one_way, by_chance, all_of_it = log.trend
         with np.errstate(invalid="ignore", divide="ignore"):
             trend, null = (float(part / all_of_it) if all_of_it else np.nan for part in (one_way, by_chance))
@@ -85,33 +134,23 @@ class Whole:
             stretches=self.order.stretches,
             voxels=self.order.voxels,
             tested_voxels=int(log.p.count.sum()),
-            unusual_sbd_voxels=int(np.count_nonzero(self._drift_q <= FALSE_DISCOVERIES)),
+            unusual_sbd_voxels=int(np.count_nonzero(orders.q <= FALSE_DISCOVERIES)),
             trending_voxels=log.p.found(FALSE_DISCOVERIES),
         )
 
-    def maps(self, table: VoxelTable, maps: Maps) -> Maps:
-        """Of a part, from what its first look says of each voxel (n,), what hangs on all: which orders are rare."""
-        log = self.first.log
-        if log is None:
-            return {}
-        rows, drawn = shared_rows(table, log.table)
-        p, q = maps["drift_p"].copy(), np.full(len(table), np.nan)
-        p[rows], q[rows] = self._drift_p[drawn], self._drift_q[drawn]
-        tested = np.where(table.op >= TESTABLE, maps["trend_p"], np.nan)
-        return {"drift_p": p, "drift_q": q, "trend_q": log.p.adjusted(tested)}
-
 
 def second_look(
-    table: VoxelTable, whole: Whole, truth: Truth | None = None, limit: VoxelTable | None = None
+    table: VoxelTable, overall: Overall, truth: Truth | None = None, limit: VoxelTable | None = None
 ) -> tuple[SecondSums, Maps]:
     """The sums of a part, a table, and which of its voxels are stable, and wrong."""
-    stable, edge = steady(table, whole.shares), whole.first.own.places.edge
+    table = table.measured()
+    stable, edge = steady(table, overall.shares), overall.edge
     maps: Maps = {"stable": stable}
     if truth is not None:
-        maps["stable_wrong"] = stable_wrong(table, truth, whole.shares)
+        maps["stable_wrong"] = wrong_of_steady(table, truth, stable)
     found = SecondSums(
         FlippingSums.of(table, stable, edge),
         None if truth is None else quadrant_sums(table, truth, stable, edge),
-        None if limit is None or whole.loss_edge is None else loss_sums(table, limit, whole.loss_edge),
+        None if limit is None or overall.loss_edge is None else loss_sums(table, limit, overall.loss_edge),
     )
     return found, maps

@@ -58,7 +58,7 @@ class OnCommonPlaces:
         if not len(rows[0]):
             return None
         first = next(iter(tables.values()))
-        places = Places(first.index[rows[0]], first.voxel_size)
+        places = Places.of(first.rows(rows[0]), where=np.ones(len(rows[0]), np.bool_))
         sums = {}
         for (name, table), own in zip(tables.items(), rows, strict=True):
             where = np.zeros(len(table), dtype=np.bool_)

@@ -1,0 +1,73 @@
+"""Compiled loops over rows of evidence: one pass over their entries where NumPy takes many over dense rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from semstab.runtime.compiled import serial
+
+
+@serial
+def concentrate(
+    starts: Any,
+    label: Any,
+    weight: Any,
+    rest: Any,
+    K: int,
+    largest: Any,
+    lead: Any,
+    bits: Any,
+    dominant: Any,
+    squares: Any,
+) -> None:
+    """Fill largest, lead, bits, dominant and squares (n,), see `Concentration`.
+
+    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty.
+    """
+    for i in range(starts.shape[0] - 1):
+        first, end = starts[i], starts[i + 1]
+        unseen = rest[i] if rest.shape[0] else 0.0
+        others = K - (end - first)
+        total, square = others * unseen, others * unseen * unseen
+        top, second, best, gap = -1.0, 0.0, 0, 0
+        for e in range(first, end):
+            w = weight[e] if weight[e] != 0.0 else unseen
+            total += w
+            square += w * w
+            if w > top:
+                second, top, best = max(top, 0.0), w, label[e]
+            elif w > second:
+                second = w
+            gap += 1 if label[e] == gap else 0  # the lowest class without an entry
+        if others > 0:
+            if unseen > top or (unseen == top and gap < best):
+                second, top, best = (unseen if others > 1 else max(top, 0.0)), unseen, gap
+            elif unseen > second:
+                second = unseen
+        squares[i], dominant[i] = square, best
+        largest[i], lead[i], bits[i] = top / total, top / total - second / total, 0.0
+        if end - first > 1 or unseen > 0.0:
+            spread = 0.0
+            for e in range(first, end):
+                p = (weight[e] if weight[e] != 0.0 else unseen) / total
+                if p > 0.0:
+                    spread -= p * np.log2(p)
+            if unseen > 0.0 and others > 0:
+                spread -= others * (unseen / total) * np.log2(unseen / total)
+            bits[i] = max(spread, 0.0)
+
+
+@serial
+def add_by_group(group: Any, values: Any, sums: Any, defined: Any) -> None:
+    """Add values (C, n) that are not NaN to the row of sums (G, C) of each group (n,), and count them; -1 is none."""
+    for i in range(group.shape[0]):
+        g = group[i]
+        if g < 0:
+            continue
+        for c in range(values.shape[0]):
+            value = values[c, i]
+            known = value == value  # noqa: PLR0124 - NaN is not
+            sums[g, c] += value if known else 0.0
+            defined[g, c] += 1.0 if known else 0.0

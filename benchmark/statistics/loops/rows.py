@@ -1,0 +1,147 @@
+"""Compiled loops over the rows of a voxel table: sums by cube and by class, beliefs beside the true classes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.runtime.compiled import serial
+
+
+@serial
+def add_classes(of, evidence, op, by_look, by_place):
+    """Add the evidence (starts, label, weight) of voxels to (G, K) by their cube of (n,), -1 is none; and that / OP."""
+    starts, label, weight = evidence
+    for i in range(of.shape[0]):
+        if of[i] >= 0:
+            share = 1.0 / op[i]
+            for e in range(starts[i], starts[i + 1]):
+                by_look[of[i], label[e]] += weight[e]
+                by_place[of[i], label[e]] += share * weight[e]
+
+
+@serial
+def add_class_sums(evidence, op, exact, bounds, log, sums):
+    """Add to sums (5, K), over voxels with OP >= 2: evidence, that / OP, disagreement, that * OP, squares.
+
+    Where exact (n,) holds the evidence is the sum of its squares too, else the log tells, whose rows bounds (n + 1,)
+    are a voxel's. Classes that nobody saw in a voxel are no disagreement there.
+    """
+    starts, label, weight = evidence
+    squares = np.zeros(sums.shape[1])
+    for i in range(op.shape[0]):
+        T = np.float64(op[i])
+        if T < 2.0:
+            continue
+        if not exact[i]:
+            for e in range(log[0][bounds[i]], log[0][bounds[i + 1]]):
+                squares[log[1][e]] += log[2][e] * log[2][e]
+        for entry in range(starts[i], starts[i + 1]):
+            k, own = label[entry], weight[entry]
+            square = own if exact[i] else squares[k]
+            apart = 2.0 * ((T - 1.0) * own - own * own + square) / (T * (T - 1.0))
+            sums[0, k] += own
+            sums[1, k] += own / T
+            sums[2, k] += apart
+            sums[3, k] += T * apart
+            sums[4, k] += square
+            squares[k] = 0.0
+
+
+@serial
+def square_errors(evidence, rest, K, truth, errors):
+    """Squared distance (n,) of each belief from certainty of the true class (n,); rest as in `concentrate`."""
+    starts, label, weight = evidence
+    for i in range(truth.shape[0]):
+        unseen, others = (rest[i] if rest.shape[0] else 0.0), K - (starts[i + 1] - starts[i])
+        total, error, hit = others * unseen, 0.0, False
+        for e in range(starts[i], starts[i + 1]):
+            total += weight[e] if weight[e] != 0.0 else unseen
+        for e in range(starts[i], starts[i + 1]):
+            p = (weight[e] if weight[e] != 0.0 else unseen) / total
+            if label[e] == truth[i]:
+                p, hit = p - 1.0, True
+            error += p * p
+        p = unseen / total
+        if others > 0:
+            error += (others - 1) * p * p + (p * p if hit else (p - 1.0) * (p - 1.0))
+        errors[i] = error
+
+
+@serial
+def add_judged(group, label, predicted, confidence, error, bins, sums):
+    """Add to the row of sums (G, 3 + 3 bins + 3 K) of each voxel's group (n,), -1 is none: see `judged_sums`."""
+    K = (sums.shape[1] - 3 - 3 * bins) // 3
+    for i in range(group.shape[0]):
+        g = group[i]
+        if g < 0:
+            continue
+        right = 1.0 if predicted[i] == label[i] else 0.0
+        at = 3 + min(max(np.int64(np.ceil(confidence[i] * bins - 1e-9)) - 1, 0), bins - 1)
+        kind = 3 + 3 * bins
+        sums[g, 0] += 1.0
+        sums[g, 1] += right
+        sums[g, 2] += error[i]
+        sums[g, at] += 1.0
+        sums[g, at + bins] += confidence[i]
+        sums[g, at + 2 * bins] += right
+        sums[g, kind + label[i]] += right
+        sums[g, kind + K + label[i]] += 1.0
+        sums[g, kind + 2 * K + predicted[i]] += 1.0
+
+
+@serial
+def add_pairs(evidence, op, weights, pairs):
+    """Add to pairs (K, K), above the diagonal, how often two looks at a voxel are of two classes; NaN is no weight."""
+    starts, label, weight = evidence
+    for i in range(op.shape[0]):
+        if starts[i + 1] - starts[i] > 1 and weights[i] > 0.0:
+            for a in range(starts[i], starts[i + 1]):
+                share = weights[i] * (weight[a] / op[i])
+                for b in range(a + 1, starts[i + 1]):
+                    pairs[label[a], label[b]] += share * (weight[b] / op[i])
+
+
+@serial
+def label_near(evidence, rest, K, near, found):
+    """The lowest class (n,) whose belief is within `near` of the largest; rest as in `concentrate`."""
+    starts, label, weight = evidence
+    for i in range(found.shape[0]):
+        first, end = starts[i], starts[i + 1]
+        unseen, others = (rest[i] if rest.shape[0] else 0.0), K - (end - first)
+        total, top, gap = others * unseen, (unseen if others > 0 else 0.0), 0
+        for e in range(first, end):
+            w = weight[e] if weight[e] != 0.0 else unseen
+            total, top = total + w, max(top, w)
+            gap += 1 if label[e] == gap else 0  # the lowest class without an entry
+        least = top / total - near
+        best = gap if others > 0 and unseen / total >= least else K
+        for e in range(first, end):
+            if label[e] < best and (weight[e] if weight[e] != 0.0 else unseen) / total >= least:
+                best = label[e]
+        found[i] = best
+
+
+@serial
+def add_apart(of, evidence, op, shares, apart):
+    """Add to (G, K) by the voxels' cubes (n,), -1 is none: one-hot evidence, and how far apart looks are in a class.
+
+    The latter counts for each look: 2 ((T - 1) e - e^2 + squares) / (T - 1).
+    """
+    starts, label, weight = evidence
+    for i in range(of.shape[0]):
+        if of[i] >= 0:
+            for e in range(starts[i], starts[i + 1]):
+                own, others = weight[e], op[i] - 1.0
+                shares[of[i], label[e]] += own
+                apart[of[i], label[e]] += 2.0 * (others * own - own * own + own) / others
+
+
+@serial
+def weight_of(evidence, wanted, found):
+    """The evidence (n,) of one class of each voxel, 0 where it has none."""
+    starts, label, weight = evidence
+    for i in range(wanted.shape[0]):
+        found[i] = 0.0
+        for e in range(starts[i], starts[i + 1]):
+            if label[e] == wanted[i]:
+                found[i] = weight[e]
