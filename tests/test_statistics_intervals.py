@@ -25,6 +25,7 @@ from semstab.statistics.sampling import (
     unpaired,
     value,
 )
+from semstab.statistics.sampling.arrangement import arranged
 
 
 def sums_from(labels, side, voxel_size=0.125):
@@ -149,6 +150,20 @@ def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
         for field in ("value", "low", "high", "degrees", "block_size"):
             assert getattr(found, field) == pytest.approx(getattr(alone, field), rel=1e-9, nan_ok=True)
         assert found.undecided == alone.undecided
+
+
+def test_the_order_of_cells_does_not_depend_on_what_was_asked_before():
+    """Else the last bits of an interval would."""
+    large = np.random.default_rng(0).permutation(np.stack(np.divmod(np.arange(30), 6), axis=1))
+    small = large[:20]
+    for far in range(20):  # whatever is at hand from before is gone
+        arranged([large + far])
+    (alone,) = arranged([small])
+    with_more = arranged([large, small[::2], small])[2]
+    (again,) = arranged([small])
+    assert not np.array_equal(with_more.of.at, alone.of.at)
+    np.testing.assert_array_equal(again.of.at, alone.of.at)
+    np.testing.assert_array_equal(again.order, alone.order)
 
 
 # --- Differences ------------------------------------------------------------------------------------------------------

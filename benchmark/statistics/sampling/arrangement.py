@@ -31,7 +31,7 @@ MOST_KNOWN = 2048
 """So many moments of an arrangement are kept for the next number of the same map."""
 
 KEPT = 4
-"""Arrangements that are at hand: many numbers of one map are asked for."""
+"""So many times what was asked for together is kept: of one map the same cells are asked for again and again."""
 
 AT_ONCE = 2**18
 """Numbers in the matrices that are worked on together."""
@@ -196,22 +196,22 @@ def _stretches(count: int, cells: int) -> Iterator[slice]:
 
 # --- Cells of several numbers -----------------------------------------------------------------------------------------
 
-_recent: tuple[dict[bytes, Cells], ...] = ()
-
 
 def arranged(sets: Sequence[npt.NDArray[np.integer]]) -> list[Cells]:
     """Sets of cells, each (n, D), none of them twice: those that hold others share an arrangement with them.
 
-    The last few arrangements are at hand.
+    What was asked for lately is at hand. The order of an arrangement's cells, and with it how sums round, depends on
+    the sets alone, never on what was asked before.
     """
-    global _recent  # noqa: PLW0603 - as a cache
-    asked = {_key(own): own for own in sets}
-    known = {key: own for nest in _recent for key, own in nest.items()}
-    made = tuple(_nested(nest) for nest in _nests({key: own for key, own in asked.items() if key not in known}))
-    _recent = (*made, *_recent)[:KEPT]
-    for nest in made:
-        known |= nest
-    return [known[key] for key in map(_key, sets)]
+    keys = [_key(own) for own in sets]
+    known = _made(tuple(dict.fromkeys(keys)))
+    return [known[key] for key in keys]
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _made(keys: tuple[bytes, ...]) -> dict[bytes, Cells]:
+    nests = _nests({key: np.frombuffer(key[1:], np.int64).reshape(-1, key[0]) for key in keys})
+    return {key: own for nest in nests for key, own in _nested(nest).items()}
 
 
 def _key(cells: npt.NDArray[np.integer]) -> bytes:
