@@ -12,7 +12,7 @@ import numpy as np
 from semstab.backends.shared.hashing import mix
 from semstab.runtime.compiled import compiled, serial
 from semstab.statistics.loops.chunks import CHUNKS
-from semstab.statistics.loops.logarithm import plogp_fast
+from semstab.statistics.loops.logarithm import EIGHT, add_step
 
 ENUMERATED = 5
 """Up to this OP all T! orders are gone through; 5! = 120."""
@@ -33,7 +33,7 @@ ROUNDING = 1e-9
 # --- Orders, side by side ---------------------------------------------------------------------------------------------
 
 
-@compiled(fastmath={"reassoc", "contract"})
+@serial
 def drifts(x, A, T, order, lanes, work, drift):
     """The sum of drifts, bits, in each of `lanes` orders, to drift (LANES,).
 
@@ -41,8 +41,9 @@ def drifts(x, A, T, order, lanes, work, drift):
     (2 A, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
     each belief but the first and last is one after, then one before.
     """
-    work[:A, :lanes] = 0.0
-    drift[:lanes] = 0.0
+    whole_lanes = -(-lanes // EIGHT) * EIGHT
+    work[:A, :whole_lanes] = 0.0
+    drift[:whole_lanes] = 0.0
     for t in range(T):
         whole = 0.5 if t == 0 or t == T - 1 else 1.0
         mixed = 1.0 if t > 0 else 0.0
@@ -51,12 +52,8 @@ def drifts(x, A, T, order, lanes, work, drift):
             for lane in range(lanes):
                 work[A + a, lane] = x[a, order[t, lane]]
         for a in range(A):
-            for lane in range(lanes):
-                n = work[a, lane]
-                more = n + work[A + a, lane]
-                work[a, lane] = more
-                p, q = n * before, more * after
-                drift[lane] += whole * plogp_fast(q) - mixed * plogp_fast(0.5 * (p + q))
+            for lane in range(0, lanes, EIGHT):
+                add_step(drift, lane, work, a * LANES + lane, work, (A + a) * LANES + lane, before, after, mixed, whole)
 
 
 @compiled(fastmath={"reassoc", "contract"})
@@ -105,7 +102,7 @@ def room(T, entries, K):
     longest, classes = 1, max(1, min(K, entries))
     for i in range(T.shape[0]):
         longest = max(longest, T[i])
-    x, work, number = np.empty((classes, longest)), np.empty((2 * classes, LANES)), np.full(K, -1)
+    x, work, number = np.empty((classes, longest)), np.zeros((2 * classes, LANES)), np.full(K, -1)
     return x, work, number, np.empty((longest, LANES), np.int64), np.empty((longest, LANES)), np.empty(LANES)
 
 
