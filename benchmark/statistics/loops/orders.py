@@ -11,6 +11,7 @@ import numpy as np
 
 from semstab.backends.shared.hashing import mix
 from semstab.runtime.compiled import compiled, serial
+from semstab.statistics.loops.asking import SOON, ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.logarithm import EIGHT, add_step
 
@@ -41,33 +42,42 @@ def drifts(x, A, T, order, lanes, work, drift):
     (2 A, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
     each belief but the first and last is one after, then one before.
     """
-    whole_lanes = -(-lanes // EIGHT) * EIGHT
-    work[:A, :whole_lanes] = 0.0
-    drift[:whole_lanes] = 0.0
+    wide = -(-lanes // EIGHT) * EIGHT
+    work[:A, :wide] = 0.0
+    drift[:wide] = 0.0
     for t in range(T):
+        soon = t % (LANES // wide)
+        if soon == 0:  # well before they are read: what was stored as numbers is not at hand as a vector
+            for a in range(A):
+                for step in range(min(LANES // wide, T - t)):
+                    for lane in range(lanes):
+                        work[A + a, step * wide + lane] = x[a, order[t + step, lane]]
         whole = 0.5 if t == 0 or t == T - 1 else 1.0
         mixed = 1.0 if t > 0 else 0.0
         before, after = 1.0 / max(t, 1), 1.0 / (t + 1)
-        for a in range(A):  # well before they are read: what was stored as numbers is not at hand as a vector
-            for lane in range(lanes):
-                work[A + a, lane] = x[a, order[t, lane]]
         for a in range(A):
+            more = (A + a) * LANES + soon * wide
             for lane in range(0, lanes, EIGHT):
-                add_step(drift, lane, work, a * LANES + lane, work, (A + a) * LANES + lane, before, after, mixed, whole)
+                add_step(drift, lane, work, a * LANES + lane, work, more + lane, before, after, mixed, whole)
 
 
 @compiled(fastmath={"reassoc", "contract"})
 def trends(x, A, T, age, lanes, work, trend):
     """|| sum_t (t - mean t) s_t ||^2 in each of `lanes` orders, to trend (LANES,).
 
-    age (T, LANES) is t - mean t of each observation; work space is (1, LANES).
+    age (T, LANES) is t - mean t of each observation; work space is (1, LANES). As these add up to 0, what most
+    observations have of a class, all or nothing, can be left out of each.
     """
     trend[:lanes] = 0.0
     moment = work[0]
     for a in range(A):
         moment[:lanes] = 0.0
+        others = 0
         for j in range(T):
-            share = x[a, j]
+            others += (x[a, j] == 1.0) - (x[a, j] == 0.0)
+        usual = 1.0 if others > 0 else 0.0
+        for j in range(T):
+            share = x[a, j] - usual
             if share != 0.0:
                 for lane in range(lanes):
                     moment[lane] += share * age[j, lane]
@@ -281,7 +291,9 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
             _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
             open_ = 0
             for j in range(left):
-                i = voxels[j]
+                i, soon, later = voxels[j], voxels[min(j + SOON, left - 1)], voxels[min(j + 2 * SOON, left - 1)]
+                ask_for_bounds(log, first[later], steps)
+                ask_for_entries(log, first[soon], steps)
                 _own_order(at, steps, seeds[i], own)
                 A = dense(log, first[i], steps, number, at, x)
                 if tried == 0:
