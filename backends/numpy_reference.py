@@ -31,7 +31,7 @@ from semstab.model.voxels.extent import Extent
 ONE_IN = 16
 """Of so many voxels the sample holds one."""
 
-ODD = np.array([[-0x61C8864680B583EB], [-0x3D4D51C2D82B14B1], [0x165667B19E3779F9]])
+ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 """Of each axis, to mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
 
@@ -134,9 +134,10 @@ class NumpySample(NumpyReference):
         return pixels_held(frame, super()._pixels(frame), self.voxel_size, in_sample)
 
 
-def in_sample(index: Int64) -> Mask:
+def in_sample(index: npt.NDArray[np.integer]) -> Mask:
     """Whether the voxels of that index (3, n) are in the sample."""
-    with np.errstate(over="ignore"):
-        mixed = (index * ODD).sum(axis=0)
+    mixed = np.zeros(index.shape[1], np.int64)
+    for axis, odd in zip(index, ODD, strict=True):
+        mixed += axis * odd
     drawn: Mask = (mixed >> 40) % ONE_IN == 0
     return drawn

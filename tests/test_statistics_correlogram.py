@@ -11,7 +11,7 @@ from simulated_events import grid, log_of
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
 from semstab.outputs.plots.looks import draw_correlogram
 from semstab.outputs.recording.maps.agreement import looks_report
-from semstab.statistics import Sample, View, correlogram, describe, krippendorff_alpha
+from semstab.statistics import Sample, Views, correlogram, describe, krippendorff_alpha
 
 SIDE = 20
 
@@ -19,7 +19,8 @@ SIDE = 20
 def sample_of(labels, centres, limit=None, K=3):
     """Labels (n, F) of a floor of voxels of 0.2 m, seen from cameras at (F, 3)."""
     log = log_of(labels, K=K, index=grid(SIDE))
-    views = tuple(View(frame, np.asarray(centre, float), math.nan) for frame, centre in enumerate(centres))
+    centres = np.asarray(centres, float)
+    views = Views(np.arange(len(centres)), centres, np.full(len(centres), math.nan))
     return Sample(log, log if limit is None else log_of(limit, K=K, index=grid(SIDE)), views, soft=False)
 
 

@@ -126,7 +126,8 @@ def test_looks_come_back_from_their_file(tmp_path):
     (a, b) = common([looks, back]).logs
     np.testing.assert_array_equal(a.evidence, b.evidence)
     np.testing.assert_array_equal(looks.observations().frame, back.observations().frame)
-    assert (back.classes, back.views[1].centre.tolist()) == (("a", "b", "c"), looks.views[1].centre.tolist())
+    assert back.classes == ("a", "b", "c")
+    np.testing.assert_array_equal(back.views.rows(), looks.views.rows())
     (tmp_path / "other.parquet").write_bytes(b"no")
     with pytest.raises(DataError, match="not a file of sampled looks"):
         Looks.load(tmp_path / "other.parquet")

@@ -18,7 +18,7 @@ from semstab.metrics.matching import shared_observations
 from semstab.statistics import (
     Sample,
     Sampler,
-    View,
+    Views,
     alpha_between,
     describe,
     disagreement,
@@ -174,7 +174,7 @@ def test_lines_planes_and_blocks_of_voxels_are_sampled_evenly(along, shape):
 
 def test_no_frames_leave_an_empty_sample():
     sample = sampled([])
-    assert (len(sample.seen), sample.views) == (0, ())
+    assert (len(sample.seen), len(sample.views)) == (0, 0)
 
 
 # --- The ceiling ------------------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
     log = log_of(np.where(rare, rng.integers(2, 4, size=(n, 4)), own), K=4, index=grid(102))
     steady = np.where(rare, rng.integers(2, 4, size=(n, 1)), own)
     perfect = log_of(np.repeat(steady, 4, axis=1), K=4, index=grid(102))
-    views = tuple(View(frame, np.array([3.0, 3.0, 9.0]), float(frame)) for frame in range(4))
+    views = Views(np.arange(4), np.tile([3.0, 3.0, 9.0], (4, 1)), np.arange(4.0))
     sample = Sample(log, perfect, views, soft=False)
     found = describe(log.table(), sample=sample)
     assert found.agreement.alpha.value > 0.95
@@ -264,3 +264,11 @@ def shelf():
         pytest.skip(f"no {DATA / 'apc_shelf'}; set SEMSTAB_DATA to the folder that holds apc_shelf/")
     scene = open_dataset("posed_folder", {"root": DATA / "apc_shelf"}).scene("apc_shelf")
     return [scene.frame(index, "gt") for index in range(15)]
+
+
+def test_views_are_found_by_the_index_of_their_frame_whatever_their_order():
+    views = Views(np.array([7, 2, 5]), np.arange(9.0).reshape(3, 3), np.array([0.5, math.nan, 1.0]))
+    assert views.rank(np.array([5, 7, 7, 2])).tolist() == [2, 0, 0, 1]
+    np.testing.assert_array_equal(Views.of(views.rows().tolist()).rows(), views.rows())
+    with pytest.raises(ValueError, match="without an index"):
+        Views.of([[math.nan, 0, 0, 0, 0]])

@@ -87,7 +87,7 @@ def test_the_sample_is_part_of_the_reference() -> None:
     for frame in frames:
         whole.integrate(frame)
         sample.integrate(frame)
-    drawn = rows_of(whole.table(), in_sample(whole.table().index.T.astype(np.int64)))
+    drawn = rows_of(whole.table(), in_sample(whole.table().index.T))
     assert 0 < len(drawn) < len(whole.table()) / 4
     assert_same_map(sample.table(), drawn, 0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -224,20 +225,20 @@ def _looks_of(record: Record) -> Looks | None:
 
 def _same_frames(looks: Sequence[Looks]) -> bool:
     """Whether frames of one index were taken from one place, and most of the shorter flight's are in the others."""
-    first, *others = ({view.frame: view.centre for view in own.views} for own in looks)
+    first, *others = (own.views for own in looks)
     for other in others:
-        both = first.keys() & other.keys()
-        if 2 * len(both) < min(len(first), len(other)):
+        _, one, same = np.intersect1d(first.frame, other.frame, return_indices=True)
+        if 2 * len(one) < min(len(first), len(other)):
             return False
-        if any(np.abs(first[frame] - other[frame]).max() > NEAR for frame in both):
+        if np.abs(first.centre[one] - other.centre[same]).max(initial=0.0) > NEAR:
             return False
     return True
 
 
 def _fewer_frames(looks: Sequence[Looks]) -> tuple[str, ...]:
     """Where not all of a run's frames are in the others."""
-    frames = [{view.frame for view in own.views} for own in looks]
-    both = len(frozenset.intersection(*map(frozenset, frames)))
+    frames = [own.views.frame for own in looks]
+    both = len(functools.reduce(np.intersect1d, frames))
     listed = " and ".join(str(len(own)) for own in frames)
     if both == max(map(len, frames)):
         return ()

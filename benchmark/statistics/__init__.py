@@ -35,7 +35,7 @@ from semstab.statistics.correctness import (
 from semstab.statistics.description import Analysis, analyse, describe
 from semstab.statistics.judging.ceiling import ceiling, losses, rendered
 from semstab.statistics.judging.verdict import verdict
-from semstab.statistics.looks import Looks, Sample, Sampler, View, correlogram, reach_of
+from semstab.statistics.looks import Looks, Sample, Sampler, Views, correlogram, reach_of
 from semstab.statistics.order.drift import (
     Flips,
     VoxelDrift,
@@ -74,7 +74,7 @@ __all__ = [
     "StabilityVerdict",
     "Truth",
     "Uncertainty",
-    "View",
+    "Views",
     "VoxelDrift",
     "alpha_between",
     "analyse",

@@ -112,7 +112,7 @@ def analyse(
     """
     if events is not None:
         require_same_map(table, events)
-    table, known = table.measured(), None if truth is None else join_truth(table, truth)
+    given, table, known = table, table.measured(), None if truth is None else join_truth(table, truth)
     first, further, null = first_look(table, events, known, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
     second, more = second_look(table, whole.overall, known, limit)
@@ -127,7 +127,8 @@ def analyse(
         critical=critical,
     )
 
-    def maps() -> Maps:
+    def maps() -> Maps:  # until they are asked for, what was measured of the rows takes no memory
+        table = given.measured()
         own = maps_of(table, expected_sbd(table) if null is None else null)
         return {**own, **further, **more, **whole.overall.maps(table, further)}
 

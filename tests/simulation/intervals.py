@@ -20,7 +20,7 @@ import numpy as np
 from flights import Flight, fly, sample_of, sums_of, world
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
-from semstab.statistics.looks import View, correlogram
+from semstab.statistics.looks import Views, correlogram
 from semstab.statistics.sampling import difference, estimate
 from semstab.statistics.sampling.influence import FUNCTIONALS
 
@@ -172,7 +172,7 @@ APART = (1, 2, 4)
 def correlograms(count: int, seed: int) -> Iterator[Row]:
     """Bands of the bins in time. The target is the mean of all trials."""
     along = np.stack([np.linspace(0, 5.6, 40), np.full(40, 2.8), np.full(40, 10.0)], axis=1)
-    views = tuple(View(frame, centre, math.nan) for frame, centre in enumerate(along))
+    views = Views(np.arange(40), along, np.full(40, math.nan))
     for quality in ("alike", "uneven", "lasting"):
         flight = Flight(45, 2.0, 1.0, 40, 10, quality)
         found: dict[int, list[Interval]] = {apart: [] for apart in APART}

@@ -141,7 +141,7 @@ def no_voxels(task: Task, config: Config) -> DataError:
 def _checked(one: UnitMap, table: VoxelTable, sample: NumpySample) -> Agreement:
     """How far the map agrees with the reference on the voxels of the sample."""
     unit, found = one.task.units[0], _table(sample, one.task)
-    drawn = rows_of(table, in_sample(table.index.T.astype(np.int64)))
+    drawn = rows_of(table, in_sample(table.index.T))
     units = (unit, dataclasses.replace(unit, backend="numpy"))
     return dataclasses.replace(compare(drawn, found, units, tolerance=one.request.config.tolerance), one_in=ONE_IN)
 

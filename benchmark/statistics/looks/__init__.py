@@ -2,16 +2,17 @@
 
 from semstab.statistics.looks.common import Common, common
 from semstab.statistics.looks.correlogram import correlogram
-from semstab.statistics.looks.entries import Looks, Sample, View
+from semstab.statistics.looks.entries import Looks, Sample
 from semstab.statistics.looks.reach import reach_by, reach_from, reach_of
 from semstab.statistics.looks.sampler import Sampler
+from semstab.statistics.looks.views import Views
 
 __all__ = [
     "Common",
     "Looks",
     "Sample",
     "Sampler",
-    "View",
+    "Views",
     "common",
     "correlogram",
     "reach_by",

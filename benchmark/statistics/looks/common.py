@@ -15,7 +15,8 @@ from semstab.errors import DataError
 from semstab.metrics.matching import voxel_keys
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
-from semstab.statistics.looks.entries import Looks, View
+from semstab.statistics.looks.entries import Looks
+from semstab.statistics.looks.views import Views
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -57,13 +58,13 @@ def common(maps: Sequence[Looks]) -> Common:
 def _of_the_same_voxels(maps: Sequence[Looks]) -> list[Looks]:
     """The voxels that are in all samples by their hash, with the frames of all numbered alike."""
     share = min(looks.share for looks in maps)
-    views: dict[int, View] = {view.frame: view for looks in maps for view in looks.views}
-    order = {frame: rank for rank, frame in enumerate(views)}
+    views = Views.joined([looks.views for looks in maps])
+    views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
     same = []
     for looks in maps:
         kept = looks.only(looks.drawn < share)
-        rank = np.array([order[view.frame] for view in looks.views], dtype=np.int64)
-        same.append(dataclasses.replace(kept, view=rank[kept.view], views=tuple(views.values()), share=share))
+        rank = views.rank(looks.views.frame)
+        same.append(dataclasses.replace(kept, view=rank[kept.view], views=views, share=share))
     return same
 
 

@@ -144,9 +144,8 @@ def _of_seen_classes(*logs: Events) -> Iterator[Events]:
 
 def _pairs(sample: Sample, seen: Events, limit: Events) -> Iterator[_Pairs]:
     """The pairs of looks that are 1, 2, 4, ... looks apart, one lag after the other."""
-    order = {view.frame: rank for rank, view in enumerate(sample.views)}
-    rank = np.array([order[frame] for frame in seen.frame.tolist()], dtype=np.int64)
-    camera = np.array([view.centre for view in sample.views]).reshape(-1, 3)[rank]
+    rank = sample.views.rank(seen.frame)
+    camera = sample.views.centre[rank]
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     ray = camera - ((index + 0.5) * seen.voxel_size)[seen.voxel]
     reach = np.linalg.norm(ray, axis=1)

@@ -20,6 +20,7 @@ from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
 from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
+from semstab.statistics.looks.views import Views
 from semstab.statistics.ranks import ranked
 
 CELLS = 4
@@ -36,15 +37,6 @@ Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """Where a frame was taken: its index, camera centre (3,) in metres, and time stamp in seconds or NaN."""
-
-    frame: int
-    centre: Float64
-    timestamp: float
-
-
-@dataclass(frozen=True, eq=False)
 class Sample:
     """What was seen of the sampled voxels, and what would have been had their labels not depended on the view.
 
@@ -57,7 +49,7 @@ class Sample:
 
     seen: Events
     limit: Events
-    views: tuple[View, ...]
+    views: Views
     soft: bool
     by: str = OWN
 
@@ -87,7 +79,7 @@ class Looks:
     label: Int64
     weight: Float64
     drawn: Int64
-    views: tuple[View, ...]
+    views: Views
     voxel_size: float
     K: int
     share: int = 1 << 32
@@ -133,7 +125,7 @@ class Looks:
         first, of, starts, label = (np.empty(n + more, np.int64) for more in (0, 0, 1, 0))
         pixels, share = np.empty(n), np.empty(n)
         n, m = look(voxel, self.view, self.label, self.weight, kept, self.K, first, of, pixels, starts, label, share)
-        frames = np.array([view.frame for view in self.views], dtype=np.int32)
+        frames = self.views.frame.astype(np.int32)
         first, of = first[:n], of[:n]
         return Events(
             **index_columns(self.cell[first[np.flatnonzero(np.diff(of, prepend=-1))]] // CELLS),
@@ -154,7 +146,7 @@ class Looks:
         columns |= {"view": self.view.astype(np.int32), "label": self.label.astype(np.uint16)}
         columns |= {"weight": self.weight, "drawn": self.drawn.astype(np.uint32)}
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
-        about["views"] = [(view.frame, *view.centre.tolist(), view.timestamp) for view in self.views]
+        about["views"] = self.views.rows().tolist()
         content = pa.table({name: arrow.column(values) for name, values in columns.items()})
         text = json.dumps({"schema": SCHEMA, "kind": "Looks", **about})
         with atomic_path(path) as temporary:
@@ -171,7 +163,7 @@ class Looks:
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("Looks", SCHEMA):
                 raise DataError("of another kind, or of another version, which sampled other voxels: run it again")
-            views = tuple(View(int(row[0]), np.array(row[1:4]), float(row[4])) for row in about.pop("views"))
+            views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
             x, y, z, view, label, weight, drawn = (column.to_numpy() for column in content.columns)
             cell = np.stack([x, y, z], axis=1).astype(np.int64)

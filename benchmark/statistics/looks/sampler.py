@@ -17,7 +17,9 @@ import numpy.typing as npt
 
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.statistics.looks.entries import CELLS, Looks, Sample, View
+from semstab.runtime.rows import Rows
+from semstab.statistics.looks.entries import CELLS, Looks, Sample
+from semstab.statistics.looks.views import VIEW, Views
 from semstab.statistics.ranks import numbered
 
 BUDGET = 1 << 19
@@ -76,7 +78,7 @@ class Sampler:
         self._origin: Int64 | None = None if origin is None else np.array(origin, dtype=np.int64)
         self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in COLUMNS)
         self._entries = 0
-        self._views: list[View] = []
+        self._views = Rows(VIEW)
         self._soft = False
 
     def add(self, frame: Frame) -> None:
@@ -86,7 +88,7 @@ class Sampler:
         if self._origin is None:
             self._origin = np.floor(centre / self.voxel_size).astype(np.int64)
         when = math.nan if frame.timestamp is None else frame.timestamp
-        self._views.append(View(frame.index, centre, when))
+        self._views.append([frame.index, *centre.tolist(), when])
         self._soft = self._soft or frame.scores is not None
         entries_of = self._labels if frame.scores is None else self._scores
         for key, label, weight, drawn in entries_of(frame, self._drawn(frame)):
@@ -133,7 +135,7 @@ class Sampler:
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
         return Looks(
             self._cells(key), view.astype(np.int64), label.astype(np.int64), weight.copy(), drawn.astype(np.int64),
-            tuple(self._views), self.voxel_size, self.K, self._share, self._soft, classes,
+            Views.of(self._views.table()), self.voxel_size, self.K, self._share, self._soft, classes,
         )  # fmt: skip
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
@@ -195,7 +197,7 @@ def merged(stretches: Sequence[Looks], budget: int = BUDGET) -> Looks:
         weight=joined("weight"),
         drawn=joined("drawn"),
         view=np.concatenate([looks.view + first for looks, first in zip(kept, before, strict=False)]),
-        views=tuple(view for looks in stretches for view in looks.views),
+        views=Views.joined([looks.views for looks in stretches]),
         share=share,
         soft=any(looks.soft for looks in stretches),
     )

@@ -1,0 +1,53 @@
+"""Where the frames of a sample of looks were taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+VIEW = 5
+"""Numbers of a view: frame, centre, time stamp."""
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Indices (V,) of frames, camera centres (V, 3) in metres, and time stamps (V,) in seconds or NaN."""
+
+    frame: Int64
+    centre: Float64
+    timestamp: Float64
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[float]] | Float64) -> Views:
+        """Of rows (V, 5). Raises ValueError where they are of another shape, or an index is not a finite number."""
+        table = np.asarray(rows, np.float64).reshape(len(rows), VIEW)
+        if not np.isfinite(table[:, 0]).all():
+            raise ValueError("a frame without an index")
+        return cls(table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4].copy())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Views]) -> Views:
+        """One after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+    def rows(self) -> Float64:
+        """(V, 5) what `of` takes."""
+        return np.concatenate([self.frame[:, None], self.centre, self.timestamp[:, None]], axis=1)
+
+    def take(self, rows: Int64) -> Views:
+        """Some of them."""
+        return Views(self.frame[rows], self.centre[rows], self.timestamp[rows])
+
+    def rank(self, frame: npt.NDArray[np.integer]) -> Int64:
+        """Which of these, in their order, the frames (m,) of these indices are."""
+        order = np.argsort(self.frame)
+        return np.asarray(order[np.searchsorted(self.frame, frame, sorter=order)], np.int64)
