@@ -149,7 +149,7 @@ class _Sampled:
         stretch = self.stretch[np.repeat(kept, self.T)]
         at = np.concatenate([[0], np.cumsum(T)])
         as_seen = np.tile(np.arange(self.stretches), (count, 1))
-        orders = np.random.default_rng(seed).permuted(as_seen, axis=1)
+        orders = np.ascontiguousarray(np.random.default_rng(seed).permuted(as_seen, axis=1).T)
         voxels = np.arange(chunks.CHUNKS + 1) * len(T) // chunks.CHUNKS
         edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((chunks.CHUNKS, count, 2))
         log = events.evidence.entries

@@ -9,8 +9,11 @@ from semstab.statistics.loops.orders import LANES, dense, drifts, room, trends
 
 
 @serial
-def _in_order(rank, T, stretches, order, age, bounds, made):
-    """The observations of a voxel in each order of the stretches (lanes, S), which rank (T,) puts them into."""
+def _in_order(rank, T, stretches, order, age, bounds, made, begins, came):
+    """The observations of a voxel in each order of the stretches (S, lanes), which rank (T,) puts them into.
+
+    bounds (S + 1,), made (T,), begins (S, LANES) and came (LANES,) are work space.
+    """
     bounds[:] = 0
     for t in range(T):
         bounds[rank[t] + 1] += 1
@@ -19,13 +22,19 @@ def _in_order(rank, T, stretches, order, age, bounds, made):
     for t in range(T):
         made[bounds[rank[t]]] = t
         bounds[rank[t]] += 1  # now where the next stretch begins
-    for lane in range(stretches.shape[0]):
-        t = 0
-        for s in stretches[lane]:
-            for j in range(bounds[s - 1] if s else 0, bounds[s]):
-                order[t, lane] = made[j]
+    came[:] = 0
+    for turn in range(stretches.shape[0]):
+        for lane in range(stretches.shape[1]):
+            s = stretches[turn, lane]
+            begins[s, lane] = came[lane]
+            came[lane] += bounds[s] - (bounds[s - 1] if s else 0)
+    for s in range(stretches.shape[0]):
+        first = bounds[s - 1] if s else 0
+        for j in range(first, bounds[s]):
+            for lane in range(stretches.shape[1]):
+                t = begins[s, lane] + (j - first)
                 age[made[j], lane] = t - 0.5 * (T - 1)
-                t += 1
+                order[t, lane] = made[j]
 
 
 @serial
@@ -33,18 +42,20 @@ def permute_stretches(chunk, edges, first, T, log, K, entries, rank, orders, sum
     """Statistics of the scene with its stretches of time in other orders, the same for all voxels.
 
     edges (CHUNKS + 1, 2) bounds each chunk's voxels and their observations; rank (m,) is the stretch of each
-    observation of the voxels, one voxel after the other, orders (R, S) the stretches in each order; `entries` is the
+    observation of the voxels, one voxel after the other, orders (S, R) the stretches in each order; `entries` is the
     most that a voxel has. sums (CHUNKS, R, 2) takes, over voxels: the drift a step; the trend divided by
     sum_t (t - mean t)^2, over those with T > 2.
     """
     x, work, number, order, age, value = room(T, entries, K)
     natural, made = np.arange(x.shape[1]), np.empty(x.shape[1], np.int64)
-    bounds, at = np.empty(orders.shape[1] + 1, np.int64), edges[chunk, 1]
+    bounds, at = np.empty(orders.shape[0] + 1, np.int64), edges[chunk, 1]
+    begins, came = np.empty((orders.shape[0], LANES), np.int64), np.empty(LANES, np.int64)
     for i in range(edges[chunk, 0], edges[chunk + 1, 0]):
         A = dense(log, first[i], T[i], number, natural, x)
-        for r in range(0, orders.shape[0], LANES):
-            lanes = min(LANES, orders.shape[0] - r)
-            _in_order(rank[at : at + T[i]], T[i], orders[r : r + lanes], order, age, bounds, made)
+        for r in range(0, orders.shape[1], LANES):
+            lanes = min(LANES, orders.shape[1] - r)
+            own = rank[at : at + T[i]]
+            _in_order(own, T[i], orders[:, r : r + lanes], order, age, bounds, made, begins, came)
             drifts(x, A, T[i], order, lanes, work, value)
             for lane in range(lanes):
                 sums[chunk, r + lane, 0] += value[lane] / (T[i] - 1)

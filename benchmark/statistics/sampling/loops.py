@@ -16,6 +16,9 @@ DRIFT = 2
 (KNOWN, RIGHT, LOOKS, LOOKS_RIGHT, STABLE, STABLE_WRONG) = range(6)
 """The columns with ground truth, counted from the first of them."""
 
+TIE = 1e-12
+"""Sums of evidence that differ by no more are equal."""
+
 
 @serial
 def _classes_of(log, first, T, rows, total, squares, own, active):
@@ -70,7 +73,7 @@ def _label_without(total, row, active, A):
     best, most = active[0], total[active[0]] - row[active[0]]
     for j in range(1, A):
         rest = total[active[j]] - row[active[j]]
-        if rest > most + 1e-12:
+        if rest > most + TIE:
             best, most = active[j], rest
     return best
 
@@ -83,25 +86,35 @@ def _add_truth(sums, base, rows, first, T, group, truth, likely, total, active, 
     for j in range(A):
         mean[active[j]] = 0.0
     mean[truth] = 0.0
+    part = 1.0 / T
+    lead, most = total[label], 0.0
+    for j in range(A):
+        lead = min(lead, total[label] - total[active[j]]) if active[j] != label else lead
     for t in range(T):
-        without[t] = _label_without(total, rows[t], active, A)
-        mean[without[t]] += 1.0 / T
+        most = max(most, rows[t, label])
+    if lead > most + TIE:  # whichever is left out
+        without[:T] = label
+        mean[label] = 1.0
+    else:
+        for t in range(T):
+            without[t] = _label_without(total, rows[t], active, A)
+            mean[without[t]] += part
     for t in range(T):
         r = base + group[first + t]
-        own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) / T
-        sums[r, column + KNOWN] += 1.0 / T
+        own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) * part
+        sums[r, column + KNOWN] += part
         sums[r, column + RIGHT] += own
         sums[r, column + LOOKS] += 1.0
         sums[r, column + LOOKS_RIGHT] += rows[t, truth]
         if T > 2:
-            sums[r, column + STABLE] += likely / T
-            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) / T
+            sums[r, column + STABLE] += likely * part
+            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * part
         if K:
-            sums[r, column + 6 + truth] += 1.0 / T
+            sums[r, column + 6 + truth] += part
             sums[r, column + 6 + K + truth] += own
             for j in range(A):
                 k = active[j]
-                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) / T
+                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) * part
 
 
 @serial
@@ -198,6 +211,7 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
             A = _classes_of(log, first, T, rows, total, squares, own, active)
             best, agreed = _label(total, active, A), _agreement(total, squares, T, active, A, surprise, apart)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
+            part, of_others = 1.0 / T, 1.0 / (T - 1.0)
             for t in range(T):
                 r = cell * groups + group[first + t]
                 with_others = surprised = 0.0
@@ -208,13 +222,13 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
                     sums[r, ENTROPY + 1 + k] += s
                     surprised += s * surprise[k]
                     if by_class:
-                        others = (total[k] - s) / (T - 1.0)
+                        others = (total[k] - s) * of_others
                         differs = s + others - 2.0 * s * others
                         sums[r, ENTROPY + 1 + K + k] += apart[k] + spread * (differs - apart[k])
                         sums[r, ENTROPY + 1 + 2 * K + k] += s**2
-                share = agreed + spread * ((with_others - own[t]) / (T - 1.0) - agreed)
-                sums[r, VOXELS] += 1.0 / T
-                sums[r, PSA] += share / T
+                share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
+                sums[r, VOXELS] += part
+                sums[r, PSA] += share * part
                 sums[r, OBSERVATIONS] += 1.0
                 sums[r, AGREEING] += share
                 sums[r, OWN] += own[t]
@@ -223,8 +237,8 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
                     sums[r, TWICE] += 1.0
                     sums[r, TWICE_AGREEING] += agreed
                 else:
-                    sums[r, RECURRENT] += 1.0 / T
-                    sums[r, VSS] += rows[t, best] / T
+                    sums[r, RECURRENT] += part
+                    sums[r, VSS] += rows[t, best] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
                     sums, cell * groups, rows, first, T, group, truth[i], likely[i], total, active, A, without, mean,
