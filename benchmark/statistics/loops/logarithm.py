@@ -10,19 +10,20 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.bits import bits_of
-from semstab.runtime.compiled import compiled, serial
+from semstab.backends.shared.scores.logarithm import plogp_of
+from semstab.backends.shared.scores.vectors import DOUBLES, LANES, spread
+from semstab.runtime.compiled import serial
 
 MANTISSA_BITS = 52
-ROOT_HALF = 0x3FE6A09E667F3BCD
-"""The bits of 1 / sqrt(2)."""
-
 ROUNDER = 1.5 * 2.0**MANTISSA_BITS
 """What is added to it loses its fraction, which is rounded, and has it in its last bits."""
 
 LOWEST = -1000.0
 """Powers below are 2^LOWEST."""
 
-LN2, TWO_OVER_LN2 = math.log(2.0), 2.0 / math.log(2.0)
+LN2 = math.log(2.0)
+
+EIGHT = LANES
 
 
 @intrinsic
@@ -31,35 +32,63 @@ def number_of(_typing: Any, _bits: Any) -> Any:
     return types.float64(types.int64), lambda _, builder, __, given: builder.bitcast(given[0], ir.DoubleType())
 
 
-@compiled(fastmath={"contract"})
-def log2_fast(p):
-    """log2 p of p > 0, finite for 0, to a few units in the last place.
+@intrinsic
+def add_plogp(_typing: Any, to: Any, _at: Any, by: Any, _from: Any, p: Any, _of: Any) -> Any:
+    """add_plogp(to, at, by, i, p, j): to[at : at + 8] += by[i : i + 8] * p log2 p of p[j : j + 8], 0 for 0.
 
-    p = 2^e m, m in [1/sqrt 2, sqrt 2), and log m = 2 artanh((m - 1) / (m + 1)): odd powers, whose 11th adds 2^-56.
+    Places are counted from an array's beginning, whatever its shape; it must be contiguous.
     """
-    bits: Any = bits_of(p)
-    e = (bits - ROOT_HALF) >> MANTISSA_BITS
-    m: Any = number_of(bits - (e << MANTISSA_BITS))
-    s = (m - 1.0) / (m + 1.0)
-    t = s * s
-    series = 1.0 / 21.0
-    series = series * t + 1.0 / 19.0
-    series = series * t + 1.0 / 17.0
-    series = series * t + 1.0 / 15.0
-    series = series * t + 1.0 / 13.0
-    series = series * t + 1.0 / 11.0
-    series = series * t + 1.0 / 9.0
-    series = series * t + 1.0 / 7.0
-    series = series * t + 1.0 / 5.0
-    series = series * t + 1.0 / 3.0
-    series = series * t + 1.0
-    return float(e) + TWO_OVER_LN2 * s * series
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        total, factor, belief = (_eight(context, builder, signature, arguments, i) for i in (0, 2, 4))
+        term = _times(builder, builder.load(factor, align=8), plogp_of(context, builder, builder.load(belief, align=8)))
+        builder.store(_plus(builder, builder.load(total, align=8), term), total, align=8)
+        return context.get_dummy_value()
+
+    place = types.intp
+    return types.void(to, place, by, place, p, place), generate
 
 
-@compiled(fastmath={"contract"})
-def plogp_fast(p):
-    """p log2 p of p >= 0, 0 for 0."""
-    return p * log2_fast(p)
+@intrinsic
+def add_step(
+    _typing: Any, drift: Any, _lane: Any, seen: Any, _at: Any, more: Any, _of: Any,
+    _before: Any, _after: Any, _mixed: Any, _whole: Any,
+) -> Any:  # fmt: skip
+    """add_step(drift, lane, seen, at, more, j, before, after, mixed, whole): what more evidence of a class changes.
+
+    seen[at : at + 8] += more[j : j + 8]. With p = before * evidence as it was, q = after * evidence as it is then:
+    drift[lane : lane + 8] += whole * q log2 q - mixed * m log2 m of m = (p + q) / 2. Places as in `add_plogp`.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        total, own, new = (_eight(context, builder, signature, arguments, i) for i in (0, 2, 4))
+        before, after, mixed, whole = (spread(builder, argument, DOUBLES) for argument in arguments[6:])
+        was = builder.load(own, align=8)
+        value = builder.fadd(was, builder.load(new, align=8))
+        builder.store(value, own, align=8)
+        q = _times(builder, value, after)
+        m = _times(builder, _plus(builder, _times(builder, was, before), q), ir.Constant(DOUBLES, [0.5] * LANES))
+        gone = _times(builder, mixed, plogp_of(context, builder, m))
+        step = builder.fsub(_times(builder, whole, plogp_of(context, builder, q)), gone, flags=["contract"])
+        builder.store(_plus(builder, builder.load(total, align=8), step), total, align=8)
+        return context.get_dummy_value()
+
+    place, number = types.intp, types.float64
+    return types.void(drift, place, seen, place, more, place, number, number, number, number), generate
+
+
+def _eight(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
+    """Where eight numbers of array i lie, from the place on that the next argument says."""
+    array = context.make_array(signature.args[i])(context, builder, arguments[i])
+    return builder.bitcast(builder.gep(array.data, [arguments[i + 1]]), DOUBLES.as_pointer())
+
+
+def _plus(builder: Any, a: Any, b: Any) -> Any:
+    return builder.fadd(a, b, flags=["contract"])
+
+
+def _times(builder: Any, a: Any, b: Any) -> Any:
+    return builder.fmul(a, b, flags=["contract"])
 
 
 @serial

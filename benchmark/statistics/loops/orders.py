@@ -11,8 +11,9 @@ import numpy as np
 
 from semstab.backends.shared.hashing import mix
 from semstab.runtime.compiled import compiled, serial
+from semstab.statistics.loops.asking import SOON, ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
-from semstab.statistics.loops.logarithm import plogp_fast
+from semstab.statistics.loops.logarithm import EIGHT, add_step
 
 ENUMERATED = 5
 """Up to this OP all T! orders are gone through; 5! = 120."""
@@ -33,7 +34,7 @@ ROUNDING = 1e-9
 # --- Orders, side by side ---------------------------------------------------------------------------------------------
 
 
-@compiled(fastmath={"reassoc", "contract"})
+@serial
 def drifts(x, A, T, order, lanes, work, drift):
     """The sum of drifts, bits, in each of `lanes` orders, to drift (LANES,).
 
@@ -41,36 +42,42 @@ def drifts(x, A, T, order, lanes, work, drift):
     (2 A, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
     each belief but the first and last is one after, then one before.
     """
-    work[:A, :lanes] = 0.0
-    drift[:lanes] = 0.0
+    wide = -(-lanes // EIGHT) * EIGHT
+    work[:A, :wide] = 0.0
+    drift[:wide] = 0.0
     for t in range(T):
+        soon = t % (LANES // wide)
+        if soon == 0:  # well before they are read: what was stored as numbers is not at hand as a vector
+            for a in range(A):
+                for step in range(min(LANES // wide, T - t)):
+                    for lane in range(lanes):
+                        work[A + a, step * wide + lane] = x[a, order[t + step, lane]]
         whole = 0.5 if t == 0 or t == T - 1 else 1.0
         mixed = 1.0 if t > 0 else 0.0
         before, after = 1.0 / max(t, 1), 1.0 / (t + 1)
-        for a in range(A):  # well before they are read: what was stored as numbers is not at hand as a vector
-            for lane in range(lanes):
-                work[A + a, lane] = x[a, order[t, lane]]
         for a in range(A):
-            for lane in range(lanes):
-                n = work[a, lane]
-                more = n + work[A + a, lane]
-                work[a, lane] = more
-                p, q = n * before, more * after
-                drift[lane] += whole * plogp_fast(q) - mixed * plogp_fast(0.5 * (p + q))
+            more = (A + a) * LANES + soon * wide
+            for lane in range(0, lanes, EIGHT):
+                add_step(drift, lane, work, a * LANES + lane, work, more + lane, before, after, mixed, whole)
 
 
 @compiled(fastmath={"reassoc", "contract"})
 def trends(x, A, T, age, lanes, work, trend):
     """|| sum_t (t - mean t) s_t ||^2 in each of `lanes` orders, to trend (LANES,).
 
-    age (T, LANES) is t - mean t of each observation; work space is (1, LANES).
+    age (T, LANES) is t - mean t of each observation; work space is (1, LANES). As these add up to 0, what most
+    observations have of a class, all or nothing, can be left out of each.
     """
     trend[:lanes] = 0.0
     moment = work[0]
     for a in range(A):
         moment[:lanes] = 0.0
+        others = 0
         for j in range(T):
-            share = x[a, j]
+            others += (x[a, j] == 1.0) - (x[a, j] == 0.0)
+        usual = 1.0 if others > 0 else 0.0
+        for j in range(T):
+            share = x[a, j] - usual
             if share != 0.0:
                 for lane in range(lanes):
                     moment[lane] += share * age[j, lane]
@@ -105,7 +112,7 @@ def room(T, entries, K):
     longest, classes = 1, max(1, min(K, entries))
     for i in range(T.shape[0]):
         longest = max(longest, T[i])
-    x, work, number = np.empty((classes, longest)), np.empty((2 * classes, LANES)), np.full(K, -1)
+    x, work, number = np.empty((classes, longest)), np.zeros((2 * classes, LANES)), np.full(K, -1)
     return x, work, number, np.empty((longest, LANES), np.int64), np.empty((longest, LANES)), np.empty(LANES)
 
 
@@ -284,7 +291,9 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
             _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
             open_ = 0
             for j in range(left):
-                i = voxels[j]
+                i, soon, later = voxels[j], voxels[min(j + SOON, left - 1)], voxels[min(j + 2 * SOON, left - 1)]
+                ask_for_bounds(log, first[later], steps)
+                ask_for_entries(log, first[soon], steps)
                 _own_order(at, steps, seeds[i], own)
                 A = dense(log, first[i], steps, number, at, x)
                 if tried == 0:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.runtime.compiled import compiled, serial
+from semstab.statistics.loops.asking import ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
-from semstab.statistics.loops.logarithm import exp2_fast, log2_fast, plogp_fast
+from semstab.statistics.loops.logarithm import EIGHT, add_plogp, exp2_fast
 
 LANES = 64
 """Voxels of the same OP that go side by side, at most."""
@@ -54,9 +55,9 @@ def _beliefs(total, lanes, of, scale, pooled, after, logs, norm):
     if not pooled:
         for a in range(total.shape[0]):
             for lane in range(lanes):
-                q = total[a, lane] * scale
-                after[a, lane] = q
-                logs[lane] += of[a, lane] * plogp_fast(q)
+                after[a, lane] = total[a, lane] * scale
+            for lane in range(0, lanes, EIGHT):
+                add_plogp(logs, lane, of, a * LANES + lane, after, a * LANES + lane)
         return
     top, norm = norm[0], norm[1]
     top[:lanes] = total[0, :lanes]
@@ -71,26 +72,32 @@ def _beliefs(total, lanes, of, scale, pooled, after, logs, norm):
             after[a, lane] = power
             norm[lane] += of[a, lane] * power
             logs[lane] += of[a, lane] * power * z
+    top[:] = -1.0
+    for lane in range(0, lanes, EIGHT):
+        add_plogp(logs, lane, top, lane, norm, lane)
     for lane in range(lanes):
-        log_norm = log2_fast(norm[lane])
         norm[lane] = 1.0 / norm[lane]
-        logs[lane] = logs[lane] * norm[lane] - log_norm
+        logs[lane] *= norm[lane]
     for a in range(total.shape[0]):
         for lane in range(lanes):
             after[a, lane] *= norm[lane]
 
 
 @compiled(fastmath={"reassoc", "contract", "nnan"})
-def _add_drift(before, after, of, lanes, logs_before, logs, drift):
-    """Add the Jensen-Shannon divergence of beliefs before and after (A + 1, lanes), bits, to drift (lanes,)."""
-    step = np.empty(lanes)
-    for lane in range(lanes):
-        step[lane] = 0.5 * (logs_before[lane] + logs[lane])
+def _add_drift(before, after, of, lanes, logs_before, logs, drift, work):
+    """Add the Jensen-Shannon divergence of beliefs before and after (A + 1, lanes), bits, to drift (lanes,).
+
+    work (2, lanes) is work space.
+    """
+    mean, mixed = work[0], work[1]
+    mixed[:] = 0.0
     for a in range(before.shape[0]):
         for lane in range(lanes):
-            step[lane] -= of[a, lane] * plogp_fast(0.5 * (before[a, lane] + after[a, lane]))
+            mean[lane] = 0.5 * (before[a, lane] + after[a, lane])
+        for lane in range(0, lanes, EIGHT):
+            add_plogp(mixed, lane, of, a * LANES + lane, mean, lane)
     for lane in range(lanes):
-        drift[lane] += min(max(step[lane], 0.0), 1.0)
+        drift[lane] += min(max(0.5 * (logs_before[lane] + logs[lane]) - mixed[lane], 0.0), 1.0)
 
 
 @compiled(forceinline=True)
@@ -128,9 +135,9 @@ def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules
     at, label, weight = log
     certain = -np.log2(floor) if rules.max() >= PRODUCT else 0.0
     totals, of = np.empty((3, most + 1, LANES)), np.empty((most + 1, LANES))
-    before, after = np.empty((rules.shape[0], most + 1, LANES)), np.empty((most + 1, LANES))
+    before, after = np.zeros((rules.shape[0], most + 1, LANES)), np.zeros((most + 1, LANES))
     logs_before, logs = np.empty((rules.shape[0], LANES)), np.empty(LANES)
-    drift, norm = np.empty((rules.shape[0], LANES)), np.empty((2, LANES))
+    drift, norm = np.empty((rules.shape[0], LANES)), np.zeros((2, LANES))
     row, own = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     begin, end = chunk * rank.shape[0] // CHUNKS, (chunk + 1) * rank.shape[0] // CHUNKS
     while begin < end:
@@ -147,6 +154,11 @@ def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules
             of[:seen, lane] = 1.0
             of[A, lane] = K - seen
         drift[:] = 0.0
+        for j in range(begin + LANES, min(begin + 3 * LANES, end)):
+            if j >= begin + 2 * LANES:
+                ask_for_bounds(log, starts[rank[j]], ends[rank[j]] - starts[rank[j]])
+            else:
+                ask_for_entries(log, starts[rank[j]], ends[rank[j]] - starts[rank[j]])
         for t in range(T):
             for lane in range(lanes):
                 e = at[row[lane] + t]
@@ -156,7 +168,7 @@ def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules
                 scale = 1.0 if rule == PRODUCT else 1.0 / (t + 1)
                 _beliefs(totals[min(rule, PRODUCT), : A + 1], lanes, of, scale, rule >= PRODUCT, after, logs, norm)
                 if t > 0:
-                    _add_drift(before[r, : A + 1], after, of, lanes, logs_before[r], logs, drift[r])
+                    _add_drift(before[r, : A + 1], after, of, lanes, logs_before[r], logs, drift[r], norm)
                 before[r, : A + 1], logs_before[r] = after[: A + 1], logs
         for r in range(rules.shape[0]):
             for lane in range(lanes):
