@@ -19,7 +19,7 @@ GB = 1e9
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first, all new, is not looked at closer."""
 
-LOADED, LOADED_FOR_SCORES, LOADED_FOR_TILES = 170e6, 30e6, 30e6
+LOADED, LOADED_FOR_SCORES, LOADED_FOR_TILES = 170e6, 30e6, 50e6
 """Bytes of what a run loads once it is planned (compiled loops, formats of files), of the sample of looks, and of what
 is left between parts."""
 FRAMES_AT_WORK = 3
@@ -52,6 +52,7 @@ class Kind:
         truth = expected_bytes(self.backend, n, looks, self.K) if self.logged else 0
         logs = log_bytes(looks, self.K, soft=self.soft) if self.logged else 0
         followed = expected_bytes("numpy", n // ONE_IN, 0, self.K) if self.sampled else 0  # looks: when the map is gone
+        compared = 8 * self.K * min(n // ONE_IN, STRETCH) if self.sampled else 0
         reduced = expected_bytes(self.backend, n, looks, self.K) if self.soft else 0
         now = frame_bytes(self.backend, min(n, self.touched), self.K)
         return (
@@ -59,6 +60,7 @@ class Kind:
             + truth
             + logs
             + followed
+            + compared
             + reduced
             + now
             + (1 + self.logged) * result_bytes(n, self.K, soft=self.soft)
