@@ -9,6 +9,8 @@ import sys
 import threading
 from typing import TYPE_CHECKING, Any
 
+from semstab.runtime.memory import resident_bytes
+
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
@@ -35,9 +37,12 @@ def settle() -> None:
             libc.mallopt(parameter, value)
 
 
-def give_back() -> None:
-    """Return freed memory to the system at once: what `settle` has kept for the next images (glibc)."""
-    if hasattr(libc := _libc(), "malloc_trim"):
+def give_back(*, least: int = 0) -> None:
+    """Return freed memory to the system at once: what `settle` has kept for the next images (glibc).
+
+    least  bytes that the process must have: of a small one what comes next uses it again, and need not clear it
+    """
+    if resident_bytes() >= least and hasattr(libc := _libc(), "malloc_trim"):
         libc.malloc_trim(0)
 
 

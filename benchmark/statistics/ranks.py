@@ -23,7 +23,8 @@ def ranked(numbers: Int64) -> Int64:
     if most < 1 << 16 or most >> (63 - bits):
         order: Int64 = np.argsort(numbers.astype(np.min_scalar_type(most)), kind="stable")
         return order
-    placed = numbers.astype(np.int64) << bits
+    placed = numbers.astype(np.int64)
+    placed <<= bits
     placed |= np.arange(len(numbers))
     placed.sort()
     placed &= (1 << bits) - 1

@@ -60,6 +60,9 @@ from semstab.task import Task, read
 WORST = 3
 """So many frames are named that moved the map most."""
 
+SMALL = 1 << 30
+"""A process with fewer bytes keeps what was freed for what is measured next."""
+
 Savers = dict[str, Callable[[Path], None]]
 """What writes each file of a unit, by its path in the folder."""
 
@@ -73,10 +76,10 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         _require_voxels(task, config, table)
         if not (config.statistics or config.events):
             one.backend = NoMap()  # what comes next has its memory
-        give_back()
+        give_back(least=SMALL)
     with watch("voxel sizes"):
         sizes = () if one.sizes is None else one.sizes.alphas()
-        give_back()
+        give_back(least=SMALL)
     if kept:
         with watch("observe"):
             observers.tell(lambda observer: observer.unit_fused(unit, table))
@@ -84,7 +87,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         truth = None if one.truth is None else _table(one.truth, task)
         events = one.backend.events() if config.statistics else None
         found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
-        give_back()
+        give_back(least=SMALL)
     with watch("measure"):
         summary = _summary(one, table, found, sizes)
     with watch("write"):

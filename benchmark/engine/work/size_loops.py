@@ -22,6 +22,18 @@ def keys_of(depth, valid, ray_x, ray_y, T, size, origin, rays, margin, keys):
 
 
 @serial
+def lowest(keys, low):
+    """Set low (3,) to the lowest index of each axis in packed keys (n,)."""
+    mask = np.uint64(2 * HALF - 1)
+    low[:] = mask
+    for i in range(len(keys)):
+        key = np.uint64(keys[i])
+        low[0] = min(low[0], key >> np.uint64(42))
+        low[1] = min(low[1], (key >> np.uint64(21)) & mask)
+        low[2] = min(low[2], key & mask)
+
+
+@serial
 def interleave(keys, low, code):
     """Codes (n,) of packed keys: of each axis, from `low` on, every third bit (Morton 1966).
 

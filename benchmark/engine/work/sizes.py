@@ -98,8 +98,8 @@ class SizeMaps:
         """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
         if self._lost or not self._keys:
             return ()
-        keys, frame = np.concatenate(self._keys), np.repeat(np.arange(len(self._keys)), list(map(len, self._keys)))
-        code = _codes(keys)
+        frame = np.repeat(np.arange(len(self._keys), dtype=np.uint8), list(map(len, self._keys)))
+        code = _codes(np.concatenate(self._keys))
         order = ranked(code)
         code, frame = code[order], frame[order]
         sums = (self._sums(code, 3 * level, frame, order) for level in range(len(FACTORS)))
@@ -107,7 +107,7 @@ class SizeMaps:
             SizeAlpha(size, len(self._frames), float(alpha_of(of))) for size, of in zip(self._sizes, sums, strict=True)
         )
 
-    def _sums(self, code: Int64, shift: int, frame: Int64, order: Int64) -> Any:
+    def _sums(self, code: Int64, shift: int, frame: npt.NDArray[np.uint8], order: Int64) -> Any:
         """(3 + K,) what alpha is a function of, of the map whose voxels are the codes without their last bits."""
         from semstab.engine.work.size_loops import sums_of_labels, sums_of_scores
 
@@ -117,14 +117,13 @@ class SizeMaps:
 
 
 def _codes(keys: Int64) -> Int64:
-    """See `interleave`: from the lowest voxel of each axis on, so that codes are short."""
-    from semstab.backends.shared.pixels.keys import HALF
-    from semstab.engine.work.size_loops import interleave
+    """See `interleave`: from the lowest voxel of each axis on, so that codes are short; in the place of the keys."""
+    from semstab.engine.work.size_loops import interleave, lowest
 
-    code, mask = np.empty_like(keys), 2 * HALF - 1
-    low = [int(part.min(initial=mask)) // ALIGNED * ALIGNED for part in (keys >> 42, (keys >> 21) & mask, keys & mask)]
-    interleave(keys, np.array(low, np.uint64), code)
-    return code
+    low = np.empty(3, np.uint64)
+    lowest(keys, low)
+    interleave(keys, low // ALIGNED * ALIGNED, keys)
+    return keys
 
 
 def _one_hot(labels: npt.NDArray[Any], K: int) -> Any:

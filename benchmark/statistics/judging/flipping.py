@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.model.evidence import stretches
-from semstab.model.statistics import Flipping
+from semstab.model.statistics import Flipping, Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling import Places, PlaceSums
+from semstab.statistics.sampling.intervals import Asked
+from semstab.statistics.sampling.places import Mean
 
 Float64 = npt.NDArray[np.float64]
 
@@ -54,9 +55,12 @@ class FlippingSums:
         share = PlaceSums.added([part.share for part in parts])
         return cls(share, sum(part.often for part in parts), np.sum([part.together for part in parts], axis=0))
 
-    def flipping(self, classes: Sequence[str] = ()) -> Flipping:
-        """The share of the places that are not stable, and the two classes that stand together most often there."""
-        share = self.share.estimate("", ratio_of)
+    def asked(self) -> Iterator[Asked]:
+        """For `answers`: the share of the places that are not stable."""
+        return self.share.asked({"": Mean("")})
+
+    def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
+        """That share, as it was answered, and the two classes that stand together most often there."""
         places = self.share[""][1]
         seen = float(self.often / places) if places else float("nan")
         total = float(self.together.sum())
