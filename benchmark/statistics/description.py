@@ -151,11 +151,10 @@ def concluded(
     table, influence = own.table.summary(voxel_size, classes, edges), whole.influence
     if sample is not None:
         influence = with_sample(influence, sample.shared(), logged=first.log is not None)
-    found, judged, (unsteady,), of_flips, reached = answered(
+    found, judged, (unsteady,), reached = answered(
         own.places.asked(MEANS),
         judged_by(influence),
         second.flipping.asked(),
-        () if first.log is None else first.log.places.asked(OF_FLIPS),
         () if sample is None else reach_by(influence, table.K),
     )
     means = dict(zip(MEANS, found, strict=True))
@@ -169,7 +168,7 @@ def concluded(
         sample,
         agreement=_agreement(means, class_agreement_of(own.classes, classes)),
         flipping=second.flipping.flipping(unsteady, classes),
-        drift=_drift(means, own.places, whole, of_flips),
+        drift=_drift(means, own.places, whole),
         strata=_strata(table, own.strata),
         geometry=_geometry(whole, second, voxel_size),
         correctness=_correctness(whole, second, edges),
@@ -262,9 +261,7 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(
-    means: Mapping[str, Interval], places: PlaceSums, whole: Whole, of_flips: Sequence[Interval]
-) -> DriftStatistics:
+def _drift(means: Mapping[str, Interval], places: PlaceSums, whole: Whole) -> DriftStatistics:
     """Against its null; without a log only for one-hot evidence, and without tests."""
     log = whole.first.log
     return DriftStatistics(
@@ -273,12 +270,12 @@ def _drift(
         null=means["null"],
         excess=means["excess"],
         tests=None if log is None else whole.drift_tests(),
-        flips=None if log is None else _flips(of_flips),
+        flips=None if log is None else _flips(log.places),
     )
 
 
-def _flips(in_order: Sequence[Interval]) -> FlipRates:
-    found = dict(zip(OF_FLIPS, in_order, strict=True))
+def _flips(places: PlaceSums) -> FlipRates:
+    found = places.estimates(OF_FLIPS)
     return FlipRates(found["flip_rate"], found["flip_null"], found["flip_excess"], found["frames_since"])
 
 
