@@ -14,9 +14,10 @@ from collections import Counter
 import numpy as np
 from flights import Flight, fly, sample_of, table_of, world
 
+from semstab.model.statistics import Judged
 from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import reach_of
-from semstab.statistics.sampling import influence_sums, judged_of, value
+from semstab.statistics.sampling import answers, influence_sums, judged_by, value
 from semstab.statistics.sampling.influence import FUNCTIONALS, columns_of
 
 BETTER = {"stable": ("stable", "partly stable"), "usable": ("stable", "partly stable", "usable")}
@@ -52,7 +53,8 @@ def levels(flight: Flight, count: int, seed: int) -> tuple[float, Counter[str]]:
         sums = influence_sums(table, sample=sample.shared())
         reach = reach_of(sample, table, sums)
         assert np.isclose(reach.reached.value, value(sums, "reached"))
-        said = verdict("net", judged=judged_of(sums), reach=reach, voxels=len(table), share=1.0, blocks=sums.cells)
+        judged = Judged(*answers(judged_by(sums)))
+        said = verdict("net", judged=judged, reach=reach, voxels=len(table), share=1.0, blocks=sums.cells)
         found[said.level] += 1
         total = total + columns_of(sums, "reached").sum(axis=0)
     return float(FUNCTIONALS["reached"].of(np.asarray(total))), found
