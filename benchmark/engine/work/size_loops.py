@@ -58,17 +58,25 @@ def spread(x):
 
 
 @serial
+def look_at_voxel(code, shift, frame, start, pixels):
+    """Count the pixels of each frame in the voxel that begins there; where it ends, and how many frames saw it."""
+    end, T = start, 0
+    while end < len(code) and (code[end] >> shift) == (code[start] >> shift):
+        T += pixels[frame[end]] == 0.0
+        pixels[frame[end]] += 1.0
+        end += 1
+    return end, T
+
+
+@serial
 def sums_of_labels(code, shift, frame, label, frames, K):
     """What `alpha_sums` gives of the map whose voxels are the codes (n,), ascending, without their last bits."""
     sums, count, pixels, e = np.zeros(3 + K), np.zeros((frames, K)), np.zeros(frames), np.zeros(K)
     start = 0
     while start < len(code):
-        end, T = start, 0
-        while end < len(code) and (code[end] >> shift) == (code[start] >> shift):
-            T += pixels[frame[end]] == 0.0
-            pixels[frame[end]] += 1.0
-            count[frame[end], label[end]] += 1.0
-            end += 1
+        end, T = look_at_voxel(code, shift, frame, start, pixels)
+        for i in range(start, end):
+            count[frame[i], label[i]] += 1.0
         own = 0.0
         for i in range(start, end):
             s = count[frame[i], label[i]] / pixels[frame[i]]  # 0 where its frame and label came before
@@ -93,11 +101,7 @@ def sums_of_scores(code, shift, frame, pixel, scores, frames):
     sums, s, pixels, e = np.zeros(3 + K), np.zeros((frames, K)), np.zeros(frames), np.zeros(K)
     start = 0
     while start < len(code):
-        end, T = start, 0
-        while end < len(code) and (code[end] >> shift) == (code[start] >> shift):
-            T += pixels[frame[end]] == 0.0
-            pixels[frame[end]] += 1.0
-            end += 1
+        end, T = look_at_voxel(code, shift, frame, start, pixels)
         own = both = 0.0
         if T >= 2:
             for i in range(start, end):

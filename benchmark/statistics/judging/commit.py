@@ -19,7 +19,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import write_text
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth
-from semstab.statistics.sampling.cubes import cell_edge, cells_of
+from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.intervals import of_places
 
 Float64 = npt.NDArray[np.float64]
@@ -177,8 +177,7 @@ class _Labels:
     ) -> None:
         self._right, self._evidence = right, evidence
         if len(index):
-            self._edge = cell_edge(index, size)
-            self._cell, self._of = cells_of(index, size, self._edge)
+            self._cell, self._of, self._edge = cubes((index[:, 0], index[:, 1], index[:, 2]), size)
 
     def least(self, precision: float, error: float) -> Threshold:
         """The threshold that leaves most of them."""

@@ -18,7 +18,7 @@ from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
 from semstab.statistics.looks.entries import Sample
-from semstab.statistics.sampling.cubes import cell_edge, cells_of
+from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_GROUPS
 from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
 
@@ -92,11 +92,10 @@ class _Cells:
 
     @classmethod
     def over(cls, seen: Events) -> _Cells:
-        index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
-        edge = cell_edge(index, seen.voxel_size)
-        while len((found := cells_of(index, seen.voxel_size, edge))[0]) > MOST_CUBES:
-            edge *= 2
-        at, of = found
+        index = seen.ix, seen.iy, seen.iz
+        at, of, edge = cubes(index, seen.voxel_size)
+        while len(at) > MOST_CUBES:
+            at, of, edge = cubes(index, seen.voxel_size, 2 * edge)
         step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(at), 1) * (3 + seen.K))))
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2

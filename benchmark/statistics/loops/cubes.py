@@ -11,6 +11,12 @@ ROOM = 1024
 
 
 @serial
+def _cube(index, scale):
+    """That of a voxel's centre, along one axis."""
+    return np.int64(np.floor((index + 0.5) * scale))
+
+
+@serial
 def _place(cell, table, used):
     """Where a cube stands in a table (ROOM, 3) of some, or would stand."""
     at = (cell[0] * 73856093 ^ cell[1] * 19349663 ^ cell[2] * 83492791) & (ROOM - 1)
@@ -37,18 +43,14 @@ def _halved(table, used):
 def occupied(ix, iy, iz, some, scale, most):
     """How often cubes are doubled until at most `most` of them hold the voxels (n,) for which `some` (n,) holds.
 
-    The first cubes are floor((index + 0.5) * scale).
+    scale  of the first ones
     """
     table, used, count, doublings = np.empty((ROOM, 3), np.int64), np.zeros(ROOM, np.bool_), 0, 0
     before = (np.int64(0), np.int64(0), np.int64(0))
     for i in range(ix.shape[0]):
         if not some[i]:
             continue
-        cell = (
-            np.int64(np.floor((ix[i] + 0.5) * scale)),
-            np.int64(np.floor((iy[i] + 0.5) * scale)),
-            np.int64(np.floor((iz[i] + 0.5) * scale)),
-        )
+        cell = _cube(ix[i], scale), _cube(iy[i], scale), _cube(iz[i], scale)
         if count > 0 and cell == before:
             continue
         before, at = cell, _place(cell, table, used)
@@ -77,11 +79,7 @@ def runs(ix, iy, iz, some, scale, cells, of):
         of[i] = -1
         if not some[i]:
             continue
-        cell = (
-            np.int64(np.floor((ix[i] + 0.5) * scale)),
-            np.int64(np.floor((iy[i] + 0.5) * scale)),
-            np.int64(np.floor((iz[i] + 0.5) * scale)),
-        )
+        cell = _cube(ix[i], scale), _cube(iy[i], scale), _cube(iz[i], scale)
         if count == 0 or cell != before:
             if count < cells.shape[0]:
                 cells[count, 0], cells[count, 1], cells[count, 2] = cell
@@ -97,12 +95,3 @@ def renumber(of, number):
     for i in range(of.shape[0]):
         if of[i] >= 0:
             of[i] = number[of[i]]
-
-
-@serial
-def add_looks(rows, kind, first, starts, ends, group, groups, total):
-    """Add 1 / T for each of the T looks at each of these voxels, at (kind - first) * groups + group."""
-    for i in rows:
-        share, at = 1.0 / (ends[i] - starts[i]), (kind[i] - first) * groups
-        for row in range(starts[i], ends[i]):
-            total[at + group[row]] += share

@@ -51,9 +51,7 @@ class PValues:
         return int(self.count[self._adjusted() <= rate].sum())
 
     def _adjusted(self) -> Float64:
-        raised = self.value * self.count.sum() / np.cumsum(self.count)
-        lowest: Float64 = np.minimum.accumulate(raised[::-1])[::-1]
-        return np.minimum(lowest, 1.0)
+        return _raised(self.value, self.count)
 
 
 def _rounded_up(p: Float64) -> Float64:
@@ -68,8 +66,14 @@ def benjamini_hochberg(p: Float64) -> Float64:
     NaN is not a test. It holds for independent tests and for those that depend positively (Benjamini and Yekutieli
     2001), as neighbouring voxels do.
     """
-    adjusted, descending = np.full(len(p), np.nan), np.argsort(-p)  # NaN comes last
-    tested = descending[: np.count_nonzero(~np.isnan(p))]
-    rank = np.arange(len(tested), 0, -1)
-    adjusted[tested] = np.minimum(np.minimum.accumulate(p[tested] * (len(tested) / rank)), 1.0)
+    adjusted, tested = np.full(p.shape, np.nan), ~np.isnan(p)
+    value, of, count = np.unique(p[tested], return_inverse=True, return_counts=True)
+    adjusted[tested] = _raised(value, count)[of]
     return adjusted
+
+
+def _raised(value: Float64, count: Int64) -> Float64:
+    """Adjusted p-values of those (v,) that there are, ascending, and how often each is there."""
+    by_rank = value * count.sum() / np.cumsum(count)
+    lowest: Float64 = np.minimum.accumulate(by_rank[::-1])[::-1]
+    return np.minimum(lowest, 1.0)

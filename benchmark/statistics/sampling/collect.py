@@ -14,7 +14,7 @@ from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa
 from semstab.statistics.ranks import SPARSE, distinct, ranked
-from semstab.statistics.sampling.cubes import cell_edge, cells_of, cubes
+from semstab.statistics.sampling.cubes import cells_of, cubes
 from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.steady import steady
@@ -45,8 +45,8 @@ def influence_sums(
                 leaves at most MOST_CELLS
     likely      None leaves open how likely places are stable: of a part of a map, see `StableLooks`
     """
-    index = table.index[table.op >= 2]
-    edge = cell_edge(index, table.voxel_size) if edge is None else edge
+    if edge is None:
+        edge = cubes((table.ix, table.iy, table.iz), table.voxel_size, some=table.op >= 2)[2]
     stable = np.nan_to_num(steady(table)) if true_label is not None and likely else np.zeros(len(table))
     whole = _of_table(table, true_label, edge, stable) if events is None else _of_log(events, true_label, edge, stable)
     whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)

@@ -45,8 +45,3 @@ def cubes(
 def cells_of(index: Int32, voxel_size: float, edge: float) -> tuple[Int32, Int64]:
     """The cubes (G, 3) that hold voxels (n, 3), and which of them each is in."""
     return cubes((index[:, 0], index[:, 1], index[:, 2]), voxel_size, edge)[:2]
-
-
-def cell_edge(index: Int32, voxel_size: float) -> float:
-    """The smallest power of 2, in metres and no smaller than a voxel, that leaves at most MOST_CELLS cubes."""
-    return cubes((index[:, 0], index[:, 1], index[:, 2]), voxel_size)[2]

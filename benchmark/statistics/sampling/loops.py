@@ -245,3 +245,12 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
             _cleared(log, first, T, rows)
+
+
+@serial
+def add_kinds(rows, kind, first, starts, ends, group, groups, total):
+    """Add 1 / T for each of the T looks at each of these voxels, at (kind - first) * groups + group."""
+    for i in rows:
+        share, at = 1.0 / (ends[i] - starts[i]), (kind[i] - first) * groups
+        for row in range(starts[i], ends[i]):
+            total[at + group[row]] += share

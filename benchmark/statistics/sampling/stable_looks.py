@@ -98,14 +98,14 @@ def _by_frame(events: Events, voxels: Int64, kind: Int64, group: Int64, groups: 
 
     A place counts 1 / T for each of its T frames.
     """
-    from semstab.statistics.loops.cubes import add_looks
+    from semstab.statistics.sampling.loops import add_kinds
 
     starts, ends, order = events.starts[voxels], events.bounds[1:][voxels], ranked(kind)
     step, kinds, found = max(1, AT_ONCE // max(groups, 1)), int(kind.max(initial=-1)) + 1, [(kind[:0], np.zeros(0))]
     for first in range(0, kinds, step):
         low, high = np.searchsorted(kind, [first, first + step], sorter=order)
         total = np.zeros(min(step, kinds - first) * groups)
-        add_looks(order[low:high], kind, first, starts, ends, group, groups, total)
+        add_kinds(order[low:high], kind, first, starts, ends, group, groups, total)
         key = np.flatnonzero(total)
         found.append((key + first * groups, total[key]))
     keys, weights = zip(*found, strict=True)
