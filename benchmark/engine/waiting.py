@@ -11,9 +11,8 @@ from semstab.engine.observer import Factory
 from semstab.engine.tiled_unit import TiledUnit
 from semstab.engine.units import Planned
 from semstab.engine.work.jobs import Job, Request, split
+from semstab.engine.work.memory import GB
 from semstab.model.results import Unit
-
-GB = 1e9
 
 
 class Waiting(Iterator[Job]):
