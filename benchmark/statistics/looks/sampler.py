@@ -135,8 +135,12 @@ class Sampler:
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
         return Looks(
             self._cells(key), view.astype(np.int64), label.astype(np.int64), weight.copy(), drawn.astype(np.int64),
-            Views.of(self._views.table()), self.voxel_size, self.K, self._share, self._soft, classes,
+            self._seen_from(), self.voxel_size, self.K, self._share, self._soft, classes,
         )  # fmt: skip
+
+    def _seen_from(self) -> Views:
+        frame, x, y, z, when = (self._views.column(k) for k in range(VIEW))
+        return Views(frame.astype(np.int64), np.stack([x, y, z], axis=1), when)
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, pixels, hash) of a frame's labels."""
