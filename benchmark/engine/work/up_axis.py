@@ -90,7 +90,7 @@ def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
 
 
 def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """Which points (n,) lie within a distance of the plane, of those through three points at random, with most (RANSAC).
+    """Which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
 
     Here and not by Open3D, as a run that fuses without it takes a second to load it.
     """
