@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.backends.shared.pixels.pixel_keys import in_voxels
 from semstab.runtime.compiled import serial
-from semstab.statistics.looks.entries import CELLS
+from semstab.statistics.looks.keys import CELLS
 
 ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uint32(0x8CB92BA7)
 """Weights of a voxel's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no

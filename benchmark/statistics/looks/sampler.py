@@ -18,7 +18,8 @@ import numpy.typing as npt
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.runtime.rows import Rows
-from semstab.statistics.looks.entries import CELLS, Looks, Sample
+from semstab.statistics.looks.entries import Looks, Sample
+from semstab.statistics.looks.keys import SPAN, Voxel
 from semstab.statistics.looks.views import VIEW, Views
 from semstab.statistics.ranks import numbered
 
@@ -31,11 +32,11 @@ PIECE = 1 << 20
 SIDE = 640
 """Of frames with more pixels on a side every n-th of each axis is looked at."""
 
-REACH = 1 << 18
+REACH = SPAN // 2
 """Voxels from the first camera within which there is a sample."""
 
-COLUMNS = np.int64, np.int32, np.uint16, np.float64, np.uint32
-"""Of entries: the key of the cell, the row of the frame, the class, its pixels or sum of scores, the voxel's hash."""
+TYPES = np.int64, np.int32, np.uint16, np.float64, np.uint32
+"""Of the columns of entries."""
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -71,12 +72,12 @@ class Sampler:
         voxel_size: float,
         num_classes: int,
         budget: int = BUDGET,
-        origin: tuple[int, int, int] | None = None,
+        origin: Voxel | None = None,
     ) -> None:
         self.voxel_size, self.K, self.budget = voxel_size, num_classes, budget
         self._share = 1 << 32
         self._origin: Int64 | None = None if origin is None else np.array(origin, dtype=np.int64)
-        self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in COLUMNS)
+        self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in TYPES)
         self._entries = 0
         self._views = Rows(VIEW)
         self._soft = False
@@ -128,14 +129,19 @@ class Sampler:
 
     def sample(self) -> Sample:
         """What is there so far, as observations of the sampled voxels."""
-        return self.looks().sample()
+        return self._so_far().sample()
 
     def looks(self, classes: tuple[str, ...] = ()) -> Looks:
         """What is there so far, cell by cell."""
+        return dataclasses.replace(self._so_far().copied(), classes=classes)
+
+    def _so_far(self) -> Looks:
+        """What is there until the next frame changes it."""
+        x, y, z = (0, 0, 0) if self._origin is None else (self._origin - REACH).tolist()
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
         return Looks(
-            self._cells(key), view.astype(np.int64), label.astype(np.int64), weight.copy(), drawn.astype(np.int64),
-            self._seen_from(), self.voxel_size, self.K, self._share, self._soft, classes,
+            key, view, label, weight, drawn, (x, y, z), self._seen_from(),
+            self.voxel_size, self.K, self._share, self._soft,
         )  # fmt: skip
 
     def _seen_from(self) -> Views:
@@ -163,15 +169,6 @@ class Sampler:
             row, label = np.nonzero(sums)
             yield pixels.cell[own[row]], label.astype(np.uint16), sums[row, label], pixels.drawn[own[row]]
 
-    def _cells(self, key: Int64) -> Int64:
-        """Indices (n, 3) of cells by their keys: three voxel indices of 19 bits, three digits of 2 bits."""
-        origin = np.zeros(3, dtype=np.int64) if self._origin is None else self._origin
-        cells = np.empty((len(key), 3), np.int64)
-        for axis, (bits, digit) in enumerate(((44, 4), (25, 2), (6, 0))):
-            voxel = ((key >> bits) & (2 * REACH - 1)) + (origin[axis] - REACH)
-            cells[:, axis] = CELLS * voxel + ((key >> digit) & (CELLS - 1))
-        return cells
-
 
 def _pieces(of: Int64, most: int) -> list[Int64]:
     """Pixels by the number of their cell: of whole cells, in order, about so many at a time."""
@@ -189,19 +186,9 @@ def merged(stretches: Sequence[Looks], budget: int = BUDGET) -> Looks:
     while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:
         share //= 2
     kept = [looks.only(looks.drawn < share) for looks in stretches]
-    before = np.cumsum([0, *(len(looks.views) for looks in stretches)])
-
-    def joined(name: str) -> npt.NDArray[Any]:
-        return np.concatenate([getattr(looks, name) for looks in kept])
-
-    return dataclasses.replace(
-        stretches[0],
-        cell=joined("cell"),
-        label=joined("label"),
-        weight=joined("weight"),
-        drawn=joined("drawn"),
-        view=np.concatenate([looks.view + first for looks, first in zip(kept, before, strict=False)]),
-        views=Views.joined([looks.views for looks in stretches]),
-        share=share,
-        soft=any(looks.soft for looks in stretches),
+    before = np.cumsum([0, *(len(looks.views) for looks in stretches)], dtype=np.int32)
+    joined = Looks.joined(
+        [dataclasses.replace(own, view=own.view + first) for own, first in zip(kept, before, strict=False)]
     )
+    views = Views.joined([looks.views for looks in stretches])
+    return dataclasses.replace(joined, views=views, share=share, soft=any(looks.soft for looks in stretches))
