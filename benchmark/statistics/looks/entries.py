@@ -177,9 +177,8 @@ class Looks:
         columns = dict(zip("xyz", self.cell.astype(np.int32).T, strict=True))
         columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
-        about["views"] = self.views.rows().tolist()
         content = pa.table({name: arrow.column(values) for name, values in columns.items()})
-        text = json.dumps({"schema": SCHEMA, "kind": "Looks", **about})
+        text = f'{json.dumps({"schema": SCHEMA, "kind": "Looks", **about})[:-1]}, "views": {self.views.text()}}}'
         with atomic_path(path) as temporary:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
 

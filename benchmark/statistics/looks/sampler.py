@@ -141,9 +141,13 @@ class Sampler:
         x, y, z = (0, 0, 0) if self._origin is None else (self._origin - REACH).tolist()
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
         return Looks(
-            key, view, label, weight, drawn, (x, y, z), Views.of(self._views.table()),
+            key, view, label, weight, drawn, (x, y, z), self._seen_from(),
             self.voxel_size, self.K, self._share, self._soft,
         )  # fmt: skip
+
+    def _seen_from(self) -> Views:
+        frame, x, y, z, when = (self._views.column(k) for k in range(VIEW))
+        return Views(frame.astype(np.int64), np.stack([x, y, z], axis=1), when)
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, pixels, hash) of a frame's labels."""
