@@ -71,7 +71,7 @@ def test_kinds_that_there_is_no_room_for_stand_for_themselves():
 )
 def test_voxels_that_differ_in_anything_that_is_summed_are_of_two_kinds(column):
     n, T = 4096, np.full(4096, 2.0)
-    columns = {name: 0 * T for name in ("iy", "iz", "drift_sum", "first_frame", "last_frame", "frame_entropy_sum")}
+    columns = dict.fromkeys(("iy", "iz", "drift_sum", "first_frame", "last_frame", "frame_entropy_sum"), 0 * T)
     columns |= {"ix": np.arange(n) + 0.0, "op": T, "pixels": T, "self_sum": T}
     label, weight, true = np.zeros(n, np.uint16), T.copy(), np.zeros(n, np.int64)
     {**columns, "label": label, "weight": weight, "truth": true, "cube": columns["ix"]}[column][-1] += (
