@@ -387,7 +387,7 @@ def _up(scene: Scene, table: VoxelTable, poses: npt.NDArray[np.float64]) -> tupl
     """The scene's up axis, said or estimated; None where neither works."""
     try:
         up = estimate_up(table, poses) if scene.up is None else scene.up
-    except (DataError, ImportError, OSError):
+    except DataError:
         return None
     x, y, z = (float(value) for value in up)
     return x, y, z
