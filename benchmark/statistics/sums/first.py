@@ -19,9 +19,9 @@ from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.order.drift import flips, voxel_drift
 from semstab.statistics.sampling import PlaceSums
-from semstab.statistics.sampling.stable_looks import StableLooks
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
+from semstab.statistics.sums.stable_looks import StableLooks
 
 Float64 = npt.NDArray[np.float64]
 
