@@ -114,9 +114,10 @@ class SizeMaps:
         F, shifts = len(self._keys), range(0, 3 * len(FACTORS), 3)
         code, order = ordered(code)
         if self._said.ndim == 2:
-            frame, many = frame[order], np.ones(len(code), np.int32)
-            return (sums_of_scores(code, shift, frame, many, order, self._said, F) for shift in shifts)
-        own, seen, label, many = (np.empty(len(code), kind) for kind in (np.int64, np.uint8, np.uint16, np.int32))
+            frame, ones = frame[order], np.ones(len(code), np.int32)
+            return (sums_of_scores(code, shift, frame, ones, order, self._said, F) for shift in shifts)
+        kinds: tuple[Any, ...] = np.int64, np.uint8, np.uint16, np.int32
+        own, seen, label, many = (np.empty(len(code), kind) for kind in kinds)
         m = runs(code, order, frame, self._said, own, seen, label, many)
         of = own[:m], seen[:m], label[:m], many[:m]
         return (sums_of_labels(*of, shift, F, self._K) for shift in shifts)
