@@ -85,7 +85,10 @@ def test_the_same_input_gives_the_same_answer():
         assert (estimate_up(points, poses) == first).all()
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((2, 3)), np.ones((50, 3))])
+LINE = np.arange(50.0)[:, None] * (1, 0, 0)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((2, 3)), np.ones((50, 3)), LINE])
 def test_too_few_points_are_refused(points):
     with pytest.raises(DataError, match=f"no ground plane found under the cameras in {len(points)} points; say which"):
         estimate_up(points, looking((0, 1, 0)))

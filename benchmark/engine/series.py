@@ -75,11 +75,11 @@ INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
 class Series(Sequence[FrameRow]):
     """The rows of a time series, kept as numbers.
 
-    numbers  (F, C) of the first rows
+    numbers  NUMBERS of the first ones
     """
 
-    def __init__(self, numbers: npt.NDArray[np.float64] | None = None) -> None:
-        self._rows = Rows(len(NUMBERS), numbers)
+    def __init__(self, numbers: Rows | None = None) -> None:
+        self._rows = Rows(len(NUMBERS)) if numbers is None else numbers
 
     @property
     def numbers(self) -> npt.NDArray[np.float64]:
@@ -124,7 +124,9 @@ class Series(Sequence[FrameRow]):
     def __getitem__(self, at: slice) -> Sequence[FrameRow]: ...
     def __getitem__(self, at: int | slice) -> FrameRow | Sequence[FrameRow]:
         """A row, or some."""
-        return Series(self.numbers[at]) if isinstance(at, slice) else _row(self._rows.row(at))
+        if isinstance(at, slice):
+            return [_row(self._rows.row(k)) for k in range(len(self))[at]]
+        return _row(self._rows.row(at))
 
 
 def _row(numbers: Sequence[float]) -> FrameRow:

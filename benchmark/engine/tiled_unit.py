@@ -14,7 +14,7 @@ from semstab.engine.units import PlannedUnit
 from semstab.engine.work.assembly import Sampled, assembled, second_looks
 from semstab.engine.work.jobs import Outcome, Request, failed
 from semstab.engine.work.looking_again import look_again
-from semstab.errors import OutgrownError, SemstabError
+from semstab.errors import DataError, OutgrownError, SemstabError
 from semstab.statistics.sums import Whole
 
 MORE = 1.5
@@ -42,7 +42,7 @@ class TiledUnit:
         self._again: dict[str, SeenAgain] = {}
         for name in self._requests.keys() & there:
             if (found := folder.portion(self._key, name)) is not None:
-                self._there[name] = found
+                self._there[name] = found.without_rows()
         self._failed = False
         self._sampled: Sampled | None = None
         self._waiting = [request for name, request in self._requests.items() if name not in self._there]
@@ -96,7 +96,7 @@ class TiledUnit:
         found = self._folder.portion(self._key, name)
         if found is None:
             return self._error(name, f"part {name} is not in the folder; start it again")
-        self._there[name] = found
+        self._there[name] = found.without_rows()
         return None
 
     def _ended(self) -> Outcome | None:
@@ -112,10 +112,16 @@ class TiledUnit:
             if len(self._again) < len(self._second):
                 return None
             again = [self._again[name] for name in self._second]
-            content = assembled(self.planned, finished, self._folder.path, sampled, self._whole, again)
+            content = assembled(self.planned, finished, self._loaded, self._folder.path, sampled, self._whole, again)
             return Outcome(self.planned.identity, content)
         except SemstabError as error:
             return failed([*self._requests.values()][:1], error)[0]
+
+    def _loaded(self, name: str) -> Finished:
+        """A portion with what it has of each frame. Raises DataError where it is gone meanwhile."""
+        if (found := self._folder.portion(self._key, name)) is None:
+            raise DataError(f"{self.name}: part {name} is no longer in the folder as it was; start it again")
+        return found
 
     def _look_again(self, request: Request) -> SeenAgain:
         """Here, where the worker does not see the folder."""

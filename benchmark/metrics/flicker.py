@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.errors import DataError
 from semstab.model.frames import Frame
@@ -55,12 +54,12 @@ def compensated_flicker(
 
     Raises ConfigError where depth_tolerance is not above 0 and below 1.
     """
-    seen = correspond(current, previous, depth_tolerance=depth_tolerance)
-    covisible = current.valid & seen.bring(previous.valid, fill=False)
-    changed = covisible & (seen.bring(previous.predicted) != current.predicted)
-    return CompensatedFlicker(_share(changed, covisible, whole=100.0), _share(covisible, current.valid))
+    from semstab.model.pixel_kernel import count_changed_at
 
-
-def _share(part: npt.NDArray[np.bool_], of: npt.NDArray[np.bool_], whole: float = 1.0) -> float:
-    n = int(np.count_nonzero(of))
-    return whole * int(np.count_nonzero(part)) / n if n else math.nan
+    seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel
+    images = (seen, current.valid, current.predicted, previous.valid, previous.predicted)
+    covisible, changed = count_changed_at(*(flat(image) for image in images))
+    return CompensatedFlicker(
+        100.0 * changed / covisible if covisible else math.nan,
+        covisible / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
+    )

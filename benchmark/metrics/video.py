@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError, DataError
+from semstab.model.labels import flat
 
 Labels = npt.NDArray[np.integer[Any]]
 Mask = npt.NDArray[np.bool_]
@@ -27,7 +28,7 @@ class VideoConsistency:
     def __init__(self, n: int) -> None:
         self._prediction = _Run(n)
         self._truth = _Run(n)
-        self._clips = _Clips()
+        self._clips = _Clips(n)
 
     def add(self, labels: Labels, valid: Mask, truth: Labels) -> float:
         """Add the next frame; return the consistency of the clip that ends with it, NaN where none does.
@@ -39,9 +40,7 @@ class VideoConsistency:
 
         Raises DataError where the sizes differ.
         """
-        constant = self._prediction.add(labels, valid)
-        counted = self._truth.add(truth, valid)
-        return self._clips.add(counted & constant, counted)
+        return self._clips.add(self._prediction.add(labels, valid), self._truth.add(truth, valid))
 
     @property
     def value(self) -> float:
@@ -58,16 +57,14 @@ class SelfConsistency:
     def __init__(self, n: int) -> None:
         self._prediction = _Run(n)
         self._valid = _Run(n)
-        self._clips = _Clips()
+        self._clips = _Clips(n)
 
     def add(self, labels: Labels, valid: Mask) -> float:
         """Add the next frame's ids (H, W) and its pixels that count; return its clip's consistency, NaN for none.
 
         Raises DataError where the sizes differ.
         """
-        constant = self._prediction.add(labels, valid)
-        counted = self._valid.add(np.zeros(valid.shape, dtype=np.uint8), valid)
-        return self._clips.add(counted & constant, counted)
+        return self._clips.add(self._prediction.add(labels, valid), self._valid.add(valid.view(np.uint8), valid))
 
     @property
     def value(self) -> float:
@@ -85,33 +82,36 @@ class _Run:
         self._length: npt.NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._labels: Labels = np.zeros((0, 0), dtype=np.uint8)
 
-    def add(self, labels: Labels, valid: Mask) -> Mask:
-        """Where the label has been the same, and has counted, in the last n frames."""
+    def add(self, labels: Labels, valid: Mask) -> npt.NDArray[np.int16]:
+        """Take the next frame in; of each pixel for how many frames its label has been the same and has counted."""
+        from semstab.metrics.video_kernel import lengthen
+
         if labels.shape != valid.shape:
             sizes = " and ".join(f"{W}x{H}" for H, W in (labels.shape, valid.shape))
             raise DataError(f"labels and the mask of what counts differ in size ({sizes})")
-        if labels.shape == self._labels.shape:
-            self._length[labels != self._labels] = 0
-            self._length += self._length < self.n
-            self._length[~valid] = 0
-        else:
-            self._length = valid.astype(np.int16)
+        if labels.shape != self._labels.shape:
+            self._length, self._labels = np.zeros(labels.shape, np.int16), np.zeros_like(labels)
+        lengthen(flat(labels), flat(self._labels), flat(valid), self.n, self._length.reshape(-1))
         self._labels = labels.copy()
-        return self._length >= self.n
+        return self._length
 
 
 class _Clips:
-    """The mean over clips."""
+    """The mean over clips of n frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, n: int) -> None:
+        self.n = n
         self._sum = 0.0
         self._count = 0
 
-    def add(self, consistent: Mask, counted: Mask) -> float:
-        pixels = np.count_nonzero(counted)
+    def add(self, constant: npt.NDArray[np.int16], counted: npt.NDArray[np.int16]) -> float:
+        """Of the pixels that have counted for n frames, the share whose prediction has been constant as long."""
+        from semstab.metrics.video_kernel import count_long
+
+        pixels, consistent = count_long(flat(counted), flat(constant), self.n)
         if not pixels:
             return math.nan
-        value = np.count_nonzero(consistent) / pixels
+        value: float = consistent / pixels
         self._sum += value
         self._count += 1
         return value

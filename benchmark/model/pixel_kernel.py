@@ -30,6 +30,18 @@ def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) 
 
 
 @serial
+def count_changed_at(at: Any, valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
+    """Of the valid pixels those that see a valid pixel of the other view, `at`, and those whose label differs there."""
+    seen = changed = 0
+    for i in range(len(at)):
+        j = max(at[i], 0)
+        both = valid[i] & other_valid[j] & (at[i] >= 0)
+        seen += both
+        changed += both & (labels[i] != other_labels[j])
+    return seen, changed
+
+
+@serial
 def has_other(labels: Any, count: int, ignore: int) -> bool:
     """Whether a map of ids (n,) holds one that is neither below `count` nor the ignore id."""
     first, ignored = labels.dtype.type(count), labels.dtype.type(ignore)

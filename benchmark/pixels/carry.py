@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.pixels.warp import DEPTH_TOLERANCE, motion
+from semstab.pixels.warp import DEPTH_TOLERANCE, by_rows, motion
 
 
 def carry(
@@ -26,7 +26,7 @@ def carry(
     rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
     carried = np.zeros((H, W, belief.shape[2]), dtype=np.float32)
     blend(
-        fixed(target.depth), rays, motion(target, source), fixed(source.depth),
+        fixed(target.depth), rays, by_rows(motion(target, source)), fixed(source.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, np.ascontiguousarray(belief), carried,
     )  # fmt: skip
     return carried

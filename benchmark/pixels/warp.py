@@ -58,7 +58,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
     rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
     pixel = np.empty((H, W), dtype=np.int32)
     look_up(
-        fixed(frame.depth), rays, motion(frame, other), fixed(other.depth),
+        fixed(frame.depth), rays, by_rows(motion(frame, other)), fixed(other.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
     )  # fmt: skip
     return Correspondence(pixel)
@@ -80,3 +80,8 @@ def motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
     R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
     t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]
     return np.column_stack([R @ frame.T_wc[:3, :3], R @ t])
+
+
+def by_rows(matrix: npt.NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+    """A matrix as tuples, which compiled loops keep in registers."""
+    return tuple(tuple(row) for row in matrix.tolist())

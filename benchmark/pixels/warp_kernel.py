@@ -5,22 +5,32 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from semstab.runtime.compiled import serial
 
 
 @serial
 def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> tuple[float, float, float]:
     """Column, row and depth in the other camera of the point at depth d along a ray; depth 0 where it is not seen."""
-    fx, fy, cx, cy = camera
-    if not 0.0 < d < math.inf:
-        return 0.0, 0.0, 0.0
+    (fx, fy, cx, cy), (to_x, to_y, to_z) = camera, motion
     x, y = ray_x * d, ray_y * d
-    z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] * d + motion[2, 3]
-    if not z > 0.0:
-        return 0.0, 0.0, 0.0
-    to_x = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] * d + motion[0, 3]
-    to_y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] * d + motion[1, 3]
-    return fx * (to_x / z) + cx, fy * (to_y / z) + cy, z
+    z = to_z[0] * x + to_z[1] * y + to_z[2] * d + to_z[3]
+    column = fx * ((to_x[0] * x + to_x[1] * y + to_x[2] * d + to_x[3]) / z) + cx
+    row = fy * ((to_y[0] * x + to_y[1] * y + to_y[2] * d + to_y[3]) / z) + cy
+    return column, row, z if (d > 0.0) & (d < math.inf) & (z > 0.0) else 0.0
+
+
+@serial
+def _look_up_row(depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any, shape: Any, at: Any, z: Any) -> None:
+    """The flat index of the pixel of the other view, of some shape, in which each point of a row falls, or -1; and its
+    depth there. Without a branch, for vectors."""
+    H, W = float(shape[0]), float(shape[1])
+    for u in range(len(depth)):
+        column, row, z[u] = _seen_at(float(depth[u]), ray_x[u], ray_y, motion, camera)
+        at_u, at_v = np.floor(column + 0.5), np.floor(row + 0.5)  # integers are pixel centres
+        inside = (z[u] > 0.0) & (at_u >= 0.0) & (at_u < W) & (at_v >= 0.0) & (at_v < H)
+        at[u] = np.int32(at_v * W + at_u if inside else -1.0)
 
 
 @serial
@@ -29,24 +39,17 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
 
     depth        (H, W) of the view, metres; 0, negative, NaN and inf are invalid
     rays         (u - cx) / fx of each column, then (v - cy) / fy of each row
-    motion       (3, 4) from the view's camera axes to the other's
+    motion       three rows of four numbers, from the view's camera axes to the other's
     other_depth  (H', W') of the other view, whose intrinsics are camera = (fx, fy, cx, cy)
     tolerance    of the occlusion test, relative to the distance from the other camera
     out          (H, W) int32, is filled
     """
-    ray_x, ray_y = rays
-    H, W = other_depth.shape
+    there, z = other_depth.reshape(-1), np.empty(depth.shape[1])
     for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            out[v, u] = -1
-            column, row, z = _seen_at(float(depth[v, u]), ray_x[u], ray_y[v], motion, camera)
-            if not z > 0.0:
-                continue
-            at_u, at_v = math.floor(column + 0.5), math.floor(row + 0.5)  # integers are pixel centres
-            if not (0 <= at_u < W and 0 <= at_v < H):
-                continue
-            if abs(float(other_depth[at_v, at_u]) - z) <= tolerance * z:
-                out[v, u] = at_v * W + at_u
+        at = out[v]
+        _look_up_row(depth[v], rays[0], rays[1][v], motion, camera, other_depth.shape, at, z)
+        for u in range(len(at)):
+            at[u] = at[u] if (at[u] >= 0) & (abs(float(there[max(at[u], 0)]) - z[u]) <= tolerance * z[u]) else -1
 
 
 @serial

@@ -2,60 +2,132 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.runtime.scratch import Scratch
+
 BLOCK = 1024
 """Rows that room is made for at a time."""
+
+KEPT = 64
+"""Blocks that stay in memory; where there are more, all that are full go to a file."""
 
 Float64 = npt.NDArray[np.float64]
 
 
 class Rows:
-    """In blocks, so that nothing is copied when they grow: as objects they would take ten times the memory."""
+    """In blocks of columns, so that nothing is copied when they grow, and memory is bounded however many there are.
 
-    def __init__(self, columns: int, numbers: Float64 | None = None) -> None:
+    rows  (n, columns) the first ones
+    """
+
+    def __init__(self, columns: int, rows: Float64 | None = None) -> None:
         self.columns = columns
-        self._full = [] if numbers is None else [numbers]
-        self._before = sum(map(len, self._full))
-        self._last = np.empty((0, columns))
-        self._used = 0
+        self._file: Scratch | None = None
+        self._filed = 0  # blocks in the file; those that came after them are in memory
+        self._full: list[Float64] = []
+        self._last, self._used = np.empty((columns, 0)), 0
+        if rows is not None:
+            self.extend(rows)
 
     def __len__(self) -> int:
         """The number of rows."""
-        return self._before + self._used
+        return BLOCK * (self._filed + len(self._full)) + self._used
 
     def __iter__(self) -> Iterator[list[float]]:
         """Each in turn."""
-        for block in self._blocks():
-            for first in range(0, len(block), BLOCK):
-                yield from block[first : first + BLOCK].tolist()
+        for block in self.blocks():
+            yield from block.tolist()
+
+    def __reduce__(self) -> tuple[type[Rows], tuple[int, Float64]]:
+        """As numbers: another process has a file of its own."""
+        return Rows, (self.columns, self.table())
 
     def append(self, row: Iterable[float]) -> None:
         """One more."""
-        if self._used == len(self._last):
-            self._full.append(self._last)
-            self._before += self._used
-            self._last, self._used = np.empty((BLOCK, self.columns)), 0
-        self._last[self._used] = [*row]
+        if self._used == self._last.shape[1]:
+            self._begin()
+        self._last[:, self._used] = [*row]
         self._used += 1
+
+    def extend(self, rows: Float64) -> None:
+        """Some more, (m, columns)."""
+        while len(rows):
+            if self._used == self._last.shape[1]:
+                self._begin()
+            some = rows[: BLOCK - self._used]
+            self._last[:, self._used : self._used + len(some)] = some.T
+            self._used += len(some)
+            rows = rows[len(some) :]
 
     def row(self, at: int) -> list[float]:
         """One of them. Raises IndexError where there is none."""
-        at = range(len(self))[at]
-        if at >= self._before:
-            return self._last[at - self._before].tolist()  # type: ignore[no-any-return]
-        return self.table()[at].tolist()  # type: ignore[no-any-return]
+        block, k = divmod(range(len(self))[at], BLOCK)
+        return self._block(block)[:, k].tolist()  # type: ignore[no-any-return]
 
-    def column(self, k: int) -> Float64:
-        """(n,) the k-th number of each row."""
-        return np.concatenate([np.empty(0), *(block[:, k] for block in self._blocks())])
+    def column(self, k: int, first: int = 0, last: int | None = None) -> Float64:
+        """(n,) the k-th number of each row, from one of them up to but without another."""
+        last = len(self) if last is None else last
+        blocks = range(first // BLOCK, -(-last // BLOCK))
+        found = [np.empty(0), *(self._block(block, slice(k, k + 1))[0] for block in blocks)]
+        return np.concatenate(found)[first - BLOCK * blocks.start :][: last - first]
 
-    def table(self, first: int = 0) -> Float64:
-        """(n, columns), from a row on."""
-        return np.concatenate([np.empty((0, self.columns)), *self._blocks()])[first:]
+    def put(self, k: int, values: Float64) -> None:
+        """Make these (n,) the k-th numbers of the rows. Raises OSError where the file cannot be written."""
+        for block in range(self._count):
+            some = values[BLOCK * block :][:BLOCK]
+            if block >= self._filed:
+                self._block(block)[k] = some
+            else:
+                assert self._file is not None
+                self._file.write(some, 8 * BLOCK * (block * self.columns + k))
 
-    def _blocks(self) -> list[Float64]:
-        return [*self._full, self._last[: self._used]]
+    def blocks(self) -> Iterator[Float64]:
+        """The rows (m, columns), some at a time."""
+        return (self._block(block).T for block in range(self._count))
+
+    def table(self, first: int = 0, step: int = 1) -> Float64:
+        """(n, columns), from a row on, and every step-th of these."""
+        found = np.empty((len(range(first, len(self), step)), self.columns))
+        done = 0
+        for k, block in enumerate(self.blocks()):
+            some = block[max(first - BLOCK * k, (first - BLOCK * k) % step) :: step]
+            found[done : done + len(some)] = some
+            done += len(some)
+        return found
+
+    @property
+    def _count(self) -> int:
+        """Blocks, with the one that is being filled."""
+        return self._filed + len(self._full) + (self._used > 0)
+
+    def _begin(self) -> None:
+        """Room for more rows."""
+        if self._used:
+            self._full.append(self._last)
+            if len(self._full) >= KEPT or self._filed:
+                self._put_aside()
+        self._last, self._used = np.empty((self.columns, BLOCK)), 0
+
+    def _put_aside(self) -> None:
+        """Full blocks go to the file. Where its disk is full they stay: a long run does not end for a few megabytes."""
+        with contextlib.suppress(OSError):
+            self._file = self._file or Scratch()
+            while self._full:
+                self._file.write(self._full[0], self._filed * self._full[0].nbytes)
+                self._filed += 1
+                del self._full[0]
+
+    def _block(self, block: int, columns: slice = slice(None)) -> Float64:
+        """(columns, m) some columns of a block."""
+        if block >= self._filed:
+            full = self._full[block - self._filed :]
+            return full[0][columns] if full else self._last[columns, : self._used]
+        assert self._file is not None
+        first, last, _ = columns.indices(self.columns)
+        at = 8 * BLOCK * (block * self.columns + first)
+        return self._file.read(np.float64, BLOCK * (last - first), at).reshape(-1, BLOCK)

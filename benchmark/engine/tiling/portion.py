@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from semstab.model.results import Agreement, SizeAlpha
 from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.runtime.files import parse_json
 from semstab.runtime.json_form import from_json, to_json
+from semstab.runtime.rows import Rows
 
 PORTIONS = "parts"
 """Folder of what is finished of units in tiles, unit by unit, until they are whole."""
@@ -29,6 +31,10 @@ TRUE_LOOKS = ".truth.parquet"
 
 PART, STRETCH, SIZES = "part", "stretch", "sizes"
 """Kinds of portions; the last one tells how the map hangs on the voxel size."""
+
+SUMS = ("points", "voxels", "new_voxels", "drift_sum", "seconds")
+SECONDS = ("association_seconds", "update_seconds")
+"""Not known of a frame that no part fused."""
 
 MEANS = ("map_vss", "map_entropy", "map_recurrent")
 
@@ -125,6 +131,10 @@ class Finished:
         text = json.dumps(to_json(self.about)).encode()
         write_arrays(path, {"about": np.frombuffer(text, np.uint8), **arrays})
 
+    def without_rows(self) -> Finished:
+        """The same but for what it has of each frame: portions are many."""
+        return replace(self, series=self.series[:0], poses=self.poses[:0], image=self.image[:0])
+
     @classmethod
     def load(cls, path: Path) -> Finished | None:
         """What `save` wrote; None where it is not there, or damaged. Raises DataError for that of another version."""
@@ -136,25 +146,39 @@ class Finished:
         return cls(about, arrays["series"], sums, arrays["reduced"], arrays["poses"], arrays["image"])
 
 
-def joined_series(frames: Float64, parts: Sequence[Float64]) -> Series:
-    """The time series of a unit (F rows) from that of its frames without a map, and those of the parts of its map."""
-    joined = frames.copy()
-    columns = {name: joined[:, k] for k, name in enumerate(NUMBERS)}
-    state = {name: np.zeros(len(frames)) for name in ("map_voxels", *MEANS)}
-    for part in parts:
-        own = {name: part[:, k] for k, name in enumerate(NUMBERS)}
-        at = np.searchsorted(columns["frame"], own["frame"])
-        for name in ("points", "voxels", "new_voxels", "drift_sum", "seconds"):
-            columns[name][at] += own[name]
-        for name in ("association_seconds", "update_seconds"):
-            columns[name][at] = np.nan_to_num(columns[name][at]) + own[name]
-        last = np.searchsorted(own["frame"], columns["frame"], side="right") - 1
-        voxels = np.where(last >= 0, own["map_voxels"][last], 0.0)
-        state["map_voxels"] += voxels
-        for name in MEANS:
-            state[name] += np.where(voxels > 0, voxels * own[name][last], 0.0)
-    n = np.where(state["map_voxels"] > 0, state["map_voxels"], math.nan)
-    columns["map_voxels"][:] = state["map_voxels"]
+def joined_series(frames: Rows, parts: Rows, sizes: Sequence[int]) -> Series:
+    """The time series of a unit from that of its frames without a map, and those of the parts of its map.
+
+    frames  (F, C) rows of NUMBERS, of which those of the whole map become the unit's
+    parts   the same of one part after the other, of so many rows each
+    """
+    where = {name: k for k, name in enumerate(NUMBERS)}
+    frame, ends = frames.column(where["frame"]), np.cumsum([0, *sizes]).tolist()
+
+    def of_parts(*names: str) -> Iterator[list[Float64]]:
+        for first, last in itertools.pairwise(ends):
+            yield [parts.column(where[name], first, last) for name in ("frame", *names)]
+
+    for name in (*SUMS, *SECONDS):
+        total = frames.column(where[name])
+        for own, values in of_parts(name):
+            at = np.searchsorted(frame, own)
+            total[at] = (np.nan_to_num(total[at]) if name in SECONDS else total[at]) + values
+        frames.put(where[name], total)
+    voxels = np.zeros(len(frame))
+    for own, so_far in of_parts("map_voxels"):
+        voxels += _latest(frame, own, so_far)
+    frames.put(where["map_voxels"], voxels)
+    n = np.where(voxels > 0, voxels, math.nan)
     for name in MEANS:
-        columns[name][:] = state[name] / n
-    return Series(joined)
+        total = np.zeros(len(frame))
+        for own, so_far, values in of_parts("map_voxels", name):
+            total += _latest(frame, own, np.where(so_far > 0, so_far * values, 0.0))
+        frames.put(where[name], total / n)
+    return Series(frames)
+
+
+def _latest(frame: Float64, own: Float64, values: Float64) -> Float64:
+    """(F,) the value of the last of its own frames at each frame, 0 before them."""
+    found: Float64 = np.concatenate([np.zeros(1), values])[np.searchsorted(own, frame, side="right")]
+    return found

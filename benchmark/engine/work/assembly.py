@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
+from semstab.engine.series import NUMBERS
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
-from semstab.engine.work.image_space import image_space_of
+from semstab.engine.work.image_space import COLUMNS, image_space_of
+from semstab.engine.work.stream import AXES, some_poses
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.agreement import together
@@ -25,6 +27,7 @@ from semstab.metrics.summary import TableSums
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
 from semstab.model.results import Agreement
 from semstab.model.voxels import VoxelTable
+from semstab.runtime.rows import Rows
 from semstab.statistics import Looks, Sample
 from semstab.statistics.description import concluded
 from semstab.statistics.looks.sampler import merged
@@ -55,6 +58,7 @@ class Sampled:
 def assembled(
     planned: PlannedUnit,
     finished: Mapping[str, Finished],
+    load: Callable[[str], Finished],
     folder: Path,
     sampled: Sampled,
     whole: Whole | None,
@@ -62,7 +66,9 @@ def assembled(
 ) -> UnitContent:
     """The unit's content, from its portions by name, and second looks at its parts, in order; its series is written.
 
-    Raises DataError where no pixel was valid.
+    load  a portion with what it has of each frame: those are not together in memory
+
+    Raises DataError where no pixel was valid, or a portion is no longer there.
     """
     task, unit, config = planned.task, planned.unit, planned.config
     stretches = [each for each in finished.values() if each.about.kind == STRETCH]
@@ -84,7 +90,8 @@ def assembled(
             edges=config.strata,
             critical=config.critical_classes,
         )
-    rows = joined_series(np.concatenate([each.series for each in stretches]), [part.series for part in parts])
+    of_frames, of_parts = _rows(load, finished, STRETCH), _rows(load, finished, PART)
+    rows = joined_series(of_frames.series, of_parts.series, of_parts.sizes)
     reduced = [part.reduced for part in parts if len(part.reduced)]
     summary = unit_summary(
         task,
@@ -109,11 +116,32 @@ def assembled(
     )
     if not planned.image_space:
         return content
-    image_space = image_space_of(np.concatenate([each.image for each in stretches]), summary.flicker_percent)
+    image_space = image_space_of(of_frames.image, summary.flicker_percent)
     tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
-    poses = np.concatenate([each.poses for each in stretches])
-    up = _up(planned, tiles, int(sums.total[2]), poses)
+    up = _up(planned, tiles, int(sums.total[2]), some_poses(of_frames.poses))
     return replace(content, image_space=image_space, quality=stretches[0].about.quality, up=up)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What portions have of each frame, one portion after the other, of so many frames each; see `Finished`."""
+
+    sizes: list[int] = field(default_factory=list)
+    series: Rows = field(default_factory=lambda: Rows(len(NUMBERS)))
+    image: Rows = field(default_factory=lambda: Rows(len(COLUMNS)))
+    poses: Rows = field(default_factory=lambda: Rows(AXES))
+
+
+def _rows(load: Callable[[str], Finished], finished: Mapping[str, Finished], kind: str) -> _Rows:
+    """Of all portions of a kind, of which one at a time is in memory."""
+    rows = _Rows()
+    for name in (name for name, each in finished.items() if each.about.kind == kind):
+        found = load(name)
+        rows.sizes.append(len(found.series))
+        rows.series.extend(found.series)
+        rows.image.extend(found.image)
+        rows.poses.extend(found.poses.reshape(-1, AXES))
+    return rows
 
 
 def _saved(save: Callable[[Path], None], path: Path) -> str:

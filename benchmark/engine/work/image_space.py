@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.metrics import SelfConsistency, VideoConsistency, compensated_flicker
 from semstab.model.frames import Frame
@@ -50,9 +49,9 @@ class ImageSpaceMeter:
 
     def result(self, flicker_percent: float) -> ImageSpace:
         """Means over the frames so far, beside the flicker that the unit's summary has."""
-        return image_space_of(self.rows.table(), flicker_percent)
+        return image_space_of(self.rows, flicker_percent)
 
 
-def image_space_of(rows: npt.NDArray[np.float64], flicker_percent: float) -> ImageSpace:
-    """Means over frames, of which a row (F, C) each says what it told."""
-    return ImageSpace(flicker_percent, **{name: mean(column) for name, column in zip(COLUMNS, rows.T, strict=True)})
+def image_space_of(rows: Rows, flicker_percent: float) -> ImageSpace:
+    """Means over frames, of which a row of COLUMNS each says what it told."""
+    return ImageSpace(flicker_percent, **{name: mean(rows.column(k)) for k, name in enumerate(COLUMNS)})

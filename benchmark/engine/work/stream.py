@@ -30,6 +30,9 @@ from semstab.task import Task, prepare
 AXES = 9
 """Numbers that tell where a camera is, which way it looks and how it is rolled."""
 
+POSES = 1 << 16
+"""Of more cameras every n-th is looked at for the up axis."""
+
 SHOWN_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
 
@@ -131,8 +134,8 @@ class Stream:
 
     @property
     def poses(self) -> npt.NDArray[np.float64]:
-        """(F, 3, 3) down, forward and centre of each camera in the world; of none where up need not be estimated."""
-        return np.zeros((0, 3, 3)) if self._poses is None else self._poses.table().reshape(-1, 3, 3)
+        """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
+        return np.zeros((0, 3, 3)) if self._poses is None else some_poses(self._poses)
 
     def next_frame(self, decoded: Decoded, watch: Stopwatch, *, color: bool) -> Prepared:
         """The frame as the stream's units fuse it; with its colour only where somebody but the figures wants it."""
@@ -162,6 +165,11 @@ class Stream:
         if self.truth_task is None or decoded.truth is None:
             return None
         return prepare(self.truth_task, decoded.truth, self.pixel_stride)
+
+
+def some_poses(rows: Rows) -> npt.NDArray[np.float64]:
+    """(F, 3, 3) of each row, or of every n-th where there are more than are needed to tell where up is."""
+    return rows.table(step=max(1, -(-len(rows) // POSES))).reshape(-1, 3, 3)
 
 
 def streams_of(maps: Iterable[UnitMap]) -> list[Stream]:

@@ -25,6 +25,9 @@ POINTS = 10_000
 ITERATIONS = 2_000
 """Draws of three points a plane. They all lie in a plane of 15% of the points once in 300 draws."""
 
+CHUNKS = 50
+"""Parts of these draws whose points are looked at together."""
+
 
 @dataclass(frozen=True, eq=False)
 class Plane:
@@ -65,25 +68,42 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
 
 def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
     """The largest planes, each found among the points that the ones before it left."""
-    import open3d as o3d
-
     origin = np.median(points, axis=0)
     rest, cameras = points - origin, cameras - origin
+    rng = np.random.default_rng(0)
     if len(rest) > POINTS:
-        rest = np.random.default_rng(0).choice(rest, POINTS, replace=False, shuffle=False)
+        rest = rng.choice(rest, POINTS, replace=False, shuffle=False)
     total = len(rest)
     low, high = np.percentile(rest, [5, 95], axis=0)
     distance = THICKNESS * float(np.linalg.norm(high - low))
-    o3d.utility.random.seed(0)
     for _ in range(PLANES):
         if len(rest) < 3 or distance == 0:
             return
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rest))
-        # Probability 1: an early stop would depend on the threads' timing.
-        model, inliers = cloud.segment_plane(distance, ransac_n=3, num_iterations=ITERATIONS, probability=1.0)
-        above = np.median(cameras @ model[:3] + model[3]) > 0
-        yield Plane(_unit(model[:3] if above else -model[:3]), len(inliers) / total)
-        rest = np.delete(rest, inliers, axis=0)
+        inlier = _largest_plane(rest, distance, rng)
+        if not inlier.any():
+            return
+        mean = rest[inlier].mean(axis=0)
+        normal = np.linalg.eigh(np.cov(rest[inlier].T))[1][:, 0]  # the least squares' plane of the inliers
+        above = np.median((cameras - mean) @ normal) > 0
+        yield Plane(normal if above else -normal, np.count_nonzero(inlier) / total)
+        rest = rest[~inlier]
+
+
+def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """Which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
+
+    Here and not by Open3D, as a run that fuses without it takes a second to load it.
+    """
+    a, b, c = points[rng.integers(len(points), size=(3, ITERATIONS))]
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    offset = np.where(normal.any(axis=1), -(normal * a).sum(axis=1), np.inf)  # three points in a line are no plane
+    plane = np.column_stack([normal, offset]).astype(np.float32)
+    homogeneous = np.vstack([points.T, np.ones(len(points))]).astype(np.float32)
+    within = [np.count_nonzero(np.abs(some @ homogeneous) <= distance, axis=1) for some in np.split(plane, CHUNKS)]
+    best = plane[int(np.argmax(np.concatenate(within)))]
+    inlier: npt.NDArray[np.bool_] = np.abs(best @ homogeneous) <= distance
+    return inlier
 
 
 def _unit(vector: Float64) -> Float64:

@@ -46,6 +46,7 @@ class VoxelTable:
     frame_entropy_sum  (n,) float64 sum over frames of the entropy of s_bar, bits
     voxel_size         r, metres
     classes            the K class names, where they are known
+    copies             (n,) how many voxels each row stands for, where they are not one each: see `statistics.kinds`
 
     Raises DataError where columns disagree in length or rows are not sorted and distinct.
     """
@@ -63,6 +64,7 @@ class VoxelTable:
     frame_entropy_sum: Float64
     voxel_size: float
     classes: tuple[str, ...] = ()
+    copies: Float64 | None = None
 
     def __post_init__(self) -> None:
         _freeze_columns(self, _VOXEL_TYPES, self.ix)
@@ -95,7 +97,13 @@ class VoxelTable:
     def rows(self, rows: Any) -> VoxelTable:
         """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
-        return replace(self, **columns, evidence=self.evidence.take(rows))
+        copies = None if self.copies is None else self.copies[rows]
+        return replace(self, **columns, evidence=self.evidence.take(rows), copies=copies)
+
+    @property
+    def voxels(self) -> Float64:
+        """(n,) how many voxels each row stands for."""
+        return np.ones(len(self)) if self.copies is None else self.copies
 
     def measured(self) -> VoxelTable:
         """The same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
@@ -230,7 +238,8 @@ class Events:
     def __post_init__(self) -> None:
         _freeze_columns(self, _INDEX_TYPES, self.ix)
         _freeze_columns(self, _EVENT_TYPES, self.voxel)
-        if not np.array_equal(self.voxel[self.starts], np.arange(len(self.ix))):
+        further = self.voxel[1:][self.voxel[1:] != self.voxel[:-1]]
+        if not np.array_equal(np.append(self.voxel[:1], further), np.arange(len(self.ix))):
             raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
 
     def __len__(self) -> int:
@@ -244,9 +253,11 @@ class Events:
     @cached_property
     def bounds(self) -> Int64:
         """(n + 1,) first row of each voxel, then how many rows there are."""
-        begins = np.ones(len(self), np.bool_)
-        np.not_equal(self.voxel[1:], self.voxel[:-1], out=begins[1:])
-        return np.append(np.flatnonzero(begins), len(self))
+        from semstab.model.row_kernel import bound_groups
+
+        bounds = np.zeros(len(self.ix) + 1, np.int64)
+        bound_groups(self.voxel, bounds)
+        return bounds
 
     @property
     def starts(self) -> Int64:
@@ -327,12 +338,12 @@ class Events:
 
     def rows(self, voxels: Int64) -> Events:
         """The log of these of its voxels (r,), ascending."""
-        first, T = self.bounds[voxels], np.diff(self.bounds)[voxels]
-        of = np.repeat(np.arange(len(T)), T)
-        rows = np.arange(len(of)) + (first - np.cumsum(T) + T)[of]
+        count = self.bounds[voxels + 1] - self.bounds[voxels]
+        number = np.repeat(np.arange(len(voxels)), count)
+        rows = np.arange(len(number)) + (self.bounds[voxels] - np.cumsum(count) + count)[number]
         own: dict[str, Any] = {name: getattr(self, name)[voxels] for name in _INDEX_TYPES}
         own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
-        return replace(self, **own, voxel=of, evidence=self.evidence.take(rows))
+        return replace(self, **own, voxel=number, evidence=self.evidence.take(rows))
 
     def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""

@@ -29,6 +29,9 @@ IMAGE_SIDE = 640
 SAMPLING = 2
 """In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
 
+POSES = 1 << 14
+"""About as many of the cameras, at most, make a track."""
+
 JPEG_QUALITY = 80
 COLOR_BYTES = 400_000_000
 """Of a scene's colour, where its frames' files are JPEG: those within their share go into the recording as they are."""
@@ -88,21 +91,23 @@ class CameraLog:
         """Why a colour image is missing, where one is."""
         self._translation = translation
         self._share = COLOR_BYTES // max(frames, 1)
-        self._logged: set[int] = set()
+        self._logged = bytearray()  # for each frame up to the last one, whether it was
         self._overlay = Overlay()
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
         self._depth_unit: float | None = None
 
     @property
     def poses(self) -> npt.NDArray[np.float64]:
-        """(n, 4, 4) so far, relative to the map's origin."""
-        return self._poses.table().reshape(-1, 4, 4)
+        """(n, 4, 4) so far, relative to the map's origin: of very many every n-th, and the last one."""
+        n, step = len(self._poses), 1 + len(self._poses) // POSES
+        return self._poses.table((n - 1) % step, step).reshape(-1, 4, 4)
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, track: bool = True) -> None:
         """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
-        if frame.index in self._logged:
+        self._logged.extend(bytes(max(0, frame.index + 1 - len(self._logged))))
+        if self._logged[frame.index]:
             return
-        self._logged.add(frame.index)
+        self._logged[frame.index] = True
         self._log_camera(stream, frame, self._follow(frame.T_wc))
         if track:
             self.log_track(stream)

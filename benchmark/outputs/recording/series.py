@@ -15,7 +15,7 @@ from semstab.engine.units import Plan
 from semstab.errors import DataError, one_line
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.results import RECURRENT, Unit
-from semstab.outputs.recording.entities import Clock, path
+from semstab.outputs.recording.entities import LAST_DATE, Clock, path
 from semstab.runtime.rows import Rows
 from semstab.task import Task
 
@@ -36,6 +36,9 @@ SERIES = {
 }
 """Time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) and
 compensated_flicker are columns of the CSV."""
+
+PIECE = 1 << 16
+"""Of a long series so many values are sent at a time."""
 
 OF_THE_BACKBONE = ("flicker_percent", "compensated_flicker", "decode_ms", "wait_ms")
 """Series that are the same for all backends."""
@@ -91,10 +94,12 @@ def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, cl
         if not at.any():
             continue
         least[name], largest[name] = float(column[at].min()), float(column[at].max())
-        if name in wanted:
-            known = [None if math.isnan(stamp) else stamp for stamp in stamps[at].tolist()]
-            times = clock.columns(frames[at].tolist(), known)
-            stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=column[at]))
+        dated = bool((np.abs(stamps[at]) <= LAST_DATE).all())
+        for first in range(0, len(column) if name in wanted else 0, PIECE):
+            some = first + np.flatnonzero(at[first : first + PIECE])
+            known = [stamp if dated else None for stamp in stamps[some].tolist()]
+            times = clock.columns(frames[some].tolist(), known)
+            stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=column[some]))
     return [least, largest]
 
 

@@ -6,13 +6,11 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError
-from semstab.metrics.matching import voxel_keys
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 from semstab.statistics.looks.entries import Looks
@@ -44,7 +42,7 @@ def common(maps: Sequence[Looks]) -> Common:
     look, first = _numbered(maps)
     pixels = np.stack([np.bincount(own, looks.weight, len(first)) for own, looks in zip(look, maps, strict=True)])
     least, most = pixels.min(axis=0), pixels.max(axis=0)
-    places = _together(maps).only(first)
+    places = Looks.joined(maps).only(first)
     logs, ignoring = [], []
     for looks, own, seen in zip(maps, look, pixels, strict=True):
         shared = dataclasses.replace(looks, weight=looks.weight * (least / np.where(seen > 0, seen, 1.0))[own])
@@ -64,30 +62,25 @@ def _of_the_same_voxels(maps: Sequence[Looks]) -> list[Looks]:
     for looks in maps:
         kept = looks.only(looks.drawn < share)
         rank = views.rank(looks.views.frame)
-        same.append(dataclasses.replace(kept, view=rank[kept.view], views=views, share=share))
+        same.append(dataclasses.replace(kept, view=rank[kept.view].astype(np.int32), views=views, share=share))
     return same
 
 
 def _numbered(maps: Sequence[Looks]) -> tuple[list[Int64], Int64]:
     """The number of each entry's look, the same in all maps, and one entry of each look among those of all maps."""
     F = max((len(looks.views) for looks in maps), default=1)
-    cells = voxel_keys(*(looks.cell for looks in maps))
-    _, cell = np.unique(np.concatenate(cells), return_inverse=True)
-    view = np.concatenate([looks.view for looks in maps])
-    _, first, look = np.unique(cell * F + view, return_index=True, return_inverse=True)
+    all_of_them = Looks.joined(maps)
+    _, cell = np.unique(all_of_them.key, return_inverse=True)
+    _, first, look = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
     return np.split(look, np.cumsum([len(looks) for looks in maps])[:-1]), first
-
-
-def _together(maps: Sequence[Looks]) -> Looks:
-    names = ("cell", "view", "label", "weight", "drawn")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(looks, name) for looks in maps]) for name in names}
-    return dataclasses.replace(maps[0], **joined)
 
 
 def _filled(looks: Looks, places: Looks, ignored: Float64) -> Looks:
     """A map's entries, and those of a further class that has the pixels `ignored` of each of the places."""
-    further = dataclasses.replace(places, label=np.full(len(places), looks.K), weight=ignored).only(ignored > 0)
-    return dataclasses.replace(_together([looks, further]), K=looks.K + 1, classes=())
+    further = dataclasses.replace(places, label=np.full(len(places), looks.K, np.uint16), weight=ignored).only(
+        ignored > 0
+    )
+    return dataclasses.replace(Looks.joined([looks, further]), K=looks.K + 1, classes=())
 
 
 def decided(log: Events) -> Events:

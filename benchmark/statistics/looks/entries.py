@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,19 +17,20 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
-from semstab.metrics.matching import shared_observations, voxel_keys
+from semstab.metrics.matching import shared_observations
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, index_columns
 from semstab.runtime import arrow
 from semstab.runtime.files import atomic_path, parse_json
+from semstab.statistics.looks.keys import CELLS, DIGITS, Voxel, alike, cells_of, keys_of
 from semstab.statistics.looks.views import Views
 from semstab.statistics.ranks import ranked
 
-CELLS = 4
-"""Cells along a voxel's edge."""
-
 LEAST_FRAMES = 2
 """What a cell shows counts where so many frames saw it: its label is to be more than one frame's own."""
+
+COLUMNS = "key", "view", "label", "weight", "drawn"
+"""Of entries."""
 
 SCHEMA = 2
 OWN, TRUTH = "its own labels in finer cells", "the ground truth"
@@ -67,18 +70,20 @@ class Sample:
 class Looks:
     """Entries (m,) of a cell, a frame and a class: what the frame's pixels in the cell say for the class.
 
-    cell    (m, 3) int64 index of the cell, of which a voxel has CELLS along its edge
-    view    (m,) int64 row of `views`
-    label   (m,) int64
+    key     (m,) int64 of the cell, see `keys`
+    view    (m,) int32 row of `views`
+    label   (m,) uint16
     weight  (m,) pixels of that label, or the sum of their scores
-    drawn   (m,) the hash of the voxel; in the sample are those below `share`
+    drawn   (m,) uint32, the hash of the voxel; in the sample are those below `share`
+    low     voxel at which keys begin
     """
 
-    cell: Int64
-    view: Int64
-    label: Int64
+    key: Int64
+    view: npt.NDArray[np.int32]
+    label: npt.NDArray[np.uint16]
     weight: Float64
-    drawn: Int64
+    drawn: npt.NDArray[np.uint32]
+    low: Voxel
     views: Views
     voxel_size: float
     K: int
@@ -87,51 +92,78 @@ class Looks:
     classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        return len(self.label)
+        return len(self.key)
+
+    @property
+    def cell(self) -> Int64:
+        """(m, 3) index of the cell, of which a voxel has CELLS along its edge."""
+        return cells_of(self.key, self.low)
 
     def sample(self) -> Sample:
         """Observations of the voxels, and those of labels that do not depend on the view."""
         from semstab.statistics.looks.observing import settle
 
-        own, voxel, child = self._in_order()
-        kept, shown = np.empty(len(own), np.bool_), np.empty(len(own), np.int64)
-        settle(voxel, own.view, child, own.label, own.weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
-        limit = dataclasses.replace(own, label=shown)
-        return Sample(own._looks(voxel, kept), limit._looks(voxel, kept), self.views, self.soft)
+        own = self._in_order()
+        kept, shown = np.empty(len(own), np.bool_), np.empty(len(own), np.uint16)
+        settle(own.key, own.view, own.label, own.weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
+        seen, limit = own._log(own.label, kept), own._log(shown, kept)
+        return Sample(seen, dataclasses.replace(seen, evidence=limit.evidence), self.views, self.soft)
 
-    def only(self, rows: npt.NDArray[Any]) -> Looks:
+    def only(self, rows: Any) -> Looks:
         """Some of the entries."""
-        names = ("cell", "view", "label", "weight", "drawn")
-        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
+        return self._each(lambda column: column[rows])
+
+    def copied(self) -> Looks:
+        """The same in memory of its own."""
+        return self._each(np.copy)
+
+    def _each(self, change: Callable[[Any], Any]) -> Looks:
+        columns: dict[str, Any] = {name: change(getattr(self, name)) for name in COLUMNS}
+        return dataclasses.replace(self, **columns)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Looks]) -> Looks:
+        """The entries of one after the other, with all else of the first."""
+        keys, low = alike([part.key for part in parts], [part.low for part in parts])
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS[1:]
+        }
+        return dataclasses.replace(parts[0], key=np.concatenate(keys), **columns, low=low)
 
     def observations(self) -> Events:
         """The log of the sampled voxels: what the entries of a voxel and a frame say together."""
-        own, voxel, _ = self._in_order()
-        return own._looks(voxel, np.ones(len(own), np.bool_))
+        own = self._in_order()
+        return own._log(own.label, np.ones(len(own), np.bool_))
 
-    def _in_order(self) -> tuple[Looks, Int64, Int64]:
-        """The same by voxel and frame, entries of one as they come; the key of each voxel, the number of each cell."""
-        (voxel,) = voxel_keys(self.cell // CELLS)
-        order = _order(voxel, self.view)
-        own = self.only(order)
-        x, y, z = (own.cell % CELLS).T
-        return own, voxel[order], (x * CELLS + y) * CELLS + z
+    def _in_order(self) -> Looks:
+        """The same by voxel and frame, entries of one as they come."""
+        from semstab.statistics.looks.observing import extent, places
 
-    def _looks(self, voxel: Int64, kept: npt.NDArray[np.bool_]) -> Events:
-        """The log of the kept entries, which are in order."""
+        low, high, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(len(self), np.int64)
+        extent(self.key, low, high)
+        size = high - low + 1
+        views = len(self.views)
+        if math.prod(size.tolist()) * views < 2**63:
+            places(self.key, self.view, low, size, views, place)
+        else:
+            place = np.unique(self.key >> DIGITS, return_inverse=True)[1] * views + self.view
+        return self.only(ranked(place))
+
+    def _log(self, label: npt.NDArray[np.uint16], kept: npt.NDArray[np.bool_]) -> Events:
+        """The log of the kept entries, which are in order and have these labels."""
         from semstab.statistics.looks.observing import look
 
         n = len(self)
-        first, of, starts, label = (np.empty(n + more, np.int64) for more in (0, 0, 1, 0))
-        pixels, share = np.empty(n), np.empty(n)
-        n, m = look(voxel, self.view, self.label, self.weight, kept, self.K, first, of, pixels, starts, label, share)
-        frames = self.views.frame.astype(np.int32)
+        first, of, starts = (np.empty(n + more, np.int64) for more in (0, 0, 1))
+        pixels, share, said = np.empty(n), np.empty(n), np.empty(n, np.uint16)
+        n, m = look(self.key, self.view, label, self.weight, kept, self.K, first, of, pixels, starts, said, share)
         first, of = first[:n], of[:n]
+        at = self.key[first[np.flatnonzero(np.diff(of, prepend=-1))]]
         return Events(
-            **index_columns(self.cell[first[np.flatnonzero(np.diff(of, prepend=-1))]] // CELLS),
+            **index_columns(cells_of(at, self.low) // CELLS),
             voxel=of,
-            frame=frames[self.view[first]],
-            evidence=Evidence(starts[: n + 1], label[:m].astype(np.uint16), share[:m], self.K),
+            frame=self.views.frame.astype(np.int32)[self.view[first]],
+            evidence=Evidence(starts[: n + 1], said[:m], share[:m], self.K),
             pixels=np.rint(pixels[:n]).astype(np.int64),
             voxel_size=self.voxel_size,
             classes=self.classes,
@@ -143,12 +175,10 @@ class Looks:
         import pyarrow.parquet as pq
 
         columns = dict(zip("xyz", self.cell.astype(np.int32).T, strict=True))
-        columns |= {"view": self.view.astype(np.int32), "label": self.label.astype(np.uint16)}
-        columns |= {"weight": self.weight, "drawn": self.drawn.astype(np.uint32)}
+        columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
-        about["views"] = self.views.rows().tolist()
         content = pa.table({name: arrow.column(values) for name, values in columns.items()})
-        text = json.dumps({"schema": SCHEMA, "kind": "Looks", **about})
+        text = f'{json.dumps({"schema": SCHEMA, "kind": "Looks", **about})[:-1]}, "views": {self.views.text()}}}'
         with atomic_path(path) as temporary:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
 
@@ -166,17 +196,7 @@ class Looks:
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
             x, y, z, view, label, weight, drawn = (column.to_numpy() for column in content.columns)
-            cell = np.stack([x, y, z], axis=1).astype(np.int64)
-            return cls(
-                cell, view.astype(np.int64), label.astype(np.int64), weight, drawn.astype(np.int64), views, **about
-            )
+            key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
+            return cls(key, view, label, weight, drawn, low, views, **about)
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of sampled looks ({one_line(error)})") from error
-
-
-def _order(place: Int64, view: Int64) -> Int64:
-    """What sorts entries by place and view, stably."""
-    views = int(view.max(initial=0)) + 1
-    if (int(place.max(initial=0)) + 1) * views >= 2**63:
-        place = np.unique(place, return_inverse=True)[1]
-    return ranked(place * views + view)

@@ -5,44 +5,72 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.runtime.compiled import serial
+from semstab.statistics.looks.keys import DIGITS, SHIFTS, SPAN
+
+FIRST, SECOND, THIRD = SHIFTS
 
 
 @serial
-def settle(voxel, view, child, label, weight, cells, K, least, kept, shown):
+def extent(key, low, high):
+    """Set low and high (3,) to the least and largest voxel index of each axis in keys (n,), 0 where there are none."""
+    mask = SPAN - 1
+    low[:], high[:] = mask if len(key) else 0, 0
+    for i in range(len(key)):
+        x, y, z = key[i] >> FIRST, (key[i] >> SECOND) & mask, (key[i] >> THIRD) & mask
+        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
+        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
+
+
+@serial
+def places(key, view, low, size, views, place):
+    """A number (n,) for the voxel and frame of each entry, ascending with x, y, z and frame, of voxels in a box."""
+    mask = SPAN - 1
+    for i in range(len(key)):
+        x, y, z = key[i] >> FIRST, (key[i] >> SECOND) & mask, (key[i] >> THIRD) & mask
+        voxel = ((x - low[0]) * size[1] + (y - low[1])) * size[2] + (z - low[2])
+        place[i] = voxel * views + view[i]
+
+
+@serial
+def settle(key, view, label, weight, cells, K, least, kept, shown):
     """Whether `least` frames or more saw each entry's cell, and the class with the largest sum of shares there.
 
-    A frame's classes have shares of its pixels in the cell; the lowest class on ties. All arrays are (n,); `child` is
-    the number of the cell in its voxel, which has so many `cells`.
+    A frame's classes have shares of its pixels in the cell; the lowest class on ties. All arrays are (n,); a voxel has
+    so many `cells`.
     """
     seen, pixels, sums = np.zeros(cells, np.int64), np.zeros(cells), np.zeros((cells, K))
-    most, best = np.zeros(cells), np.zeros(cells, np.int64)
+    most, best, which = np.zeros(cells), np.zeros(cells, np.uint16), (1 << DIGITS) - 1
     start = 0
-    while start < len(voxel):
-        end = start
-        while end < len(voxel) and voxel[end] == voxel[start]:
+    while start < len(key):
+        end, voxel = start, key[start] >> DIGITS
+        while end < len(key) and key[end] >> DIGITS == voxel:
             first = end
-            while end < len(voxel) and voxel[end] == voxel[first] and view[end] == view[first]:
-                seen[child[end]] += pixels[child[end]] == 0.0
-                pixels[child[end]] += weight[end]
+            while end < len(key) and key[end] >> DIGITS == voxel and view[end] == view[first]:
+                c = key[end] & which
+                seen[c] += pixels[c] == 0.0
+                pixels[c] += weight[end]
                 end += 1
             for i in range(first, end):
-                sums[child[i], label[i]] += weight[i] / pixels[child[i]]
+                c = key[i] & which
+                sums[c, label[i]] += weight[i] / pixels[c]
             for i in range(first, end):
-                pixels[child[i]] = 0.0
+                pixels[key[i] & which] = 0.0
         for i in range(start, end):
-            c, own = child[i], sums[child[i], label[i]]
+            c = key[i] & which
+            own = sums[c, label[i]]
             if own > most[c] or (own == most[c] and label[i] < best[c]):
                 most[c], best[c] = own, label[i]
         for i in range(start, end):
-            kept[i], shown[i] = seen[child[i]] >= least, best[child[i]]
+            c = key[i] & which
+            kept[i], shown[i] = seen[c] >= least, best[c]
         for i in range(start, end):
-            c = child[i]
+            c = key[i] & which
             seen[c], most[c], sums[c, label[i]] = 0, 0.0, 0.0
         start = end
 
 
 @serial
-def look(voxel, view, label, weight, kept, K, first, of, pixels, starts, classes, shares):
+def look(key, view, label, weight, kept, K, first, of, pixels, starts, classes, shares):
     """The looks at voxels: of each its voxel, its pixels, and the share of each class among them, classes ascending.
 
     Only of what is kept. `first` is an entry of each look, `of` counts voxels that have one; returns how many looks,
@@ -53,9 +81,9 @@ def look(voxel, view, label, weight, kept, K, first, of, pixels, starts, classes
     voxels = -1
     before = np.int64(-1)
     starts[0] = 0
-    while start < len(voxel):
-        end, many, total = start, 0, 0.0
-        while end < len(voxel) and voxel[end] == voxel[start] and view[end] == view[start]:
+    while start < len(key):
+        end, many, total, voxel = start, 0, 0.0, key[start] >> DIGITS
+        while end < len(key) and key[end] >> DIGITS == voxel and view[end] == view[start]:
             if kept[end]:
                 if sums[label[end]] == 0.0:
                     met[many] = label[end]
@@ -64,8 +92,8 @@ def look(voxel, view, label, weight, kept, K, first, of, pixels, starts, classes
                 total += weight[end]
             end += 1
         if many:
-            voxels += voxel[start] != before
-            before = voxel[start]
+            voxels += voxel != before
+            before = voxel
             first[n], of[n], pixels[n] = start, voxels, total
             met[:many].sort()
             for own in met[:many]:

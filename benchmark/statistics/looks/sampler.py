@@ -18,7 +18,8 @@ import numpy.typing as npt
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.runtime.rows import Rows
-from semstab.statistics.looks.entries import CELLS, Looks, Sample
+from semstab.statistics.looks.entries import Looks, Sample
+from semstab.statistics.looks.keys import SPAN, Voxel
 from semstab.statistics.looks.views import VIEW, Views
 from semstab.statistics.ranks import numbered
 
@@ -31,11 +32,11 @@ PIECE = 1 << 20
 SIDE = 640
 """Of frames with more pixels on a side every n-th of each axis is looked at."""
 
-REACH = 1 << 18
+REACH = SPAN // 2
 """Voxels from the first camera within which there is a sample."""
 
-COLUMNS = np.int64, np.int32, np.uint16, np.float64, np.uint32
-"""Of entries: the key of the cell, the row of the frame, the class, its pixels or sum of scores, the voxel's hash."""
+TYPES = np.int64, np.int32, np.uint16, np.float64, np.uint32
+"""Of the columns of entries."""
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -52,11 +53,14 @@ class Pixels:
     label: npt.NDArray[np.uint16]
     pixel: npt.NDArray[np.int32]
 
-    def grouped(self) -> tuple[int, Int64, Float64]:
-        """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels."""
+    def grouped(self, *, numbered: bool) -> tuple[int, Int64, Float64]:
+        """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels.
+
+        Which they are is said only where it is asked for.
+        """
         from semstab.statistics.looks.loops import grouped
 
-        of, pixels = np.empty(len(self.cell), np.int64), np.empty(len(self.cell))
+        of, pixels = np.empty(len(self.cell) if numbered else 0, np.int64), np.empty(len(self.cell))
         return grouped(self.cell, self.label, self.drawn, of, pixels), of, pixels
 
 
@@ -71,12 +75,12 @@ class Sampler:
         voxel_size: float,
         num_classes: int,
         budget: int = BUDGET,
-        origin: tuple[int, int, int] | None = None,
+        origin: Voxel | None = None,
     ) -> None:
         self.voxel_size, self.K, self.budget = voxel_size, num_classes, budget
         self._share = 1 << 32
         self._origin: Int64 | None = None if origin is None else np.array(origin, dtype=np.int64)
-        self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in COLUMNS)
+        self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in TYPES)
         self._entries = 0
         self._views = Rows(VIEW)
         self._soft = False
@@ -91,56 +95,63 @@ class Sampler:
         self._views.append([frame.index, *centre.tolist(), when])
         self._soft = self._soft or frame.scores is not None
         entries_of = self._labels if frame.scores is None else self._scores
-        for key, label, weight, drawn in entries_of(frame, self._drawn(frame)):
-            self._take(key, np.full(len(key), len(self._views) - 1, np.int32), label, weight, drawn)
+        for entries in entries_of(frame, self._drawn(frame)):
+            self._take(entries)
 
     def _drawn(self, frame: Frame) -> Pixels:
         """The frame's valid pixels in sampled voxels; the label of soft ones is the same for all."""
-        from semstab.statistics.looks.loops import cells_of, draw
+        from semstab.statistics.looks.loops import draw
 
         (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
         ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
-        points, drawn = np.empty((3, H * W)), np.empty(H * W, np.uint32)
+        cell, drawn = np.empty(H * W, np.int64), np.empty(H * W, np.uint32)
         label, pixel = np.empty(H * W, np.uint16), np.empty(H * W, np.int32)
         valid = fixed(frame.valid)
         labels = valid.view(np.uint8) if frame.labels is None else fixed(frame.labels)
         n = draw(
-            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share,
-            points, drawn, label, pixel,
+            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share, self._origin, REACH,
+            cell, drawn, label, pixel,
         )  # fmt: skip
-        cell = np.empty(n, np.int64)
-        cells_of(points[:, :n], T_wc, self.voxel_size, self._origin, REACH, cell)
-        near = slice(n) if cell.min(initial=0) >= 0 else np.flatnonzero(cell >= 0)
+        near = slice(n) if cell[:n].min(initial=0) >= 0 else np.flatnonzero(cell[:n] >= 0)
         return Pixels(cell[near], drawn[near], label[near], pixel[near])
 
-    def _take(self, *part: npt.NDArray[Any]) -> None:
-        """Take entries in; where they would be too many, every second voxel goes until they are not."""
-        from semstab.statistics.looks.loops import keep
+    def _take(self, entries: Entries) -> None:
+        """Take entries of the last view in; where they would be too many, every second voxel goes until they are not.
 
-        more = keep(self._share, len(part[0]), *part)  # a part of the frame that came before may have lowered it
-        while self._entries + more > self.budget:
+        A part of the view that came before may have lowered the share.
+        """
+        from semstab.statistics.looks.loops import append, keep
+
+        drawn = entries[-1]
+        while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
             self._share //= 2
             self._entries = keep(self._share, self._entries, *self._columns)
-            more = keep(self._share, more, *part)
-        for column, values in zip(self._columns, part, strict=True):
-            column[self._entries : self._entries + more] = values[:more]
-        self._entries += more
+        self._entries = append(self._share, self._entries, len(self._views) - 1, *entries, *self._columns)
 
     def sample(self) -> Sample:
         """What is there so far, as observations of the sampled voxels."""
-        return self.looks().sample()
+        return self._so_far().sample()
 
     def looks(self, classes: tuple[str, ...] = ()) -> Looks:
         """What is there so far, cell by cell."""
+        return dataclasses.replace(self._so_far().copied(), classes=classes)
+
+    def _so_far(self) -> Looks:
+        """What is there until the next frame changes it."""
+        x, y, z = (0, 0, 0) if self._origin is None else (self._origin - REACH).tolist()
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
         return Looks(
-            self._cells(key), view.astype(np.int64), label.astype(np.int64), weight.copy(), drawn.astype(np.int64),
-            Views.of(self._views.table()), self.voxel_size, self.K, self._share, self._soft, classes,
+            key, view, label, weight, drawn, (x, y, z), self._seen_from(),
+            self.voxel_size, self.K, self._share, self._soft,
         )  # fmt: skip
+
+    def _seen_from(self) -> Views:
+        frame, x, y, z, when = (self._views.column(k) for k in range(VIEW))
+        return Views(frame.astype(np.int64), np.stack([x, y, z], axis=1), when)
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, pixels, hash) of a frame's labels."""
-        m, _, count = pixels.grouped()
+        m, _, count = pixels.grouped(numbered=False)
         yield pixels.cell[:m], pixels.label[:m], count[:m], pixels.drawn[:m]
 
     def _scores(self, frame: Frame, pixels: Pixels) -> Iterator[Entries]:
@@ -148,7 +159,7 @@ class Sampler:
         from semstab.statistics.looks.loops import add_rows
 
         assert frame.scores is not None
-        _, of, _ = pixels.grouped()
+        _, of, _ = pixels.grouped(numbered=True)
         for piece in _pieces(of, max(1, PIECE // self.K)):
             some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
             s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)
@@ -158,15 +169,6 @@ class Sampler:
             add_rows(s, number, sums)
             row, label = np.nonzero(sums)
             yield pixels.cell[own[row]], label.astype(np.uint16), sums[row, label], pixels.drawn[own[row]]
-
-    def _cells(self, key: Int64) -> Int64:
-        """Indices (n, 3) of cells by their keys: three voxel indices of 19 bits, three digits of 2 bits."""
-        origin = np.zeros(3, dtype=np.int64) if self._origin is None else self._origin
-        cells = np.empty((len(key), 3), np.int64)
-        for axis, (bits, digit) in enumerate(((44, 4), (25, 2), (6, 0))):
-            voxel = ((key >> bits) & (2 * REACH - 1)) + (origin[axis] - REACH)
-            cells[:, axis] = CELLS * voxel + ((key >> digit) & (CELLS - 1))
-        return cells
 
 
 def _pieces(of: Int64, most: int) -> list[Int64]:
@@ -185,19 +187,9 @@ def merged(stretches: Sequence[Looks], budget: int = BUDGET) -> Looks:
     while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:
         share //= 2
     kept = [looks.only(looks.drawn < share) for looks in stretches]
-    before = np.cumsum([0, *(len(looks.views) for looks in stretches)])
-
-    def joined(name: str) -> npt.NDArray[Any]:
-        return np.concatenate([getattr(looks, name) for looks in kept])
-
-    return dataclasses.replace(
-        stretches[0],
-        cell=joined("cell"),
-        label=joined("label"),
-        weight=joined("weight"),
-        drawn=joined("drawn"),
-        view=np.concatenate([looks.view + first for looks, first in zip(kept, before, strict=False)]),
-        views=Views.joined([looks.views for looks in stretches]),
-        share=share,
-        soft=any(looks.soft for looks in stretches),
+    before = np.cumsum([0, *(len(looks.views) for looks in stretches)], dtype=np.int32)
+    joined = Looks.joined(
+        [dataclasses.replace(own, view=own.view + first) for own, first in zip(kept, before, strict=False)]
     )
+    views = Views.joined([looks.views for looks in stretches])
+    return dataclasses.replace(joined, views=views, share=share, soft=any(looks.soft for looks in stretches))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,9 @@ Int64 = npt.NDArray[np.int64]
 
 VIEW = 5
 """Numbers of a view: frame, centre, time stamp."""
+
+AT_ONCE = 4096
+"""Views that are made text together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,11 @@ class Views:
     def rows(self) -> Float64:
         """(V, 5) what `of` takes."""
         return np.concatenate([self.frame[:, None], self.centre, self.timestamp[:, None]], axis=1)
+
+    def text(self) -> str:
+        """Its rows as JSON, made some at a time: as Python's numbers all of them would take ten times the memory."""
+        rows = self.rows()
+        return f"[{', '.join(json.dumps(rows[k : k + AT_ONCE].tolist())[1:-1] for k in range(0, len(rows), AT_ONCE))}]"
 
     def take(self, rows: Int64) -> Views:
         """Some of them."""
