@@ -228,10 +228,10 @@ class Events:
     ix: Int32
     iy: Int32
     iz: Int32
-    voxel: Int32
+    voxel: npt.NDArray[np.integer]
     frame: Int32
     evidence: Evidence
-    pixels: Int32
+    pixels: npt.NDArray[np.integer]
     voxel_size: float
     classes: tuple[str, ...] = ()
 
