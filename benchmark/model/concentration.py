@@ -53,15 +53,22 @@ class Concentration:
 
 
 def by_group(
-    group: npt.NDArray[Any], values: Sequence[npt.NDArray[Any]] | Float64, groups: int
+    group: npt.NDArray[Any],
+    values: Sequence[npt.NDArray[Any]] | Float64,
+    groups: int,
+    voxels: Float64 | None = None,
 ) -> tuple[Float64, Float64]:
-    """(groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group."""
+    """(groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group.
+
+    Each row counts as so many voxels (n,), as one where that is not given.
+    """
     from semstab.model.row_kernel import add_by_group
 
     def of(some: slice) -> Float64:
         part = np.zeros((2, groups, len(values)))
         own = np.stack([column[some] for column in values], dtype=np.float64)
-        add_by_group(group[some].astype(np.int64, copy=False), own, *part)
+        many = np.ones(own.shape[1]) if voxels is None else voxels[some]
+        add_by_group(group[some].astype(np.int64, copy=False), own, many, *part)
         return part
 
     sums, defined = blockwise(of, len(group), groups)

@@ -60,8 +60,11 @@ def concentrate(
 
 
 @serial
-def add_by_group(group: Any, values: Any, sums: Any, defined: Any) -> None:
-    """Add values (C, n) that are not NaN to the row of sums (G, C) of each group (n,), and count them; -1 is none."""
+def add_by_group(group: Any, values: Any, voxels: Any, sums: Any, defined: Any) -> None:
+    """Add values (C, n) that are not NaN to the row of sums (G, C) of each group (n,), and count them; -1 is none.
+
+    A row counts as so many voxels (n,).
+    """
     for i in range(group.shape[0]):
         g = group[i]
         if g < 0:
@@ -69,5 +72,12 @@ def add_by_group(group: Any, values: Any, sums: Any, defined: Any) -> None:
         for c in range(values.shape[0]):
             value = values[c, i]
             known = value == value  # noqa: PLR0124 - NaN is not
-            sums[g, c] += value if known else 0.0
-            defined[g, c] += 1.0 if known else 0.0
+            sums[g, c] += voxels[i] * value if known else 0.0
+            defined[g, c] += voxels[i] if known else 0.0
+
+
+@serial
+def bound_groups(of: Any, bounds: Any) -> None:
+    """Fill bounds[1:] of (n + 1,) with where each of n groups ends; of (m,) are numbers from 0 on, ascending."""
+    for row in range(of.shape[0]):
+        bounds[of[row] + 1] = row + 1

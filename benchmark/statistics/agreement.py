@@ -191,10 +191,10 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
         log, bounds = table.evidence.entries, np.zeros(len(table) + 1, np.int64)
     else:
         log, bounds, told = events.evidence.entries, events.bounds, True
-    add_class_sums(table.evidence.entries, table.op, one_hot, bounds, log, sums[:5])
+    add_class_sums(table.evidence.entries, table.op, table.voxels, one_hot, bounds, log, sums[:5])
     if not told:
         sums[2:5, sums[0] > 0] = np.nan
-    sums[5], sums[6] = np.count_nonzero(again), table.op.sum(dtype=np.int64, where=again)
+    sums[5], sums[6] = table.voxels.sum(where=again), (table.voxels * table.op).sum(where=again)
     return sums
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics import strata
-from semstab.metrics.matching import shared_rows
+from semstab.metrics.matching import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.model.concentration import blockwise, by_group
-from semstab.model.evidence import Evidence
+from semstab.model.evidence import Evidence, stretches
 from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
@@ -55,11 +55,15 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
     Raises DataError where the maps differ in K or voxel size.
     """
-    rows, true_rows = shared_rows(table, truth)
-    found = truth.evidence.concentration
-    pure = found.largest[true_rows] > PURE
-    label = np.full(len(table), -1, dtype=np.int64)
-    label[rows[pure]] = found.label[true_rows[pure]]
+    require_same_grid(table, truth)
+    label = np.empty(len(truth), np.int64)
+    for some in stretches(len(truth)):
+        found = truth.evidence.take(some).concentration
+        label[some] = np.where(found.largest > PURE, found.label.astype(np.int64), -1)
+    if not same_voxels(table, truth):
+        (rows, true_rows), true = shared_rows(table, truth), label
+        label = np.full(len(table), -1)
+        label[rows] = true[true_rows]
     return Truth(label >= 0, label)
 
 
@@ -70,6 +74,7 @@ class Judged:
     label, predicted  the true and the most likely class
     confidence        belief in the latter
     error             squared distance of the belief from certainty of the true class, for Brier's score
+    voxels            how many each stands for
     K                 number of classes
     """
 
@@ -77,21 +82,22 @@ class Judged:
     predicted: npt.NDArray[np.int64]
     confidence: Float64
     error: Float64
+    voxels: Float64
     K: int
 
     @classmethod
-    def of(cls, evidence: Float64 | Evidence, label: npt.NDArray[np.int64]) -> Judged:
-        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
+    def of(cls, evidence: Float64 | Evidence, label: npt.NDArray[np.int64], voxels: Float64 | None = None) -> Judged:
+        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing.
+
+        Each is of so many voxels (n,), of one where that is not given.
+        """
         from semstab.statistics.loops.rows import square_errors
 
         kept = Evidence.of(evidence)
         found, error, rest = kept.concentration, np.empty(len(kept)), kept.unseen
         square_errors(kept.entries, np.zeros(0) if rest is None else rest, kept.K, label, error)
-        return cls(label, found.label.astype(np.int64), found.largest, error, kept.K)
-
-    def rows(self, where: Mask) -> Judged:
-        """Those for which `where` (n,) holds."""
-        return Judged(self.label[where], self.predicted[where], self.confidence[where], self.error[where], self.K)
+        many = np.ones(len(kept)) if voxels is None else voxels
+        return cls(label, found.label.astype(np.int64), found.largest, error, many, kept.K)
 
     @property
     def right(self) -> Mask:
@@ -130,7 +136,7 @@ def _judged_by_group(judged: Judged, group: npt.NDArray[np.int64], groups: int) 
 
     def of(some: slice) -> Float64:
         sums = np.zeros((groups, 3 + 3 * BINS + 3 * judged.K))
-        own = (judged.label, judged.predicted, judged.confidence, judged.error)
+        own = (judged.label, judged.predicted, judged.confidence, judged.error, judged.voxels)
         add_judged(group[some], *(values[some] for values in own), BINS, sums)
         return sums
 
@@ -162,19 +168,23 @@ def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
 
 def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
-    return rule_means_of(rule_sums(fused, where, truth))
+    return rule_means_of(rule_sums(fused, where.astype(np.float64), truth))
 
 
-def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None) -> Float64:
-    """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`."""
+def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None) -> Float64:
+    """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
+
+    Each of what was fused stands for so many voxels (n,), 0 leaves it out.
+    """
     evidence = Evidence.of(fused.evidence).measured()
     fused = Voxels(fused.op, evidence, fused.drift_sum)
-    total, defined = by_group(where - np.int64(1), [measure.of(fused) for measure in measures()], 1)
-    often = [np.count_nonzero(where & (fused.op >= measure.lowest_op)) for measure in measures()]
+    all_of_it = np.zeros(len(voxels), np.int64)
+    total, defined = by_group(all_of_it, [measure.of(fused) for measure in measures()], 1, voxels)
+    often = [voxels.sum(where=fused.op >= measure.lowest_op) for measure in measures()]
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
         return rows
-    return np.concatenate([rows, judged_where(Judged.of(evidence, truth.label), where & truth.known)])
+    return np.concatenate([rows, judged_where(Judged.of(evidence, truth.label, voxels), truth.known)])
 
 
 def rule_means_of(sums: Float64) -> RuleMeans:
@@ -199,7 +209,7 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
 
 def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
     """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
-    return judged_strata(Judged.of(table.evidence, truth.label), table.op, truth.known, edges)
+    return judged_strata(Judged.of(table.evidence, truth.label, table.voxels), table.op, truth.known, edges)
 
 
 def judged_strata(judged: Judged, op: npt.NDArray[np.int32], known: Mask, edges: Sequence[int]) -> Float64:

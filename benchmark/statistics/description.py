@@ -36,9 +36,9 @@ from semstab.statistics.agreement import alpha_of, between_of, class_agreement_o
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
 from semstab.statistics.judging.ceiling import losses_of
 from semstab.statistics.judging.verdict import verdict
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.looks import Sample, correlogram, reach_by, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
-from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, answered, judged_by, with_sample
 from semstab.statistics.sums import SecondSums, Whole, first_look, second_look
 
@@ -112,10 +112,11 @@ def analyse(
     """
     if events is not None:
         require_same_map(table, events)
-    given, table, known = table, table.measured(), None if truth is None else join_truth(table, truth)
-    first, further, null = first_look(table, events, known, limit, edges=edges, seed=seed)
+    kinds = Kinds.found(table, events, None if truth is None else join_truth(table, truth))
+    measured = kinds.measured()
+    first, further, null = first_look(measured, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
-    second, more = second_look(table, whole.overall, known, limit)
+    second, more = second_look(measured, whole.overall, limit)
     summary, sums = concluded(
         whole,
         second,
@@ -127,10 +128,9 @@ def analyse(
         critical=critical,
     )
 
-    def maps() -> Maps:  # until they are asked for, what was measured of the rows takes no memory
-        table = given.measured()
-        own = maps_of(table, expected_sbd(table) if null is None else null)
-        return {**own, **further, **more, **whole.overall.maps(table, further)}
+    def maps() -> Maps:  # until they are asked for, what was measured takes no memory
+        found = kinds.spread({**maps_of(kinds.measured().one.table, null), **further, **more})
+        return {**found, **whole.overall.maps(table, found)}
 
     return Analysis(summary, first.own.table.summary(table.voxel_size, table.classes, edges), sums, maps)
 

@@ -15,10 +15,12 @@ from semstab.metrics.summary import STRATA, TableSums, groups_of
 from semstab.model.concentration import by_group
 from semstab.model.evidence import stretches
 from semstab.model.measures import sbd, vss
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import class_sums, disagreement, psa
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.drift import expected_sbd
-from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, influence_sums, merged
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, merged
+from semstab.statistics.sampling.collect import of_log, of_table, with_places
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]
@@ -48,42 +50,51 @@ class MapSums:
     @classmethod
     def of(
         cls,
-        table: VoxelTable,
+        kinds: Kinds,
         edges: Sequence[int] = STRATA,
         *,
-        events: Events | None = None,
-        true_label: npt.NDArray[np.int64] | None = None,
         null: Float64 | None = None,
     ) -> MapSums:
-        """Those of a table, some voxels after the others.
+        """Those of a map, some voxels after the others.
 
-        events      its log, with which null (n,) comes, the SBD of its voxels in random order
-        true_label  (n,) the true classes; how likely places are stable only the whole map tells: `StableLooks`
+        null (n,) is the SBD of one voxel of each kind in random order, which comes with a log. How likely places are
+        stable only the whole map tells: `StableLooks`.
         """
-        alone = events is None and true_label is None
+        one, every = kinds.one, kinds.every
+        alone = every.events is None and every.truth is None
         parts = (
-            cls._of_few(table.rows(some), None if null is None else null[some], edges, alone=alone)
-            for some in stretches(len(table))
+            cls._of_few(one.table.rows(some), one.places.rows(some), None if null is None else null[some], edges, alone)
+            for some in stretches(len(one.table))
         )
         found = functools.reduce(lambda one, other: cls.merged([one, other]), parts)
         if alone:
             return found
-        excess = sbd(table) - (expected_sbd(table) if null is None else null)
-        by_frame = influence_sums(table, events, true_label, sbd_excess=excess, edge=found.places.edge, likely=None)
-        return replace(found, classes=class_sums(table, events), influence=by_frame)
+        excess = sbd(one.table) - (expected_sbd(one.table) if null is None else null)
+        influence = with_places(
+            of_table(one.table, one.places, one.label)
+            if every.events is None
+            else of_log(every.events, every.places, every.label),
+            one.table,
+            one.places,
+            one.label,
+            excess,
+        )
+        return replace(found, classes=class_sums(one.table, one.events), influence=influence)
 
     @classmethod
-    def _of_few(cls, table: VoxelTable, null: Float64 | None, edges: Sequence[int], *, alone: bool) -> MapSums:
+    def _of_few(
+        cls, table: VoxelTable, places: Places, null: Float64 | None, edges: Sequence[int], alone: bool
+    ) -> MapSums:
         """Without what its log or its true classes tell better, unless it is alone."""
-        maps = maps_of(table, null=expected_sbd(table) if null is None else null)
-        some = table if alone else table.rows(slice(0, 0))
-        places = Places.of(table)
+        maps = maps_of(table, null)
+        some = slice(None if alone else 0)
+        looks = of_table(table.rows(some), places.rows(some))
         return cls(
             TableSums.of(table, edges),
             place_sums(table, maps, places),
             stratum_sums(table, maps, edges),
             class_sums(table),
-            influence_sums(some, sbd_excess=maps["sbd_excess"][: len(some)], edge=places.edge),
+            with_places(looks, table.rows(some), places.rows(some), None, maps["sbd_excess"][some]),
         )
 
     @classmethod
@@ -127,8 +138,9 @@ class MapSums:
         )
 
 
-def maps_of(table: VoxelTable, null: Float64) -> Maps:
-    """Numbers of each voxel (n,) that need nothing but its row; null is its SBD expected in random order."""
+def maps_of(table: VoxelTable, null: Float64 | None = None) -> Maps:
+    """Numbers of each voxel (n,) that need nothing but its row; null is its SBD in random order, if a log tells it."""
+    null = expected_sbd(table) if null is None else null
     within, between = disagreement(table)
     parts = decompose(table)
     return {
@@ -169,7 +181,7 @@ def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
         sums.pop(name)[:, :1] for name in ("looks", "agreeing", "own", "own of a look")
     )
     coin = [sums.pop(name) for name in ("of two", "of more")]
-    by_look, by_place = places.sums_by_class(table.evidence, op)
+    by_look, by_place = places.sums_by_class(table)
     further = {
         **{name: [sums[name][:, :1], looks] for name in ("within", "between")},
         "coin": coin,
@@ -182,7 +194,8 @@ def place_sums(table: VoxelTable, maps: Maps, places: Places) -> PlaceSums:
 
 def stratum_sums(table: VoxelTable, maps: Maps, edges: Sequence[int]) -> Float64:
     """(2 * len(BY_STRATUM), strata) of maps: their sums, and how often each is defined."""
-    both = by_group(groups_of(table.op, edges), [maps[name] for name in BY_STRATUM], len(edges) + 1)
+    values = [maps[name] for name in BY_STRATUM]
+    both = by_group(groups_of(table.op, edges), values, len(edges) + 1, table.copies)
     return np.stack(both, axis=-1).reshape(len(edges) + 1, -1).T
 
 

@@ -13,6 +13,10 @@ SPARSE = 8
 """A table may have so many places for one number."""
 
 
+STRETCH = 1 << 16
+"""Places are counted so many at a time: what stays in a core's cache costs no new memory."""
+
+
 def ranked(numbers: Int64) -> Int64:
     """The order (n,) that sorts numbers from 0 on, stably.
 
@@ -23,11 +27,31 @@ def ranked(numbers: Int64) -> Int64:
     if most < 1 << 16 or most >> (63 - bits):
         order: Int64 = np.argsort(numbers.astype(np.min_scalar_type(most)), kind="stable")
         return order
+    placed = _placed(numbers, bits)
+    placed &= (1 << bits) - 1
+    return placed
+
+
+def ordered(numbers: Int64) -> tuple[Int64, Int64]:
+    """The numbers, ascending, and what `ranked` says of them."""
+    bits = len(numbers).bit_length()
+    if int(numbers.max(initial=0)) >> (63 - bits):
+        order = ranked(numbers)
+        return numbers[order], order
+    placed = _placed(numbers, bits)
+    order = placed & ((1 << bits) - 1)
+    placed >>= bits
+    return placed, order
+
+
+def _placed(numbers: Int64, bits: int) -> Int64:
+    """The numbers, ascending, with the place of each in so many lowest bits."""
     placed = numbers.astype(np.int64)
     placed <<= bits
-    placed |= np.arange(len(numbers))
+    for first in range(0, len(placed), STRETCH):
+        some = placed[first : first + STRETCH]
+        some |= np.arange(first, first + len(some))
     placed.sort()
-    placed &= (1 << bits) - 1
     return placed
 
 

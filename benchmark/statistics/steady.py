@@ -97,7 +97,8 @@ def _votes(table: VoxelTable) -> tuple[Votes, Int64]:
     longest = int(T.max(initial=0)) + 1
     votes = np.rint(vss(table)[again] * T).astype(np.int64)
     pairs, of = numbered(votes + T * longest)
-    return Votes(*np.divmod(pairs, longest), np.bincount(of, minlength=len(pairs)).astype(np.int64)), of
+    count = np.bincount(of, weights=table.voxels[again], minlength=len(pairs)).astype(np.int64)
+    return Votes(*np.divmod(pairs, longest), count), of
 
 
 def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:

@@ -52,8 +52,8 @@ from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
 from semstab.statistics.correctness import join_truth
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import maps_of
-from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sums import first_look
 from semstab.task import Task, read
 
@@ -264,13 +264,12 @@ def _looked_at(one: UnitMap, table: VoxelTable, *, judged: bool) -> _Part:
     if not judged:
         return _Part(table, TableSums.of(table, config.strata).arrays(), events=events)
     if not config.statistics:
-        return _Part(table, first_look(table, edges=config.strata)[0].arrays(), events=events)
+        return _Part(table, first_look(Kinds.found(table), edges=config.strata)[0].arrays(), events=events)
     truth = None if one.truth is None else _table(one.truth, one.task)
-    known = None if truth is None else join_truth(table, truth)
-    sums, further, null = first_look(table, events, known, truth, edges=config.strata)
-    return _Part(
-        table, sums.arrays(), further | maps_of(table, expected_sbd(table) if null is None else null), events, truth
-    )
+    kinds = Kinds.found(table, events, None if truth is None else join_truth(table, truth)).measured()
+    sums, further, null = first_look(kinds, truth, edges=config.strata)
+    maps = kinds.spread(further | maps_of(kinds.one.table, null))
+    return _Part(table, sums.arrays(), maps, events, truth)
 
 
 def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part | None) -> Savers:

@@ -16,6 +16,7 @@ from semstab.model.records import TRUTH, VOXELS
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.parquet import tile_of
 from semstab.statistics import Truth, join_truth
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.sums import SecondSums, second_look
 
 
@@ -34,12 +35,12 @@ def look_again(again: Again, folder: Path) -> SeenAgain:
         file, table = folder / name, VoxelTable.load(folder / name)
         true = file.parents[1] / "truth" / file.name
         truth = VoxelTable.load(true) if name.startswith(f"{PORTIONS}/") and true.exists() else None
-        known = _known(table, truth) if again.overall.true else None
-        sums, more = second_look(table, again.overall, known, truth)
+        kinds = Kinds.found(table, truth=_known(table, truth) if again.overall.true else None)
+        sums, more = second_look(kinds, again.overall, truth)
         found.append(sums)
         if again.written:
             maps = VoxelTable.columns(file, further_columns(file))
-            columns, tile = {**maps, **more, **again.overall.maps(table, maps)}, tile_of(file)
+            columns, tile = {**maps, **kinds.spread(more), **again.overall.maps(table, maps)}, tile_of(file)
             savers: Savers = {
                 f"{VOXELS}/{again.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
             }

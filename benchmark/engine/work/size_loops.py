@@ -23,9 +23,8 @@ def keys_of(depth, valid, ray_x, ray_y, T, size, origin, rays, margin, keys):
 
 @serial
 def lowest(keys, low):
-    """Set low (3,) to the lowest index of each axis in packed keys (n,)."""
+    """Lower low (3,) to the lowest index of each axis in packed keys (n,)."""
     mask = np.uint64(2 * HALF - 1)
-    low[:] = mask
     for i in range(len(keys)):
         key = np.uint64(keys[i])
         low[0] = min(low[0], key >> np.uint64(42))
@@ -58,25 +57,42 @@ def spread(x):
 
 
 @serial
-def look_at_voxel(code, shift, frame, start, pixels):
+def look_at_voxel(code, shift, frame, many, start, pixels):
     """Count the pixels of each frame in the voxel that begins there; where it ends, and how many frames saw it."""
     end, T = start, 0
     while end < len(code) and (code[end] >> shift) == (code[start] >> shift):
         T += pixels[frame[end]] == 0.0
-        pixels[frame[end]] += 1.0
+        pixels[frame[end]] += many[end]
         end += 1
     return end, T
 
 
 @serial
-def sums_of_labels(code, shift, frame, label, frames, K):
+def runs(code, order, frame, label, run_code, run_frame, run_label, many):
+    """Pixels (n,) by their codes, ascending, those of one frame and label in a row once; returns how many that makes.
+
+    order  (n,) which of the frames and labels (n,) each of the codes has
+    many   of how many pixels each is
+    """
+    m = -1
+    for k in range(len(code)):
+        own, its_frame, its_label = code[k], frame[order[k]], label[order[k]]
+        if m < 0 or own != run_code[m] or its_frame != run_frame[m] or its_label != run_label[m]:
+            m += 1
+            run_code[m], run_frame[m], run_label[m], many[m] = own, its_frame, its_label, 0
+        many[m] += 1
+    return m + 1
+
+
+@serial
+def sums_of_labels(code, frame, label, many, shift, frames, K):
     """What `alpha_sums` gives of the map whose voxels are the codes (n,), ascending, without their last bits."""
     sums, count, pixels, e = np.zeros(3 + K), np.zeros((frames, K)), np.zeros(frames), np.zeros(K)
     start = 0
     while start < len(code):
-        end, T = look_at_voxel(code, shift, frame, start, pixels)
+        end, T = look_at_voxel(code, shift, frame, many, start, pixels)
         for i in range(start, end):
-            count[frame[i], label[i]] += 1.0
+            count[frame[i], label[i]] += many[i]
         own = 0.0
         for i in range(start, end):
             s = count[frame[i], label[i]] / pixels[frame[i]]  # 0 where its frame and label came before
@@ -95,13 +111,13 @@ def sums_of_labels(code, shift, frame, label, frames, K):
 
 
 @serial
-def sums_of_scores(code, shift, frame, pixel, scores, frames):
+def sums_of_scores(code, shift, frame, many, pixel, scores, frames):
     """The same of scores, of which pixel (n,) names the row in scores (m, K)."""
     K = scores.shape[1]
     sums, s, pixels, e = np.zeros(3 + K), np.zeros((frames, K)), np.zeros(frames), np.zeros(K)
     start = 0
     while start < len(code):
-        end, T = look_at_voxel(code, shift, frame, start, pixels)
+        end, T = look_at_voxel(code, shift, frame, many, start, pixels)
         own = both = 0.0
         if T >= 2:
             for i in range(start, end):

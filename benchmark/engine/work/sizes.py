@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.backends.shared.pixels.keys import HALF
 from semstab.check.views import evenly
 from semstab.config import Config
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.model.results import SizeAlpha
 from semstab.statistics.agreement import alpha_of
-from semstab.statistics.ranks import ranked
+from semstab.statistics.ranks import ordered
 from semstab.task import Task
 
 FACTORS = (0.5, 1.0, 2.0)
@@ -99,31 +102,38 @@ class SizeMaps:
         if self._lost or not self._keys:
             return ()
         frame = np.repeat(np.arange(len(self._keys), dtype=np.uint8), list(map(len, self._keys)))
-        code = _codes(np.concatenate(self._keys))
-        order = ranked(code)
-        code, frame = code[order], frame[order]
-        sums = (self._sums(code, 3 * level, frame, order) for level in range(len(FACTORS)))
+        sums = self._sums(_codes(self._keys), frame)
         return tuple(
             SizeAlpha(size, len(self._frames), float(alpha_of(of))) for size, of in zip(self._sizes, sums, strict=True)
         )
 
-    def _sums(self, code: Int64, shift: int, frame: npt.NDArray[np.uint8], order: Int64) -> Any:
-        """(3 + K,) what alpha is a function of, of the map whose voxels are the codes without their last bits."""
-        from semstab.engine.work.size_loops import sums_of_labels, sums_of_scores
+    def _sums(self, code: Int64, frame: npt.NDArray[np.uint8]) -> Iterator[Any]:
+        """(3 + K,) what alpha is a function of, of each map: its voxels are the codes without their last bits."""
+        from semstab.engine.work.size_loops import runs, sums_of_labels, sums_of_scores
 
-        if self._said.ndim == 1:
-            return sums_of_labels(code, shift, frame, self._said[order], len(self._keys), self._K)
-        return sums_of_scores(code, shift, frame, order, self._said, len(self._keys))
+        F, shifts = len(self._keys), range(0, 3 * len(FACTORS), 3)
+        code, order = ordered(code)
+        if self._said.ndim == 2:
+            frame, ones = frame[order], np.ones(len(code), np.int32)
+            return (sums_of_scores(code, shift, frame, ones, order, self._said, F) for shift in shifts)
+        kinds: tuple[Any, ...] = np.int64, np.uint8, np.uint16, np.int32
+        own, seen, label, many = (np.empty(len(code), kind) for kind in kinds)
+        m = runs(code, order, frame, self._said, own, seen, label, many)
+        of = own[:m], seen[:m], label[:m], many[:m]
+        return (sums_of_labels(*of, shift, F, self._K) for shift in shifts)
 
 
-def _codes(keys: Int64) -> Int64:
-    """See `interleave`: from the lowest voxel of each axis on, so that codes are short; in the place of the keys."""
+def _codes(keys: Sequence[Int64]) -> Int64:
+    """See `interleave`: of the keys of all frames, from the lowest voxel of each axis on, so that codes are short."""
     from semstab.engine.work.size_loops import interleave, lowest
 
-    low = np.empty(3, np.uint64)
-    lowest(keys, low)
-    interleave(keys, low // ALIGNED * ALIGNED, keys)
-    return keys
+    low, code = np.full(3, 2 * HALF, np.uint64), np.empty(sum(map(len, keys)), np.int64)
+    for part in keys:
+        lowest(part, low)
+    bounds = itertools.accumulate(map(len, keys), initial=0)
+    for part, (first, last) in zip(keys, itertools.pairwise(bounds), strict=True):
+        interleave(part, low // ALIGNED * ALIGNED, code[first:last])
+    return code
 
 
 def _one_hot(labels: npt.NDArray[Any], K: int) -> Any:

@@ -46,6 +46,7 @@ class VoxelTable:
     frame_entropy_sum  (n,) float64 sum over frames of the entropy of s_bar, bits
     voxel_size         r, metres
     classes            the K class names, where they are known
+    copies             (n,) how many voxels each row stands for, where they are not one each: see `statistics.kinds`
 
     Raises DataError where columns disagree in length or rows are not sorted and distinct.
     """
@@ -63,6 +64,7 @@ class VoxelTable:
     frame_entropy_sum: Float64
     voxel_size: float
     classes: tuple[str, ...] = ()
+    copies: Float64 | None = None
 
     def __post_init__(self) -> None:
         _freeze_columns(self, _VOXEL_TYPES, self.ix)
@@ -95,7 +97,13 @@ class VoxelTable:
     def rows(self, rows: Any) -> VoxelTable:
         """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _VOXEL_TYPES if name != "evidence"}
-        return replace(self, **columns, evidence=self.evidence.take(rows))
+        copies = None if self.copies is None else self.copies[rows]
+        return replace(self, **columns, evidence=self.evidence.take(rows), copies=copies)
+
+    @property
+    def voxels(self) -> Float64:
+        """(n,) how many voxels each row stands for."""
+        return np.ones(len(self)) if self.copies is None else self.copies
 
     def measured(self) -> VoxelTable:
         """The same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
@@ -209,10 +217,10 @@ class Events:
     """The log of observations: m rows, one a (voxel, frame), grouped by voxel and in order of integration within one.
 
     ix, iy, iz  (n,) int32 the voxels, sorted
-    voxel       (m,) int64 row into them, ascending
+    voxel       (m,) int32 row into them, ascending
     frame       (m,) int32 frame index
     evidence    (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse
-    pixels      (m,) int64 pixels behind it
+    pixels      (m,) int32 pixels behind it
     voxel_size  r, metres
     classes     the K class names, where they are known
     """
@@ -220,18 +228,18 @@ class Events:
     ix: Int32
     iy: Int32
     iz: Int32
-    voxel: Int64
+    voxel: npt.NDArray[np.integer]
     frame: Int32
     evidence: Evidence
-    pixels: Int64
+    pixels: npt.NDArray[np.integer]
     voxel_size: float
     classes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _freeze_columns(self, _INDEX_TYPES, self.ix)
         _freeze_columns(self, _EVENT_TYPES, self.voxel)
-        step = np.diff(self.voxel, prepend=-1, append=len(self.ix))
-        if ((step != 0) & (step != 1)).any() or step[0] != 1 or step[-1] != 1:
+        further = self.voxel[1:][self.voxel[1:] != self.voxel[:-1]]
+        if not np.array_equal(np.append(self.voxel[:1], further), np.arange(len(self.ix))):
             raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
 
     def __len__(self) -> int:
@@ -245,7 +253,11 @@ class Events:
     @cached_property
     def bounds(self) -> Int64:
         """(n + 1,) first row of each voxel, then how many rows there are."""
-        return np.append(np.flatnonzero(np.diff(self.voxel, prepend=-1)), len(self))
+        from semstab.model.row_kernel import bound_groups
+
+        bounds = np.zeros(len(self.ix) + 1, np.int64)
+        bound_groups(self.voxel, bounds)
+        return bounds
 
     @property
     def starts(self) -> Int64:
@@ -266,7 +278,7 @@ class Events:
             "op": np.diff(np.append(starts, len(self))).astype(np.int32),
             "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
             "drift_sum": _sum_by_voxel(self.drift(), starts),
-            "pixels": _sum_by_voxel(self.pixels, starts),
+            "pixels": _sum_by_voxel(self.pixels.astype(np.int64), starts),
             "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
             "last_frame": np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
             "self_sum": _sum_by_voxel((s_bar**2).sum(axis=1), starts),
@@ -326,13 +338,12 @@ class Events:
 
     def rows(self, voxels: Int64) -> Events:
         """The log of these of its voxels (r,), ascending."""
-        chosen = np.zeros(len(self.ix), np.bool_)
-        chosen[voxels] = True
-        rows = np.flatnonzero(chosen[self.voxel])
-        own: dict[str, Any] = {name: getattr(self, name)[chosen] for name in _INDEX_TYPES}
+        count = self.bounds[voxels + 1] - self.bounds[voxels]
+        number = np.repeat(np.arange(len(voxels)), count)
+        rows = np.arange(len(number)) + (self.bounds[voxels] - np.cumsum(count) + count)[number]
+        own: dict[str, Any] = {name: getattr(self, name)[voxels] for name in _INDEX_TYPES}
         own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
-        number = np.cumsum(chosen) - 1
-        return replace(self, **own, voxel=number[self.voxel[rows]], evidence=self.evidence.take(rows))
+        return replace(self, **own, voxel=number, evidence=self.evidence.take(rows))
 
     def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
@@ -390,7 +401,7 @@ _VOXEL_TYPES: Types = _INDEX_TYPES | {
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
 _SUMS = [name for name in _VOXEL_TYPES if name not in (*_INDEX_TYPES, "evidence")]
-_EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
+_EVENT_TYPES: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64, "pixels": np.int32}
 
 
 def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:

@@ -12,6 +12,9 @@ ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uin
 """Weights of a voxel's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no
 plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectiveness of Quasirandom Sequences)."""
 
+HELD = 1024
+"""Pixels whose cells are computed together: as many as stay in a core's nearest cache."""
+
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -31,12 +34,13 @@ def hash_row(at_x, at_y, at_z, hashed):
 
 
 @serial
-def draw(depth, valid, labels, ray_x, ray_y, T, size, share, points, drawn, label, pixel):
-    """The pixels that show a sampled voxel: point in camera axes, hash, label and number; returns how many they are."""
-    n = 0
+def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label, pixel):
+    """The pixels that show a sampled voxel: key of the cell, hash, label and number; returns how many they are."""
+    n = held = 0
     H, W = depth.shape
     at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
     found = np.empty(W, np.int32)
+    x, y, z = np.empty(HELD + W), np.empty(HELD + W), np.empty(HELD + W)
     for v in range(H):
         place_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
         hash_row(at[0], at[1], at[2], hashed)
@@ -45,10 +49,14 @@ def draw(depth, valid, labels, ray_x, ray_y, T, size, share, points, drawn, labe
             found[end] = u
             end += hashed[u] <= last
         for u in found[:end]:
-            z = np.float64(depth[v, u])
-            points[0, n], points[1, n], points[2, n] = ray_x[u] * z, ray_y[v] * z, z
+            d = np.float64(depth[v, u])
+            x[held], y[held], z[held] = ray_x[u] * d, ray_y[v] * d, d
             drawn[n], label[n], pixel[n] = hashed[u], labels[v, u], v * W + u
             n += valid[v, u]
+            held += valid[v, u]
+        if held >= HELD or v == H - 1:
+            cells_of(x[:held], y[:held], z[:held], T, size, origin, reach, cell[n - held : n])
+            held = 0
     return n
 
 
@@ -67,14 +75,14 @@ def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
 
 
 @serial
-def cells_of(points, T, size, origin, reach, key):
-    """Keys (n,) of the cells of points (3, n): the voxel's, 19 bits an axis, and 2 bits more; -1 out of reach."""
+def cells_of(at_x, at_y, at_z, T, size, origin, reach, key):
+    """Keys (n,) of the cells of points of the camera, see `keys`; -1 out of reach."""
     x0, x1, x2, x3, low_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3], float(origin[0] - reach)
     y0, y1, y2, y3, low_y = T[1, 0], T[1, 1], T[1, 2], T[1, 3], float(origin[1] - reach)
     z0, z1, z2, z3, low_z = T[2, 0], T[2, 1], T[2, 2], T[2, 3], float(origin[2] - reach)
     span = float(2 * reach)
     for n in range(len(key)):
-        x, y, z = points[0, n], points[1, n], points[2, n]
+        x, y, z = at_x[n], at_y[n], at_z[n]
         a = in_voxels(x0, x1, x2, x3, x, y, z, size)
         b = in_voxels(y0, y1, y2, y3, x, y, z, size)
         c = in_voxels(z0, z1, z2, z3, x, y, z, size)
@@ -101,7 +109,8 @@ def grouped(cell, label, drawn, of, pixels):
     """The number (n,) of each pixel's cell and label in order of appearance, and how many pixels each of these has.
 
     Cells, labels and hashes move to the front, once each; returns how many they are. Those of one voxel lie side by
-    side in the table, as they do in the image.
+    side in the table, as they do in the image. Nobody can foretell whether a pixel's cell is a new one, so that there
+    is no branch for it. The numbers are left out where `of` is empty.
     """
     bits = 7
     while len(cell) > 1 << bits:
@@ -111,13 +120,18 @@ def grouped(cell, label, drawn, of, pixels):
     for i in range(len(cell)):
         own, its_label = cell[i], label[i]
         slot = np.int64((np.uint64((own >> 6) ^ (np.int64(its_label) << 48)) * GOLDEN) >> shift) << 6 | (own & 63)
-        while table[slot] >= 0 and (cell[table[slot]] != own or label[table[slot]] != its_label):
+        there = table[slot] if table[slot] >= 0 else i
+        while (cell[there] != own) | (label[there] != its_label):
             slot = (slot + 1) & mask
-        if table[slot] < 0:
-            table[slot], cell[n], label[n], drawn[n], pixels[n] = n, own, its_label, drawn[i], 0.0
-            n += 1
-        pixels[table[slot]] += 1.0
-        of[i] = table[slot]
+            there = table[slot] if table[slot] >= 0 else i
+        cell[n], label[n], drawn[n], pixels[n] = own, its_label, drawn[i], 0.0  # of the next one, should it be new
+        new = table[slot] < 0
+        number = n if new else there
+        table[slot] = number
+        n += new
+        pixels[number] += 1.0
+        if len(of):
+            of[i] = number
     return n
 
 
@@ -131,10 +145,20 @@ def add_rows(rows, of, sums):
 
 @serial
 def keep(share, entries, key, view, label, weight, drawn):
-    """Move the entries whose hash is below `share` to the front; returns how many they are."""
+    """Move the entries whose hash is below `share` to the front, without a branch; returns how many they are."""
     n = 0
     for i in range(entries):
-        if drawn[i] < share:
-            key[n], view[n], label[n], weight[n], drawn[n] = key[i], view[i], label[i], weight[i], drawn[i]
+        key[n], view[n], label[n], weight[n], drawn[n] = key[i], view[i], label[i], weight[i], drawn[i]
+        n += drawn[n] < share
+    return n
+
+
+@serial
+def append(share, entries, seen, cell, said, more, hashed, key, view, label, weight, drawn):
+    """Put entries of a view whose hash is below `share` behind so many others; returns how many there are then."""
+    n = entries
+    for i in range(len(cell)):
+        if hashed[i] < share:
+            key[n], view[n], label[n], weight[n], drawn[n] = cell[i], seen, said[i], more[i], hashed[i]
             n += 1
     return n

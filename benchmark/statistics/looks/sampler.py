@@ -53,11 +53,14 @@ class Pixels:
     label: npt.NDArray[np.uint16]
     pixel: npt.NDArray[np.int32]
 
-    def grouped(self) -> tuple[int, Int64, Float64]:
-        """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels."""
+    def grouped(self, *, numbered: bool) -> tuple[int, Int64, Float64]:
+        """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels.
+
+        Which they are is said only where it is asked for.
+        """
         from semstab.statistics.looks.loops import grouped
 
-        of, pixels = np.empty(len(self.cell), np.int64), np.empty(len(self.cell))
+        of, pixels = np.empty(len(self.cell) if numbered else 0, np.int64), np.empty(len(self.cell))
         return grouped(self.cell, self.label, self.drawn, of, pixels), of, pixels
 
 
@@ -92,40 +95,38 @@ class Sampler:
         self._views.append([frame.index, *centre.tolist(), when])
         self._soft = self._soft or frame.scores is not None
         entries_of = self._labels if frame.scores is None else self._scores
-        for key, label, weight, drawn in entries_of(frame, self._drawn(frame)):
-            self._take(key, np.full(len(key), len(self._views) - 1, np.int32), label, weight, drawn)
+        for entries in entries_of(frame, self._drawn(frame)):
+            self._take(entries)
 
     def _drawn(self, frame: Frame) -> Pixels:
         """The frame's valid pixels in sampled voxels; the label of soft ones is the same for all."""
-        from semstab.statistics.looks.loops import cells_of, draw
+        from semstab.statistics.looks.loops import draw
 
         (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
         ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
-        points, drawn = np.empty((3, H * W)), np.empty(H * W, np.uint32)
+        cell, drawn = np.empty(H * W, np.int64), np.empty(H * W, np.uint32)
         label, pixel = np.empty(H * W, np.uint16), np.empty(H * W, np.int32)
         valid = fixed(frame.valid)
         labels = valid.view(np.uint8) if frame.labels is None else fixed(frame.labels)
         n = draw(
-            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share,
-            points, drawn, label, pixel,
+            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share, self._origin, REACH,
+            cell, drawn, label, pixel,
         )  # fmt: skip
-        cell = np.empty(n, np.int64)
-        cells_of(points[:, :n], T_wc, self.voxel_size, self._origin, REACH, cell)
-        near = slice(n) if cell.min(initial=0) >= 0 else np.flatnonzero(cell >= 0)
+        near = slice(n) if cell[:n].min(initial=0) >= 0 else np.flatnonzero(cell[:n] >= 0)
         return Pixels(cell[near], drawn[near], label[near], pixel[near])
 
-    def _take(self, *part: npt.NDArray[Any]) -> None:
-        """Take entries in; where they would be too many, every second voxel goes until they are not."""
-        from semstab.statistics.looks.loops import keep
+    def _take(self, entries: Entries) -> None:
+        """Take entries of the last view in; where they would be too many, every second voxel goes until they are not.
 
-        more = keep(self._share, len(part[0]), *part)  # a part of the frame that came before may have lowered it
-        while self._entries + more > self.budget:
+        A part of the view that came before may have lowered the share.
+        """
+        from semstab.statistics.looks.loops import append, keep
+
+        drawn = entries[-1]
+        while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
             self._share //= 2
             self._entries = keep(self._share, self._entries, *self._columns)
-            more = keep(self._share, more, *part)
-        for column, values in zip(self._columns, part, strict=True):
-            column[self._entries : self._entries + more] = values[:more]
-        self._entries += more
+        self._entries = append(self._share, self._entries, len(self._views) - 1, *entries, *self._columns)
 
     def sample(self) -> Sample:
         """What is there so far, as observations of the sampled voxels."""
@@ -150,7 +151,7 @@ class Sampler:
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, pixels, hash) of a frame's labels."""
-        m, _, count = pixels.grouped()
+        m, _, count = pixels.grouped(numbered=False)
         yield pixels.cell[:m], pixels.label[:m], count[:m], pixels.drawn[:m]
 
     def _scores(self, frame: Frame, pixels: Pixels) -> Iterator[Entries]:
@@ -158,7 +159,7 @@ class Sampler:
         from semstab.statistics.looks.loops import add_rows
 
         assert frame.scores is not None
-        _, of, _ = pixels.grouped()
+        _, of, _ = pixels.grouped(numbered=True)
         for piece in _pieces(of, max(1, PIECE // self.K)):
             some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
             s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,9 @@ from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa
 from semstab.statistics.ranks import SPARSE, distinct, ranked
-from semstab.statistics.sampling.cubes import cells_of, cubes
 from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
+from semstab.statistics.sampling.places import Places
 from semstab.statistics.steady import steady
 
 Float64 = npt.NDArray[np.float64]
@@ -31,7 +31,6 @@ def influence_sums(
     sample: tuple[Events, Events] | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
-    likely: Literal["known"] | None = "known",
 ) -> InfluenceSums:
     """The sums of a map.
 
@@ -43,51 +42,51 @@ def influence_sums(
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
-    likely      None leaves open how likely places are stable: of a part of a map, see `StableLooks`
     """
-    if edge is None:
-        edge = cubes((table.ix, table.iy, table.iz), table.voxel_size, some=table.op >= 2)[2]
-    stable = np.nan_to_num(steady(table)) if true_label is not None and likely else np.zeros(len(table))
-    whole = _of_table(table, true_label, edge, stable) if events is None else _of_log(events, true_label, edge, stable)
-    whole = _with_places(dataclasses.replace(whole, classes=table.classes), table, true_label, sbd_excess)
+    places = Places.of(table, edge)
+    likely = None if true_label is None else np.nan_to_num(steady(table))
+    about = (places, true_label, likely)
+    whole = of_table(table, *about) if events is None else of_log(events, *about)
+    whole = with_places(whole, table, places, true_label, sbd_excess)
     return whole if sample is None else with_sample(whole, sample, logged=events is not None)
 
 
 def with_sample(whole: InfluenceSums, sample: tuple[Events, Events], *, logged: bool = False) -> InfluenceSums:
     """The sums of a map with those of a sample of its voxels, see `influence_sums`; logged: its frames are known."""
     seen, limit = (
-        dataclasses.replace(_of_log(log, None, whole.edge, np.zeros(len(log.ix))), classes=whole.classes)
-        for log in sample
+        dataclasses.replace(of_log(log, Places.of_log(log, whole.edge)), classes=whole.classes) for log in sample
     )
     whole = whole if logged else _with_frames(whole, seen)
     return dataclasses.replace(whole, seen=seen, limit=limit)
 
 
-def _of_table(table: VoxelTable, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
-    at, of, _ = cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, table.op >= 2)
-    columns = _sums_of_table(table, of, len(at), true_label, likely)
-    unknown = np.full(len(at), -1, dtype=np.int32)
-    return InfluenceSums(
-        at, unknown, columns, edge, 0, table.voxel_size, table.K, table.classes, true_label is not None
-    )
+def of_table(
+    table: VoxelTable, places: Places, true_label: Int64 | None = None, likely: Float64 | None = None
+) -> InfluenceSums:
+    """The sums of a table, whose places with OP >= 2 these are: each place counts as a whole, frames are not known.
+
+    likely (n,) is how likely places are stable, where true classes (n,) are known; None leaves that open.
+    """
+    columns = _sums_of_table(table, places, true_label, np.zeros(len(table)) if likely is None else likely)
+    unknown = np.full(places.count, -1, dtype=np.int32)
+    truth = true_label is not None
+    return InfluenceSums(places.cell, unknown, columns, places.edge, 0, table.voxel_size, table.K, table.classes, truth)
 
 
-def _of_log(events: Events, true_label: Int64 | None, edge: float, likely: Float64) -> InfluenceSums:
-    starts = events.starts
-    op = np.diff(events.bounds)
-    again = np.flatnonzero(op >= 2)
-    index = np.stack([events.ix, events.iy, events.iz], axis=1)
-    at, of = cells_of(index[again], events.voxel_size, edge)
-    K = int(events.evidence.shape[1])
+def of_log(
+    events: Events, places: Places, true_label: Int64 | None = None, likely: Float64 | None = None
+) -> InfluenceSums:
+    """The same by the frames of a log."""
+    K = events.K
     step = _step(events.frame, K)
     frames, group = frame_groups(events.frame, step)
-    sums = _sums_of_log(events, starts, op, again, of, len(at), group, len(frames), true_label, likely)
+    sums = _sums_of_log(events, places, group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
-        at[cell],
+        places.cell[cell],
         frames[frame].astype(np.int32),
         sums[cell, frame],
-        edge,
+        places.edge,
         step,
         events.voxel_size,
         K,
@@ -120,25 +119,30 @@ def _with_frames(whole: InfluenceSums, seen: InfluenceSums) -> InfluenceSums:
     )
 
 
-def _with_places(
-    sums: InfluenceSums, table: VoxelTable, true_label: Int64 | None, sbd_excess: Float64 | None
+def with_places(
+    sums: InfluenceSums,
+    table: VoxelTable,
+    places: Places,
+    true_label: Int64 | None = None,
+    sbd_excess: Float64 | None = None,
 ) -> InfluenceSums:
     """With rows for the sums that belong to no frame: SBD less that in random order, and how far beliefs are right."""
-    at, of, _ = cubes((table.ix, table.iy, table.iz), table.voxel_size, sums.edge, table.op >= 2)
+    at, of = places.cell, places.at
     columns, own = np.zeros((len(at), sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
     if sbd_excess is not None:
-        for name, values in zip(OF_PLACES[:2], by_group(of, [sbd_excess], len(at)), strict=True):
+        for name, values in zip(OF_PLACES[:2], by_group(of, [sbd_excess], len(at), places.voxels), strict=True):
             columns[:, own[name]] = values
     if true_label is not None:
         confidence, right = vss(table), dominant(table) == true_label
         bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
         judged = np.where((of >= 0) & (true_label >= 0), of * BINS + bins, -1)
-        gap, known = by_group(judged, [right - confidence], len(at) * BINS)
+        gap, known = by_group(judged, [right - confidence], len(at) * BINS, places.voxels)
         columns[:, own["gap"]] = gap.reshape(-1, BINS)
         columns[:, own["judged"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
     some = columns.any(axis=1)
     return dataclasses.replace(
         sums,
+        classes=table.classes,
         cell=np.concatenate([sums.cell, at[some]]),
         frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
         columns=np.concatenate([sums.columns, columns[some]]),
@@ -164,38 +168,29 @@ def frame_groups(frame: npt.NDArray[np.int32], step: int) -> tuple[Int64, Int64]
 
 
 def _sums_of_log(
-    events: Events,
-    starts: Int64,
-    op: Int64,
-    again: Int64,
-    of: Int64,
-    cells: int,
-    group: Int64,
-    groups: int,
-    true_label: Int64 | None,
-    likely: Float64,
+    events: Events, places: Places, group: Int64, groups: int, true_label: Int64 | None, likely: Float64 | None
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
     from semstab.statistics.loops.chunks import in_chunks
     from semstab.statistics.sampling import loops
 
-    K = int(events.evidence.shape[1])
+    K, cells, again = events.K, places.count, np.flatnonzero(places.at >= 0)
     sums = np.zeros((cells, groups, width(K, truth=true_label is not None)))
+    of = places.at[again]
     order = again[ranked(of)]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
-    truth = np.full(len(op), -1) if true_label is None else true_label
     options = (K <= MOST_CLASSES, true_label is not None)
     in_chunks(
         loops.add_influences,
         order,
         bounds,
-        starts,
-        op,
+        events.bounds,
+        int(np.diff(events.bounds).max(initial=0)),
         events.evidence.entries,
         K,
         group,
-        truth,
-        likely,
+        np.zeros(0, np.int64) if true_label is None else true_label,
+        np.zeros(0) if likely is None else likely,
         *options,
         groups,
         sums.reshape(cells * groups, sums.shape[2]),
@@ -203,11 +198,11 @@ def _sums_of_log(
     return sums
 
 
-def _sums_of_table(table: VoxelTable, of: Int64, cells: int, true_label: Int64 | None, likely: Float64) -> Float64:
+def _sums_of_table(table: VoxelTable, places: Places, true_label: Int64 | None, likely: Float64) -> Float64:
     """(cells, C) from the rows of the voxels that are in one of (n,); by class NaN for evidence that is not one-hot."""
     from semstab.statistics.loops.rows import add_apart
 
-    K, T, agreement = table.K, table.op.astype(np.float64), psa(table)
+    K, T, agreement, of, cells = table.K, table.op.astype(np.float64), psa(table), places.at, places.count
     recurrent, twice = (table.op >= RECURRENT).astype(np.float64), np.where(table.op == 2, T, 0.0)
     values: dict[str, npt.NDArray[Any]] = {
         "voxels": np.ones(len(T)), "psa": agreement, "observations": T, "agreeing": T * agreement,
@@ -215,16 +210,16 @@ def _sums_of_table(table: VoxelTable, of: Int64, cells: int, true_label: Int64 |
         "vss": recurrent * vss(table), "entropy": entropy(table),
     }  # fmt: skip
     shares, apart = np.zeros((cells, K)), np.zeros((cells, K))
-    add_apart(of, table.evidence.entries, table.op, shares, apart)
+    add_apart(of, table.evidence.entries, table.op, table.voxels, shares, apart)
     by_class = {"evidence": shares}
     if K <= MOST_CLASSES:
         one_hot = one_hot_where(table, of >= 0)
         by_class |= {"class_own": shares, "class_apart": apart} if one_hot else _unknown(shares)
     if true_label is not None:
-        plain, further = _with_truth(table, of, cells, true_label, likely * recurrent)
+        plain, further = _with_truth(table, places, true_label, likely * recurrent)
         values, by_class = values | plain, by_class | further
     sums, own = np.zeros((cells, width(K, truth=true_label is not None))), layout(K, truth=true_label is not None)
-    for name, column in zip(values, by_group(of, [*values.values()], cells)[0].T, strict=True):
+    for name, column in zip(values, by_group(of, [*values.values()], cells, places.voxels)[0].T, strict=True):
         sums[:, own[name].start] = column
     for name, columns in by_class.items():
         sums[:, own[name]] = columns
@@ -236,7 +231,7 @@ def _unknown(shares: Float64) -> dict[str, Float64]:
 
 
 def _with_truth(
-    table: VoxelTable, of: Int64, cells: int, label: Int64, likely: Float64
+    table: VoxelTable, places: Places, label: Int64, likely: Float64
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Float64]]:
     """What of `_sums_of_table` needs the true classes (n,): of each voxel (n,), and sums by class (cells, K)."""
     from semstab.statistics.loops.rows import weight_of
@@ -244,15 +239,17 @@ def _with_truth(
     looks, found, T = np.empty(len(label)), dominant(table), table.op
     weight_of(table.evidence.entries, label, looks)
     known, right = label >= 0, label == found
-    stable, counted = known * likely, known & (of >= 0)
+    stable, counted = known * likely, known & (places.at >= 0)
     values: dict[str, npt.NDArray[Any]] = {
         "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks,
         "stable": stable, "stable_wrong": stable * ~right,
     }  # fmt: skip
 
     def by_class(which: Int64, where: npt.NDArray[np.bool_]) -> Float64:
-        count = np.bincount(of[where] * table.K + which[where], minlength=cells * table.K)
-        return count.reshape(cells, table.K).astype(np.float64)
+        group = places.at[where] * table.K + which[where]
+        count = np.zeros(places.count * table.K)
+        np.add.at(count, group, table.voxels[where])
+        return count.reshape(places.count, table.K)
 
     if table.K > MOST_CLASSES:
         return values, {}

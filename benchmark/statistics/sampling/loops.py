@@ -181,17 +181,18 @@ def _add_agreed(sums, base, k, first, T, group, truth, likely, column, K, by_cla
 
 
 @serial
-def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likely, by_class, with_truth, groups, sums):
-    """Add the observations of the voxels with T >= 2 to `sums` (cells * groups, C).
+def add_influences(
+    chunk, order, bounds, starts, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
+):
+    """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
-    order (n,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts, op (n,) are a voxel's rows
-    of the log and of group (m,), truth (n,) its true class or -1, likely (n,) how likely it is
-    stable. A place's
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts (n + 1,) bound a voxel's rows
+    of the log, `longest` at most, and of group (m,), truth (n,) is its true class or -1, likely (n,) how likely it is
+    stable, which is left open where that is empty. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
     against, and the shares add up to T P.
     """
-    longest = op.max() if op.shape[0] else 0
     rows = np.zeros((longest, K))
     total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
     own, without, mean = np.empty(longest), np.empty(longest, np.int64), np.empty(K)
@@ -200,13 +201,11 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
-            first, T = starts[i], op[i]
-            if T < 2:
-                continue
+            first, T, steady = starts[i], starts[i + 1] - starts[i], likely[i] if likely.shape[0] else 0.0
             k = _one_class(log, first, T)
             if k >= 0:
                 known = truth[i] if with_truth else -1
-                _add_agreed(sums, cell * groups, k, first, T, group, known, likely[i], first_truth, K, by_class)
+                _add_agreed(sums, cell * groups, k, first, T, group, known, steady, first_truth, K, by_class)
                 continue
             A = _classes_of(log, first, T, rows, total, squares, own, active)
             best, agreed = _label(total, active, A), _agreement(total, squares, T, active, A, surprise, apart)
@@ -241,16 +240,21 @@ def add_influences(chunk, order, bounds, starts, op, log, K, group, truth, likel
                     sums[r, VSS] += rows[t, best] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, rows, first, T, group, truth[i], likely[i], total, active, A, without, mean,
+                    sums, cell * groups, rows, first, T, group, truth[i], steady, total, active, A, without, mean,
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
             _cleared(log, first, T, rows)
 
 
 @serial
-def add_kinds(rows, kind, first, starts, ends, group, groups, total):
-    """Add 1 / T for each of the T looks at each of these voxels, at (kind - first) * groups + group."""
-    for i in rows:
-        share, at = 1.0 / (ends[i] - starts[i]), (kind[i] - first) * groups
-        for row in range(starts[i], ends[i]):
-            total[at + group[row]] += share
+def add_kinds(kind, first, bounds, group, groups, total):
+    """Add 1 / T for each of the T looks at the voxels of kinds (n,) that there is room for, from the first on.
+
+    At (kind - first) * groups + group; bounds (n + 1,) are of a voxel's rows of group (m,).
+    """
+    last = first + total.shape[0] // groups
+    for i in range(kind.shape[0]):
+        if first <= kind[i] < last:
+            share, at = 1.0 / (bounds[i + 1] - bounds[i]), (kind[i] - first) * groups
+            for row in range(bounds[i], bounds[i + 1]):
+                total[at + group[row]] += share

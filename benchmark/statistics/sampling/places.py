@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.model.concentration import by_group
-from semstab.model.evidence import Evidence
 from semstab.model.statistics import Interval
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
@@ -30,11 +29,13 @@ class Places:
     cell  (G, 3) int32 the cubes, sorted
     at    (n,) int64 which of them each voxel is in, -1 for those that are left out
     edge  metres, a power of 2
+    voxels  (n,) how many voxels each stands for, None for one each
     """
 
     cell: npt.NDArray[np.int32]
     at: npt.NDArray[np.int64]
     edge: float
+    voxels: Float64 | None = None
 
     @classmethod
     def of(cls, table: VoxelTable, edge: float | None = None, *, where: npt.NDArray[np.bool_] | None = None) -> Places:
@@ -43,11 +44,17 @@ class Places:
         There are at most MOST_CELLS cubes, unless their edge is given, in metres.
         """
         some = table.op >= 2 if where is None else where
-        return cls(*cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
+        return cls(*cubes((table.ix, table.iy, table.iz), table.voxel_size, edge, some), table.copies)
 
-    def rows(self, rows: npt.NDArray[np.int64]) -> Places:
+    @classmethod
+    def of_log(cls, events: Events, edge: float) -> Places:
+        """The same of the voxels of a log."""
+        again = np.diff(events.bounds) >= 2
+        return cls(*cubes((events.ix, events.iy, events.iz), events.voxel_size, edge, again))
+
+    def rows(self, rows: Any) -> Places:
         """The same cubes, for some of the voxels."""
-        return replace(self, at=self.at[rows])
+        return replace(self, at=self.at[rows], voxels=None if self.voxels is None else self.voxels[rows])
 
     @property
     def count(self) -> int:
@@ -56,19 +63,19 @@ class Places:
 
     def sums(self, columns: Float64) -> Float64:
         """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
-        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
+        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count, self.voxels)[0]
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
         """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
-        both = by_group(self.at, [*values.values()], self.count)
+        both = by_group(self.at, [*values.values()], self.count, self.voxels)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
-    def sums_by_class(self, evidence: Evidence, op: npt.NDArray[np.int32]) -> tuple[Float64, Float64]:
-        """(G, K) over the voxels of each cube of their evidence (n, K), and of that / OP."""
+    def sums_by_class(self, table: VoxelTable) -> tuple[Float64, Float64]:
+        """(G, K) over the voxels of each cube, which are a table's, of their evidence, and of that / OP."""
         from semstab.statistics.loops.rows import add_classes
 
-        by_look, by_place = (np.zeros((self.count, evidence.K)) for _ in range(2))
-        add_classes(self.at, evidence.entries, op, by_look, by_place)
+        by_look, by_place = (np.zeros((self.count, table.K)) for _ in range(2))
+        add_classes(self.at, table.evidence.entries, table.op, table.voxels, by_look, by_place)
         return by_look, by_place
 
     def estimate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,12 @@ from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
+from semstab.statistics.kinds import Known
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order import fusion_rules
 from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns
 from semstab.statistics.order.p_values import PValues
-from semstab.statistics.sampling import Places, PlaceSums
+from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
 
 Float64 = npt.NDArray[np.float64]
@@ -47,15 +48,14 @@ class LogSums:
     @classmethod
     def of(
         cls,
-        table: VoxelTable,
-        events: Events,
+        known: Known,
         drift: VoxelDrift,
         changes: Flips,
-        truth: Truth | None,
         seed: int,
-        places: Places,
     ) -> LogSums:
-        """Of a table, with the cubes of its voxels with OP >= 2."""
+        """Of voxels with their log."""
+        table, events, places = known.table, known.events, known.places
+        assert events is not None
         rows, trend = trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
@@ -69,8 +69,8 @@ class LogSums:
             PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
             trends.sum(axis=0),
             PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
-            _rules(table, events, truth),
-            *sampled(table, events, seed),
+            _rules(table, events, known.truth),
+            *sampled(replace(table, copies=None), events, seed),  # of those that differ, none stands for another
         )
 
     @classmethod
@@ -118,13 +118,13 @@ def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
     for some in stretches(len(seen)):
         own = seen[some]
         part = Voxels(table.op[own], table.evidence.take(own), table.drift_sum[own])
-        usual, every = fusion_rules.labels(part.evidence), np.ones(len(own), np.bool_)
+        usual, voxels = fusion_rules.labels(part.evidence), table.voxels[own]
         known = None if truth is None else Truth(truth.known[own], truth.label[own])
         by_rule: list[Beliefs] = [part]
         by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
         rows = []
         for fused in by_rule:
-            relabelled = np.count_nonzero(fusion_rules.labels(fused.evidence) != usual)
-            rows.append(np.concatenate([[relabelled, len(own)], rule_sums(fused, every, known)]))
+            relabelled = voxels.sum(where=fusion_rules.labels(fused.evidence) != usual)
+            rows.append(np.concatenate([[relabelled, voxels.sum()], rule_sums(fused, voxels, known)]))
         total = total + np.stack(rows)
     return total

@@ -10,17 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.summary import STRATA
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.runtime.array_form import from_arrays, to_arrays
 from semstab.statistics.blocks import Occupied
-from semstab.statistics.correctness import Judged, Truth, judged_strata, judged_where
+from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.order.drift import flips, voxel_drift
-from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums
-from semstab.statistics.sampling.stable_looks import StableLooks
+from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
+from semstab.statistics.sums.stable_looks import StableLooks
 
 Float64 = npt.NDArray[np.float64]
 
@@ -41,23 +42,17 @@ class TruthSums:
     stable: StableLooks
 
     @classmethod
-    def of(
-        cls,
-        table: VoxelTable,
-        events: Events | None,
-        truth: Truth,
-        edges: Sequence[int],
-        places: Places,
-        influence: InfluenceSums,
-    ) -> TruthSums:
-        """Of a table whose other sums these are, with the cubes of its voxels with OP >= 2."""
-        judged = Judged.of(table.evidence, truth.label)
+    def of(cls, kinds: Kinds, edges: Sequence[int], step: int) -> TruthSums:
+        """Of a map with true classes, whose frames are taken in groups of so many."""
+        table, truth, places = kinds.one.table, kinds.one.truth, kinds.one.places
+        assert truth is not None
+        judged = Judged.of(table.evidence, truth.label, table.voxels)
         right = {"right": np.where(truth.known, judged.right, np.nan)}
         return cls(
             PlaceSums(places.cell, places.edge, places.means(right)),
             judged_strata(judged, table.op, truth.known, edges),
             judged_where(judged, truth.known & (table.op >= 2)),
-            StableLooks.of(table, events, truth.label, influence.edge, influence.step),
+            StableLooks.of(kinds, step),
         )
 
     @classmethod
@@ -115,36 +110,27 @@ class _Further:
 
 
 def first_look(
-    table: VoxelTable,
-    events: Events | None = None,
-    truth: Truth | None = None,
-    limit: VoxelTable | None = None,
-    *,
-    edges: Sequence[int] = STRATA,
-    seed: int = 0,
+    kinds: Kinds, limit: VoxelTable | None = None, *, edges: Sequence[int] = STRATA, seed: int = 0
 ) -> tuple[FirstSums, Maps, Float64 | None]:
-    """The sums of a table, what is known of each of its voxels, and with a log its SBD in random order (n,).
+    """The sums of a map, what is known of one voxel of each kind, and with a log its SBD in random order (n,).
 
     See `analyse` for what it takes.
     """
-    table = table.measured()
+    kinds = kinds.measured()
+    table, events = kinds.one.table, kinds.one.events
     drift = None if events is None else voxel_drift(table, events, seed=seed, sample=0)
-    label = None if truth is None else truth.label
     null = None if drift is None else drift.null
-    own = MapSums.of(table, edges, events=events, true_label=label, null=null)
-    if events is None and truth is None and limit is None:
-        return FirstSums(own, Votes.of(table)), {}, None
-    places = Places.of(table, own.places.edge)
-    log, more = None, {}
+    own = MapSums.of(kinds, edges, null=null)
+    log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if events is not None and drift is not None:
         changes = flips(events)
-        log = LogSums.of(table, events, drift, changes, truth, seed, places)
-        more = log_maps(drift, changes)
+        log = LogSums.of(kinds.one, drift, changes, seed)
+        more = log_maps(drift, changes) | more
     found = FirstSums(
         own,
         Votes.of(table),
         log,
-        None if truth is None else TruthSums.of(table, events, truth, edges, places, own.influence),
-        None if limit is None else Occupied.of(table.index[repeated(table, limit)[0]]),
+        None if kinds.one.truth is None else TruthSums.of(kinds, edges, own.influence.step),
+        None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
-    return found, more | ({} if truth is None else {"true_label": truth.label}), null
+    return found, more, null

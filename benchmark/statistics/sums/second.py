@@ -12,9 +12,10 @@ from semstab.metrics.matching import shared_rows
 from semstab.model.statistics import DriftTests
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.correctness import Truth, quadrant_sums, wrong_of_steady
+from semstab.statistics.correctness import quadrant_sums, wrong_of_steady
 from semstab.statistics.judging.ceiling import loss_sums
 from semstab.statistics.judging.flipping import FlippingSums
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order.drift import TESTABLE
 from semstab.statistics.order.p_values import PValues, benjamini_hochberg
@@ -139,11 +140,10 @@ class Whole:
         )
 
 
-def second_look(
-    table: VoxelTable, overall: Overall, truth: Truth | None = None, limit: VoxelTable | None = None
-) -> tuple[SecondSums, Maps]:
-    """The sums of a part, a table, and which of its voxels are stable, and wrong."""
-    table = table.measured()
+def second_look(kinds: Kinds, overall: Overall, limit: VoxelTable | None = None) -> tuple[SecondSums, Maps]:
+    """The sums of a part, and which voxels are stable, and wrong, of one of each of its kinds."""
+    kinds = kinds.measured()
+    table, truth = kinds.one.table, kinds.one.truth
     stable, edge = steady(table, overall.shares), overall.edge
     maps: Maps = {"stable": stable}
     if truth is not None:
@@ -151,6 +151,6 @@ def second_look(
     found = SecondSums(
         FlippingSums.of(table, stable, edge),
         None if truth is None else quadrant_sums(table, truth, stable, edge),
-        None if limit is None or overall.loss_edge is None else loss_sums(table, limit, overall.loss_edge),
+        None if limit is None or overall.loss_edge is None else loss_sums(kinds.every.table, limit, overall.loss_edge),
     )
     return found, maps

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
-from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.ranks import distinct_rows, numbered, ranked
+from semstab.model.voxels import Events
+from semstab.statistics.kinds import Kinds
+from semstab.statistics.ranks import distinct_rows, numbered
 from semstab.statistics.sampling.collect import frame_groups
-from semstab.statistics.sampling.cubes import cells_of
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
 
@@ -44,22 +44,27 @@ class StableLooks:
     step: int
 
     @classmethod
-    def of(cls, table: VoxelTable, events: Events | None, true_label: Int64, edge: float, step: int) -> StableLooks:
-        """Those of a table with true classes (n,), -1 where they are not known."""
-        counted = np.flatnonzero((true_label >= 0) & (table.op >= RECURRENT))
-        some = table.rows(counted)
-        cell, of = cells_of(some.index, table.voxel_size, edge)
-        T, wrong = some.op.astype(np.int64), dominant(some) != true_label[counted]
+    def of(cls, kinds: Kinds, step: int) -> StableLooks:
+        """Those of a map with true classes."""
+        one, every = kinds.one, kinds.every
+        assert one.truth is not None
+        counted = np.flatnonzero(one.truth.known & (one.table.op >= RECURRENT))
+        some, edge = one.table.rows(counted), one.places.edge
+        cell, of = one.places.cell, one.places.at[counted]
+        T, wrong = some.op.astype(np.int64), dominant(some) != one.truth.label[counted]
         longest = int(T.max(initial=0)) + 1
         packed = ((of * longest + T) * longest + np.rint(vss(some) * T).astype(np.int64)) * 2 + wrong
-        kinds, kind = numbered(packed)
-        pairs, is_wrong = np.divmod(kinds, 2)
+        votings, voting = numbered(packed)
+        pairs, is_wrong = np.divmod(votings, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
-        keys = np.column_stack([cell[ofs], np.full(len(kinds), -1), *np.divmod(votes, longest), is_wrong])
-        if events is None:
-            return cls(keys.astype(np.int32), np.bincount(kind, minlength=len(kinds)).astype(np.float64), edge, 0)
-        groups, group = frame_groups(events.frame, step)
-        key, weight = _by_frame(events, counted, kind, group, len(groups))
+        keys = np.column_stack([cell[ofs], np.full(len(votings), -1), *np.divmod(votes, longest), is_wrong])
+        if every.events is None:
+            count = np.bincount(voting, weights=some.voxels, minlength=len(votings))
+            return cls(keys.astype(np.int32), count.astype(np.float64), edge, 0)
+        groups, group = frame_groups(every.events.frame, step)
+        of = np.full(len(one.table), -1)
+        of[counted] = voting
+        key, weight = _by_frame(every.events, kinds.spread({"": of})[""], len(votings), group, len(groups))
         own = keys[key // max(len(groups), 1)]
         own[:, 3] = groups[key % max(len(groups), 1)]
         return cls(own.astype(np.int32), weight, edge, step)
@@ -93,19 +98,17 @@ class StableLooks:
         ).coarsened(sums.edge, sums.step)
 
 
-def _by_frame(events: Events, voxels: Int64, kind: Int64, group: Int64, groups: int) -> tuple[Int64, Float64]:
-    """What kinds (n,) of voxels which groups (m,) of frames saw: kind * groups + group, and how many places these are.
+def _by_frame(events: Events, kind: Int64, kinds: int, group: Int64, groups: int) -> tuple[Int64, Float64]:
+    """What kinds (n,) of voxels, -1 is none, which groups (m,) of frames saw: kind * groups + group, and how many.
 
     A place counts 1 / T for each of its T frames.
     """
     from semstab.statistics.sampling.loops import add_kinds
 
-    starts, ends, order = events.starts[voxels], events.bounds[1:][voxels], ranked(kind)
-    step, kinds, found = max(1, AT_ONCE // max(groups, 1)), int(kind.max(initial=-1)) + 1, [(kind[:0], np.zeros(0))]
+    step, found = max(1, AT_ONCE // max(groups, 1)), [(kind[:0], np.zeros(0))]
     for first in range(0, kinds, step):
-        low, high = np.searchsorted(kind, [first, first + step], sorter=order)
         total = np.zeros(min(step, kinds - first) * groups)
-        add_kinds(order[low:high], kind, first, starts, ends, group, groups, total)
+        add_kinds(kind, first, events.bounds, group, groups, total)
         key = np.flatnonzero(total)
         found.append((key + first * groups, total[key]))
     keys, weights = zip(*found, strict=True)

@@ -1,0 +1,92 @@
+"""What is the same for many voxels of a map is computed once: most of a clean one are of few kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.correctness import Truth
+from semstab.statistics.sampling.places import Places
+
+FEW = 4
+"""One voxel of each kind is looked at where there are at most one kind for so many voxels, else all of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Voxels with what is known of them.
+
+    events  their log, truth their true classes
+    places  the cubes of those with OP >= 2
+    """
+
+    table: VoxelTable
+    events: Events | None
+    truth: Truth | None
+    places: Places
+
+    @property
+    def label(self) -> npt.NDArray[np.int64] | None:
+        """(n,) the true class, -1 where it is not known."""
+        return None if self.truth is None else self.truth.label
+
+
+@dataclass(frozen=True, eq=False)
+class Kinds:
+    """The voxels of a map, and one of each kind, whose `copies` are how many voxels and `pixels` those of all of them.
+
+    All that is summed over voxels, but by frame, is the same for those of a kind.
+
+    every, one  all of the voxels, and one of each kind
+    of          (n,) which of the latter stands for each of the former; None where they are the same
+    """
+
+    every: Known
+    one: Known
+    of: npt.NDArray[np.int32] | None = None
+
+    @classmethod
+    def found(cls, table: VoxelTable, events: Events | None = None, truth: Truth | None = None) -> Kinds:
+        """Those of a table, of its log, and of its true classes."""
+        from semstab.statistics.loops.kinds import tell_apart
+
+        every = Known(table, events, truth, Places.of(table))
+        most, of = len(table) // FEW, np.empty(len(table), np.int32)
+        rows, voxels, pixels = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64)
+        count = tell_apart(
+            table.evidence.entries,
+            table.K,
+            table.op,
+            int(table.op.max(initial=0)),
+            (table.drift_sum, table.self_sum, table.frame_entropy_sum),
+            every.places.at,
+            np.zeros(0, np.int64) if truth is None else truth.label,
+            table.pixels,
+            rows,
+            voxels,
+            pixels,
+            of,
+        )
+        if count < 0:
+            return cls(every, every)
+        rows, voxels = rows[:count].copy(), voxels[:count].copy()
+        one = Known(
+            replace(table.rows(rows), copies=voxels, pixels=pixels[:count].copy()),
+            None if events is None else events.rows(rows),
+            None if truth is None else Truth(truth.known[rows], truth.label[rows]),
+            replace(every.places, at=every.places.at[rows], voxels=voxels),
+        )
+        return cls(every, one, of)
+
+    def measured(self) -> Kinds:
+        """The same with what measures of one of each kind are functions of: see `VoxelTable.measured`."""
+        return replace(self, one=replace(self.one, table=self.one.table.measured()))
+
+    def spread(self, maps: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+        """Values (n,) by name of all voxels, from those of one of each kind."""
+        return {name: values if self.of is None else values[self.of] for name, values in maps.items()}

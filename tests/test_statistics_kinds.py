@@ -1,0 +1,83 @@
+"""What is the same for many voxels is computed once: the numbers are those of all voxels one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from compare_summaries import differences
+from simulated_events import grid, log_of_evidence
+
+from semstab.model.evidence import Evidence
+from semstab.model.voxels import VoxelTable
+from semstab.runtime.json_form import to_json
+from semstab.statistics import analyse, join_truth, kinds
+from semstab.statistics.kinds import Kinds
+
+SIDE, F, K = 120, 3, 3
+
+
+def flight(wrong):
+    """The log of a clean map whose places few frames see; of some looks the label errs, of others pixels disagree."""
+    rng = np.random.default_rng(3)
+    label = np.where(
+        rng.random((SIDE**2, F)) < wrong, rng.integers(0, K, (SIDE**2, F)), np.arange(SIDE**2)[:, None] % K
+    )
+    evidence = np.eye(K)[label]
+    mixed = rng.random((SIDE**2, F)) < wrong
+    evidence[mixed] = 0.5 * evidence[mixed] + 0.5 * np.eye(K)[rng.integers(0, K, mixed.sum())]
+    seen = np.arange(F) < rng.integers(1, F + 1, (SIDE**2, 1))
+    return log_of_evidence(evidence, seen=seen, index=grid(SIDE))
+
+
+def looked_at(log, true, monkeypatch, few):
+    monkeypatch.setattr(kinds, "FEW", few)
+    table, limit = log.table(), true
+    return analyse(table, log, true, limit=limit), analyse(table), analyse(table, truth=true)
+
+
+def test_one_voxel_of_each_kind_tells_what_all_of_them_do(monkeypatch):
+    log, true = flight(0.02), flight(0.1).table()
+    found = Kinds.found(log.table(), log, join_truth(log.table(), true))
+    assert len(found.one.table) < SIDE**2 / 4
+    assert found.one.table.copies.sum() == SIDE**2
+    for few, every in zip(
+        looked_at(log, true, monkeypatch, kinds.FEW), looked_at(log, true, monkeypatch, SIDE**3), strict=True
+    ):
+        assert not differences(to_json(few.summary), to_json(every.summary), tolerance=1e-11)
+        assert not differences(to_json(few.table), to_json(every.table), tolerance=1e-12)
+        np.testing.assert_allclose(few.sums.columns, every.sums.columns, rtol=1e-12, atol=1e-12)
+        assert few.maps.keys() == every.maps.keys()
+        for name, values in few.maps.items():
+            np.testing.assert_array_equal(values, every.maps[name], err_msg=name)
+
+
+def test_kinds_that_there_is_no_room_for_stand_for_themselves():
+    n, classes = 60_000, 9_000
+    once, label = np.ones(n), (np.arange(n) % classes).astype(np.uint16)
+    index = {"ix": np.arange(n), "iy": np.zeros(n), "iz": np.zeros(n)}
+    table = VoxelTable(
+        **index, op=once, evidence=Evidence(np.arange(n + 1), label, once, classes), drift_sum=0 * once, pixels=once,
+        first_frame=0 * once, last_frame=0 * once, self_sum=once, frame_entropy_sum=0 * once, voxel_size=1.0,
+    )  # fmt: skip
+    found = Kinds.found(table)
+    one = found.one.table
+    assert classes < len(one) < n / 4
+    assert one.copies.sum() == one.pixels.sum() == n
+    np.testing.assert_array_equal(one.evidence.label[found.of], label)
+
+
+@pytest.mark.parametrize(
+    "column", ["op", "drift_sum", "self_sum", "frame_entropy_sum", "label", "weight", "truth", "cube"]
+)
+def test_voxels_that_differ_in_anything_that_is_summed_are_of_two_kinds(column):
+    n, T = 4096, np.full(4096, 2.0)
+    columns = dict.fromkeys(("iy", "iz", "drift_sum", "first_frame", "last_frame", "frame_entropy_sum"), 0 * T)
+    columns |= {"ix": np.arange(n) + 0.0, "op": T, "pixels": T, "self_sum": T}
+    label, weight, true = np.zeros(n, np.uint16), T.copy(), np.zeros(n, np.int64)
+    {**columns, "label": label, "weight": weight, "truth": true, "cube": columns["ix"]}[column][-1] += (
+        1 + (column == "cube") * 2**20
+    )
+    evidence = Evidence(np.arange(n + 1), label, weight, K)
+    table = VoxelTable(**columns, evidence=evidence, voxel_size=1.0)
+    truth = kinds.Truth(np.ones(n, np.bool_), true)
+    assert Kinds.found(table, truth=truth).one.table.copies.tolist()[-1] == 1
