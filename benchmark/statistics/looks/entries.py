@@ -164,7 +164,7 @@ class Looks:
         from semstab.statistics.looks.observing import look
 
         n = len(self)
-        first, of, starts = (np.empty(n + more, np.int64) for more in (0, 0, 1))
+        first, of, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
         pixels, share, said = np.empty(n), np.empty(n), np.empty(n, np.uint16)
         n, m = look(key, view, label, weight, kept, self.K, first, of, pixels, starts, said, share)
         first, of = first[:n], of[:n]
@@ -174,7 +174,7 @@ class Looks:
             voxel=of,
             frame=self.views.frame.astype(np.int32)[view[first]],
             evidence=Evidence(starts[: n + 1], said[:m], share[:m], self.K),
-            pixels=np.rint(pixels[:n]).astype(np.int64),
+            pixels=np.rint(pixels[:n]).astype(np.int32),
             voxel_size=self.voxel_size,
             classes=self.classes,
         )
