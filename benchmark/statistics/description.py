@@ -19,6 +19,7 @@ from semstab.model.statistics import (
     BlockCut,
     ClassAgreement,
     CorrectnessStatistics,
+    Correlogram,
     DriftStatistics,
     EntropyParts,
     FlipRates,
@@ -142,11 +143,15 @@ def concluded(
     voxel_size: float,
     classes: tuple[str, ...] = (),
     sample: Sample | None = None,
+    by_lag: Correlogram | None = None,
     name: str = "",
     edges: Sequence[int] = STRATA,
     critical: Sequence[str] = (),
 ) -> tuple[MapStatistics, InfluenceSums]:
-    """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts."""
+    """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts.
+
+    by_lag  the correlogram of the sample, where that is known by now
+    """
     first, own = whole.first, whole.first.own
     table, influence = own.table.summary(voxel_size, classes, edges), whole.influence
     if sample is not None:
@@ -165,7 +170,7 @@ def concluded(
         _About(name, whole.seed, table, Judged(*judged), reach),
         means,
         own.places,
-        sample,
+        correlogram(sample) if by_lag is None and sample is not None else by_lag,
         agreement=_agreement(means, class_agreement_of(own.classes, classes)),
         flipping=second.flipping.flipping(unsteady, classes),
         drift=_drift(means, own.places, whole),
@@ -220,7 +225,7 @@ def _concluded(
     about: _About,
     means: Mapping[str, Interval],
     places: PlaceSums,
-    sample: Sample | None,
+    by_lag: Correlogram | None,
     **sections: Any,
 ) -> MapStatistics:
     """All of it, from what was found section by section."""
@@ -249,7 +254,7 @@ def _concluded(
         verdict=said,
         judged=judged,
         reach=reach,
-        correlogram=None if sample is None else correlogram(sample),
+        correlogram=by_lag,
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         beyond_coin=BeyondCoin(means["coin"], means["steadier"]),
         **sections,
