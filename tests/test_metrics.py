@@ -353,7 +353,9 @@ def without(table, row):
     return dataclasses.replace(table, **columns)
 
 
-COLUMNS = [field.name for field in dataclasses.fields(VoxelTable) if field.name not in ("voxel_size", "classes")]
+COLUMNS = [
+    field.name for field in dataclasses.fields(VoxelTable) if field.name not in ("voxel_size", "classes", "copies")
+]
 
 
 @pytest.mark.parametrize("row", [0, 1, 2])

@@ -43,12 +43,17 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
     Raises DataError where the tables differ in K or voxel size.
     """
     require_same_grid(*tables)
-    first = tables[0].index
-    if all(np.array_equal(first, other.index) for other in tables[1:]):
-        return [np.arange(len(first)) for _ in tables]
+    if same_voxels(*tables):
+        return [np.arange(len(tables[0]))] * len(tables)
     keys = voxel_keys(*(table.index for table in tables))
     common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
     return [np.searchsorted(own, common).astype(np.int64) for own in keys]
+
+
+def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:
+    """Whether all tables have the same voxels."""
+    names = ("ix", "iy", "iz")
+    return all(np.array_equal(getattr(first, name), getattr(other, name)) for other in others for name in names)
 
 
 def shared_observations(*logs: Events) -> list[Events]:

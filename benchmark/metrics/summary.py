@@ -65,7 +65,7 @@ class TableSums:
             many = np.ones(len(rows.op)) if table.copies is None else table.copies[some]
             sums[1] += _by_group(values, rows.op, dominant(rows), table.K, many)
             by_op += _by_group(values, rows.op, groups_of(rows.op, finest), by_op.shape[1], many)
-            observations += float(many @ rows.op)
+            observations += float((many * rows.op).sum())
         for own, bounds in ((sums[0], edges), (sums[2], [RECURRENT - 1]), (sums[3], steps)):
             np.add.at(own.T, np.searchsorted(bounds, [*finest, np.iinfo(np.int32).max]), by_op.T)
         total = [table.pixels.sum(), observations, by_op[0].sum()]

@@ -194,7 +194,7 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
     add_class_sums(table.evidence.entries, table.op, table.voxels, one_hot, bounds, log, sums[:5])
     if not told:
         sums[2:5, sums[0] > 0] = np.nan
-    sums[5], sums[6] = table.voxels @ again, table.voxels @ (again * table.op)
+    sums[5], sums[6] = table.voxels.sum(where=again), (table.voxels * table.op).sum(where=again)
     return sums
 
 

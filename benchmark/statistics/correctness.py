@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics import strata
-from semstab.metrics.matching import shared_rows
+from semstab.metrics.matching import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.model.concentration import blockwise, by_group
-from semstab.model.evidence import Evidence
+from semstab.model.evidence import Evidence, stretches
 from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
@@ -55,11 +55,15 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
     Raises DataError where the maps differ in K or voxel size.
     """
-    rows, true_rows = shared_rows(table, truth)
-    found = truth.evidence.concentration
-    pure = found.largest[true_rows] > PURE
-    label = np.full(len(table), -1, dtype=np.int64)
-    label[rows[pure]] = found.label[true_rows[pure]]
+    require_same_grid(table, truth)
+    label = np.empty(len(truth), np.int64)
+    for some in stretches(len(truth)):
+        found = truth.evidence.take(some).concentration
+        label[some] = np.where(found.largest > PURE, found.label.astype(np.int64), -1)
+    if not same_voxels(table, truth):
+        (rows, true_rows), true = shared_rows(table, truth), label
+        label = np.full(len(table), -1)
+        label[rows] = true[true_rows]
     return Truth(label >= 0, label)
 
 
@@ -176,7 +180,7 @@ def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None) -> Float64:
     fused = Voxels(fused.op, evidence, fused.drift_sum)
     all_of_it = np.zeros(len(voxels), np.int64)
     total, defined = by_group(all_of_it, [measure.of(fused) for measure in measures()], 1, voxels)
-    often = [voxels @ (fused.op >= measure.lowest_op) for measure in measures()]
+    often = [voxels.sum(where=fused.op >= measure.lowest_op) for measure in measures()]
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
         return rows

@@ -47,7 +47,7 @@ class FlippingSums:
         unsteady = np.round((1 - stable) / UNIT) * UNIT
         places = Places.of(table, edge)
         share = PlaceSums(places.cell, edge, places.means({"": unsteady}))
-        return cls(share, int(table.voxels @ (table.op >= ENOUGH)), _together(table, table.voxels * unsteady))
+        return cls(share, int(table.voxels.sum(where=table.op >= ENOUGH)), _together(table, table.voxels * unsteady))
 
     @classmethod
     def merged(cls, parts: Sequence[FlippingSums]) -> FlippingSums:

@@ -124,7 +124,7 @@ def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
         by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
         rows = []
         for fused in by_rule:
-            relabelled = voxels @ (fusion_rules.labels(fused.evidence) != usual)
+            relabelled = voxels.sum(where=fusion_rules.labels(fused.evidence) != usual)
             rows.append(np.concatenate([[relabelled, voxels.sum()], rule_sums(fused, voxels, known)]))
         total = total + np.stack(rows)
     return total
