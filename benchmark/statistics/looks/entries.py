@@ -199,13 +199,14 @@ class Looks:
         import pyarrow.parquet as pq
 
         try:
-            content = pq.read_table(path)
+            with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+                content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("Looks", SCHEMA):
                 raise DataError("of another kind, or of another version, which sampled other voxels: run it again")
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
-            x, y, z, view, label, weight, drawn = (column.to_numpy() for column in content.columns)
+            x, y, z, view, label, weight, drawn = map(arrow.values_of, content.columns)
             key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
             return cls(key, view, label, weight, drawn, low, views, **about)
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
