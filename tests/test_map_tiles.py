@@ -8,6 +8,7 @@ import dataclasses
 import json
 import re
 import shutil
+from collections import Counter
 from collections.abc import Generator
 from unittest import mock
 
@@ -18,6 +19,7 @@ from compare_summaries import differences
 from posed_config import configure
 from posed_writer import write_posed
 from pyarrow import dataset, parquet
+from test_recording import read
 
 import semstab
 from semstab import backends
@@ -36,6 +38,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.extent import Extent
 from semstab.model.voxels.parquet import Tile
 from semstab.outputs.export import export, raster
+from semstab.outputs.recording import Recording, Target
 from semstab.outputs.relabel import Belief, relabel
 from semstab.runtime.json_form import to_json
 from semstab.statistics.sampling import InfluenceSums
@@ -465,6 +468,20 @@ def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_
     again = Progress()
     semstab.engine.run(config, out=tmp_path / "anew", observers=[again])
     assert again.frames == 30
+
+
+def test_the_recording_of_a_map_that_is_begun_again_has_each_frame_once(wall, few_said, tmp_path) -> None:
+    out, file = tmp_path / "run", tmp_path / "recording.rrd"
+    observer = Recording(Target(file), run=out)
+    semstab.engine.run(configure(wall, **SETTINGS, memory_gb=30e-6), out=out, observers=[observer])
+    recorded = read(file)
+    frames = {entity: Counter(row["frame"] for row in rows if "frame" in row) for entity, rows in recorded.items()}
+    assert set(frames["/wall/map/a/numba/00"]) == {29}
+    for entity in ("depth", "camera/a/labels", "series/map_vss/a/numba", "series/fuse_ms/a/numba", "series/wait_ms/a"):
+        assert frames[f"/wall/{entity}"] == Counter(range(30))
+    drift = {row["frame"]: row["Scalars:scalars"] for row in recorded["/wall/series/drift/a/numba"][1:]}
+    assert drift == {int(row["frame"]): [float(row["drift"])] for row in series_of(out) if row["drift"]}
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "recording.rrd"}
 
 
 def test_tiles_that_are_forbidden_are_not_begun_either(wall, few_said, tmp_path) -> None:

@@ -63,8 +63,8 @@ class History:
             observations[voxel] += 1
             entries[voxel] += seen.entries
         place, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
-        voxels = np.repeat(np.arange(len(order)), observations[1:])
-        frame, pixels = np.empty(len(voxels), np.int32), np.empty(len(voxels), np.int64)
+        voxels = np.repeat(np.arange(len(order), dtype=np.int32), observations[1:])
+        frame, pixels = (np.empty(len(voxels), np.int32) for _ in range(2))
         starts = np.empty(len(voxels) + 1, np.int64)
         starts[-1] = entry[-1]
         label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])

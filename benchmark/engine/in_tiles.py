@@ -47,4 +47,8 @@ class InTiles:
         for line in sizing.remarks:
             self._told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
         tiling = sizing.tilings.get(planned.identity)
-        return outcome if tiling is None else self.begin(planned, tiling)
+        if tiling is None:
+            return outcome
+        if planned.kept:
+            self._told.tell(lambda observer: observer.unit_begun_again(planned.unit))
+        return self.begin(planned, tiling)

@@ -65,6 +65,9 @@ class Observer:
     def part_finished(self) -> None:
         """All frames that see it went into it; its map is measured and written next."""
 
+    def unit_begun_again(self, unit: Unit) -> None:
+        """It outgrew the memory: what went into its map is given up, and it is fused in tiles, from its first frame."""
+
     def unit_assembled(self, task: Task, summary: UnitSummary) -> None:
         """All tiles of a unit's map are in the folder, and measured."""
 

@@ -217,10 +217,10 @@ class Events:
     """The log of observations: m rows, one a (voxel, frame), grouped by voxel and in order of integration within one.
 
     ix, iy, iz  (n,) int32 the voxels, sorted
-    voxel       (m,) int64 row into them, ascending
+    voxel       (m,) int32 row into them, ascending
     frame       (m,) int32 frame index
     evidence    (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse
-    pixels      (m,) int64 pixels behind it
+    pixels      (m,) int32 pixels behind it
     voxel_size  r, metres
     classes     the K class names, where they are known
     """
@@ -228,18 +228,18 @@ class Events:
     ix: Int32
     iy: Int32
     iz: Int32
-    voxel: Int64
+    voxel: npt.NDArray[np.integer]
     frame: Int32
     evidence: Evidence
-    pixels: Int64
+    pixels: npt.NDArray[np.integer]
     voxel_size: float
     classes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _freeze_columns(self, _INDEX_TYPES, self.ix)
         _freeze_columns(self, _EVENT_TYPES, self.voxel)
-        step = np.diff(self.voxel, prepend=-1, append=len(self.ix))
-        if ((step != 0) & (step != 1)).any() or step[0] != 1 or step[-1] != 1:
+        further = self.voxel[1:][self.voxel[1:] != self.voxel[:-1]]
+        if not np.array_equal(np.append(self.voxel[:1], further), np.arange(len(self.ix))):
             raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
 
     def __len__(self) -> int:
@@ -278,7 +278,7 @@ class Events:
             "op": np.diff(np.append(starts, len(self))).astype(np.int32),
             "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
             "drift_sum": _sum_by_voxel(self.drift(), starts),
-            "pixels": _sum_by_voxel(self.pixels, starts),
+            "pixels": _sum_by_voxel(self.pixels.astype(np.int64), starts),
             "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
             "last_frame": np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
             "self_sum": _sum_by_voxel((s_bar**2).sum(axis=1), starts),
@@ -401,7 +401,7 @@ _VOXEL_TYPES: Types = _INDEX_TYPES | {
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
 _SUMS = [name for name in _VOXEL_TYPES if name not in (*_INDEX_TYPES, "evidence")]
-_EVENT_TYPES: Types = {"voxel": np.int64, "frame": np.int32, "evidence": np.float64, "pixels": np.int64}
+_EVENT_TYPES: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64, "pixels": np.int32}
 
 
 def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:

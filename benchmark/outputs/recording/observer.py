@@ -29,7 +29,7 @@ from semstab.model.measures import measures
 from semstab.model.records import RECORDING_PARTS, Result, Variation, voxels_of
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import series
+from semstab.outputs.recording import given_up, series
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.camera import (
     CameraLog,
@@ -46,6 +46,7 @@ from semstab.outputs.recording.maps.legend import Legend
 from semstab.outputs.recording.maps.voxel_maps import CHUNKS, chunks_of, thinned_map
 from semstab.outputs.recording.parts import Parts
 from semstab.outputs.recording.target import DEFAULT_URL, Target, is_whole
+from semstab.runtime.files import atomic_path
 from semstab.task import Task
 
 FIRST_CHUNKS = 8
@@ -89,6 +90,7 @@ class Recording(Observer):
         self._background: Background | None = None
         self._parts: Parts | None = None
         self._drift = DriftParts(None if run is None else run / RECORDING_PARTS)
+        self._whole: set[tuple[str, str]] = set()  # of which a map has seen all frames: their pictures are there
         self._cut = False  # whether there is no earlier recording that is whole
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
@@ -138,9 +140,24 @@ class Recording(Observer):
         self._clock.set(stream, frame.index, frame.timestamp)
         origin = self._origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
         self._cameras[scene].log(stream, frame, background, track=not self.pictures_only)
+        if (scene, task.backbone) in self._whole:
+            return
         if self._group is None or self._group.task is not task:
             self._group = GroupLog(task, self._plan.config.voxel_size, origin)
         self._group.see(stream, frame, background)
+
+    def unit_begun_again(self, unit: Unit) -> None:
+        """Take what was logged of its map out of the file; a viewer that follows the run has seen it."""
+        if self._stream is None or self._background is None or self._parts is not None or self.target.live:
+            return
+        task, pictures = self._tasks[unit.scene, unit.backbone], (unit.scene, unit.backbone) not in self._whole
+        self._background.close()
+        self._finish(self._stream)
+        with atomic_path(self.target.file) as file:
+            self._stream = stream = dataclasses.replace(self.target, file=file).open()
+            given_up.copy(self.target.file, stream, given_up.entities_of(unit, task, pictures=pictures))
+        self._background, self._group = Background(stream, self._clock), None
+        self._send_blueprint(stream)
 
     def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
         """Follow the part's map: pictures of drift wait in the folder until the parts are all there."""
@@ -184,6 +201,7 @@ class Recording(Observer):
     def group_finished(self, task: Task) -> None:
         """Log what flipped, and lay out what there is now."""
         (stream, background), group = self._opened(), self._group
+        self._whole.add((task.scene.name, task.backbone))
         if group is None:
             return
         if group.tables:
@@ -361,6 +379,8 @@ class Recording(Observer):
     def _log_drift(self, stream: rr.RecordingStream, task: Task) -> None:
         """Log the pictures of drift that parts of a map in tiles have left."""
         group: GroupLog | None = None
+        if (task.scene.name, task.backbone) in self._whole:
+            return
         for picture in self._drift.pictures(task):
             group = group or GroupLog(task, self._plan.config.voxel_size, self._origins[task.scene.name])
             self._clock.set(stream, picture.frame, picture.timestamp)

@@ -6,6 +6,7 @@ One number of a map averages over all pairs of frames, so that it says as much a
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
 from semstab.statistics.looks.entries import Sample
+from semstab.statistics.ranks import numbered
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_GROUPS
 from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
@@ -37,7 +39,7 @@ MOST_CUBES, MOST_SUMS = 160, 2**17
 
 @dataclass(frozen=True, eq=False)
 class _Looks:
-    """Looks (m,) by the entries of their evidence, with ||s||^2 of each."""
+    """Looks (n,) by the entries of their evidence, with ||s||^2 of each."""
 
     entries: tuple[Int64, npt.NDArray[np.uint16], Float64]
     squares: Float64
@@ -55,36 +57,32 @@ class _Looks:
         products(*self.entries, first, lag, found)
         return found
 
-    def add(self, sums: Float64, which: Int64, into: Int64, product: Float64) -> None:
-        """Add these looks to the rows of the sums (rows, 3 + K), see `add_looks`."""
-        from semstab.statistics.looks.pairing import add_looks
-
-        add_looks(sums, which, into, product, self.squares, *self.entries)
-
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of looks (m,) at one voxel each: their numbers, how far they are apart by axis, and s . s' of each.
+    """Pairs of looks (m,) at one voxel each: the first one's number, how many looks later the second is.
 
-    seen, limit  all looks, as they were and in the limit, and the products of these pairs
+    apart  (4, m) how far they are apart, by axis as in EDGES
+    seen, limit  s . s' (m,) as they were, and in the limit
     """
 
     first: Int64
-    second: Int64
-    apart: dict[str, Float64]
-    seen: tuple[_Looks, Float64]
-    limit: tuple[_Looks, Float64]
+    lag: int
+    apart: Float64
+    seen: Float64
+    limit: Float64
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cubes (G, 3) and groups of frames (F,) that are kept apart.
+    """Cubes (G, 3), and the groups of frames (C,) of which there are looks in cube (C,): what is kept apart.
 
-    of     (m,) the cube and group of each observation, as one number
+    of     (n,) which of the C each look is in
     edge   of a cube in metres, step frames of a group
     """
 
     at: npt.NDArray[np.int32]
+    cube: Int64
     frames: npt.NDArray[np.int32]
     of: Int64
     edge: float
@@ -100,7 +98,9 @@ class _Cells:
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2
         group = np.searchsorted(frames, seen.frame // step)
-        return cls(at, frames, of[seen.voxel] * len(frames) + group, edge, step)
+        there, of = numbered(of[seen.voxel] * len(frames) + group)
+        cube, group = np.divmod(there, max(len(frames), 1))
+        return cls(at, cube, frames[group], of, edge, step)
 
 
 EDGES: dict[str, tuple[float, ...]] = {
@@ -111,6 +111,8 @@ EDGES: dict[str, tuple[float, ...]] = {
 }
 """Edges of the bins: frames, degrees, ratio of the ranges, metres."""
 
+AXES = EDGES | {"standard": STANDARD}
+
 
 def correlogram(sample: Sample) -> Correlogram:
     """Alpha between frames in bins of the distance of two looks, over the pairs of looks at sampled voxels.
@@ -120,14 +122,13 @@ def correlogram(sample: Sample) -> Correlogram:
     map.
     """
     seen, limit = _of_seen_classes(*sample.shared())
-    cells = _Cells.over(seen)
-    bins = {axis: _Bins(edges, cells, 3 + seen.K) for axis, edges in (*EDGES.items(), ("standard", STANDARD))}
-    for pairs in _pairs(sample, seen, limit):
-        for axis, into in bins.items():
-            into.add(pairs.apart["angle" if axis == "standard" else axis], pairs)
-    there = [(axis, *own) for axis, into in bins.items() for own in into.found()]
+    looks, still = _Looks.of(seen.evidence), _Looks.of(limit.evidence)
+    sums = _Sums(_Cells.over(seen), 3 + seen.K)
+    for pairs in _pairs(sample, seen, looks, still):
+        sums.add(pairs, looks, still)
+    there = list(sums.found())
     alphas = answers(asked for _, _, asked in there)
-    found: dict[str, tuple[LagBin, ...]] = dict.fromkeys(bins, ())
+    found: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for (axis, own, _), alpha in zip(there, alphas, strict=True):
         found[axis] += (dataclasses.replace(own, alpha=alpha),)
     nothing = LagBin(*STANDARD, math.nan, 0, UNKNOWN, math.nan)
@@ -141,63 +142,63 @@ def _of_seen_classes(*logs: Events) -> Iterator[Events]:
     return (dataclasses.replace(log, evidence=log.evidence.only(labels), classes=()) for log in logs)
 
 
-def _pairs(sample: Sample, seen: Events, limit: Events) -> Iterator[_Pairs]:
+def _pairs(sample: Sample, seen: Events, looks: _Looks, still: _Looks) -> Iterator[_Pairs]:
     """The pairs of looks that are 1, 2, 4, ... looks apart, one lag after the other."""
+    from semstab.statistics.looks.pairing import distances
+
     rank = sample.views.rank(seen.frame)
-    camera = sample.views.centre[rank]
+    centre = sample.views.centre
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
-    ray = camera - ((index + 0.5) * seen.voxel_size)[seen.voxel]
+    ray = centre[rank] - ((index + 0.5) * seen.voxel_size)[seen.voxel]
     reach = np.linalg.norm(ray, axis=1)
-    own, still = _Looks.of(seen.evidence), _Looks.of(limit.evidence)
     lag = 1
     while len(first := np.flatnonzero(seen.voxel[lag:] == seen.voxel[:-lag])):
-        second = first + lag
-        cosine = (ray[first] * ray[second]).sum(axis=1) / (reach[first] * reach[second])
-        apart = {
-            "time": np.abs(rank[second] - rank[first]).astype(np.float64),
-            "angle": np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))),
-            "range": np.maximum(reach[first], reach[second]) / np.minimum(reach[first], reach[second]),
-            "baseline": np.linalg.norm(camera[second] - camera[first], axis=1),
-        }
-        yield _Pairs(first, second, apart, *((looks, looks.products(first, lag)) for looks in (own, still)))
+        apart = np.empty((len(EDGES), len(first)))
+        distances(first, lag, rank, centre, ray, reach, *apart)
+        angle = apart[1]
+        np.degrees(np.arccos(np.clip(angle, -1.0, 1.0)), out=angle)
+        yield _Pairs(first, lag, apart, looks.products(first, lag), still.products(first, lag))
         lag *= 2
 
 
-class _Bins:
-    """Sums of the pairs by bin: of looks by cube and group of frames (n, G, F, C), of the limit (n, C)."""
+class _Sums:
+    """Sums of the pairs by bin, one axis after the other: of looks by cell (n, C, 3 + K), of the limit (n, 3 + K).
 
-    def __init__(self, edges: tuple[float, ...], cells: _Cells, columns: int) -> None:
-        n = len(edges) - 1
-        self.edges = np.array(edges)
-        self.cells = cells
-        self._looks = np.zeros((n, len(cells.at), len(cells.frames), columns))
-        self._limit = np.zeros((n, columns))
+    The last bin has what is beyond the edges of an axis.
+    """
+
+    def __init__(self, cells: _Cells, columns: int) -> None:
+        self._bins = [(axis, *edges) for axis, own in AXES.items() for edges in itertools.pairwise(own)]
+        n = len(self._bins) + 1
+        self._cells = cells
+        self._looks, self._limit = np.zeros((n, len(cells.cube), columns)), np.zeros((n, columns))
         self._pairs, self._apart = np.zeros(n), np.zeros(n)
 
-    def add(self, apart: Float64, pairs: _Pairs) -> None:
-        """Pairs (m,) that are so far apart; those beyond the edges are left out."""
-        n, of = len(self._pairs), np.searchsorted(self.edges, apart, side="right") - 1
-        of[of == n] = -1
-        known = of >= 0
-        self._pairs += np.bincount(of[known], minlength=n)
-        self._apart += np.bincount(of[known], weights=apart[known], minlength=n)
-        (seen, product), (limit, still) = pairs.seen, pairs.limit
-        cells, columns = self._looks[0].size // self._looks.shape[-1], self._looks.shape[-1]
-        for looks in (pairs.first, pairs.second):
-            into = np.where(known, of * cells + self.cells.of[looks], -1)
-            seen.add(self._looks.reshape(-1, columns), looks, into, product)
-            limit.add(self._limit, looks, of, still)
+    def add(self, pairs: _Pairs, looks: _Looks, still: _Looks) -> None:
+        """Pairs (m,)."""
+        from semstab.statistics.looks.pairing import add_pairs
 
-    def found(self) -> Iterator[tuple[LagBin, Asked]]:
-        """The bins in which there is enough, and what is asked of each."""
-        for k in np.flatnonzero(self._pairs >= LEAST_PAIRS):
-            columns = self._looks[k]
-            cube, group = np.nonzero(columns[:, :, 1])
+        apart = np.stack([*pairs.apart, pairs.apart[1]], axis=1)  # the standard baseline is one of angles
+        bins, before = np.empty(apart.shape, np.int64), 0
+        for axis, edges in enumerate(AXES.values()):
+            of = np.searchsorted(edges, apart[:, axis], side="right")
+            bins[:, axis] = np.where((of > 0) & (of < len(edges)), of + (before - 1), len(self._bins))
+            before += len(edges) - 1
+        add_pairs(
+            pairs.first, pairs.lag, bins, apart, self._cells.of, (*looks.entries, looks.squares, pairs.seen),
+            (*still.entries, still.squares, pairs.limit), self._looks, self._limit, self._pairs, self._apart,
+        )  # fmt: skip
+
+    def found(self) -> Iterator[tuple[str, LagBin, Asked]]:
+        """The bins in which there is enough, each with its axis, and what is asked of it."""
+        for k in np.flatnonzero(self._pairs[:-1] >= LEAST_PAIRS):
+            cells, there = self._cells, np.flatnonzero(self._looks[k, :, 1])
+            cube, looks, pairs = cells.cube[there], self._looks[k, there], self._pairs[k]
             if len(np.unique(cube)) < LEAST_CUBES:
                 continue
-            own, looks = self.cells, columns[cube, group]
             whole = looks[:, :2]  # of its agreement with the other one, neither look has half for itself alone
-            alpha = asked_of_looks(own.at[cube], own.frames[group], own.edge, own.step, looks, whole, between_of)
-            low, high, pairs = float(self.edges[k]), float(self.edges[k + 1]), self._pairs[k]
+            where = cells.at[cube], cells.frames[there], cells.edge, cells.step
+            axis, low, high = self._bins[k]
             ceiling = float(between_of(self._limit[k]))
-            yield LagBin(low, high, float(self._apart[k] / pairs), int(pairs), UNKNOWN, ceiling), alpha
+            own = LagBin(low, high, float(self._apart[k] / pairs), int(pairs), UNKNOWN, ceiling)
+            yield axis, own, asked_of_looks(*where, looks, whole, between_of)

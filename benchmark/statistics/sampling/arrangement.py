@@ -33,9 +33,6 @@ MOST_KNOWN = 2048
 KEPT = 4
 """So many times what was asked for together is kept: of one map the same cells are asked for again and again."""
 
-AT_ONCE = 2**18
-"""Numbers in the matrices that are worked on together."""
-
 
 @dataclass(frozen=True, eq=False)
 class Cells:
@@ -129,13 +126,14 @@ class Arrangement:
     def _factors(self) -> tuple[Float64, Float64]:
         """(A, G, G) Cholesky's factors of the alternatives' covariances, and the logarithms (A, G) of the determinants
         of those of the first 1, 2, ... cells."""
+        from scipy.linalg.lapack import dpotrf
+
         count = len(self.at)
         factors, diagonal = np.empty((len(self.number), count, count)), np.arange(count)
-        for some in _stretches(len(self.number), count):
-            share = self.alone[some, None, None]
-            covariance = (1 - share) * self.correlations[self.number[some]]
-            covariance[:, diagonal, diagonal] += share[:, 0] + SINGULAR
-            factors[some] = np.linalg.cholesky(covariance)
+        for own, number, share in zip(factors, self.number, self.alone, strict=True):
+            np.multiply(self.correlations[number], 1 - share, out=own)
+            own[diagonal, diagonal] += share + SINGULAR
+            dpotrf(own.T, lower=1, clean=0, overwrite_a=1)  # in its place
         return factors, 2 * np.log(factors[:, diagonal, diagonal]).cumsum(axis=1)
 
     def logarithms(self, count: Int64) -> Float64:
@@ -148,7 +146,7 @@ class Arrangement:
 
         found, columns = np.empty((len(self.number), *errors.shape)), np.asfortranarray(errors.T)
         for to, factor in zip(found, self._factors[0], strict=True):
-            to[:] = dtrsm(1.0, factor.T, columns, lower=0, trans_a=1).T
+            to[:] = dtrsm(1.0, factor.T, columns, lower=1).T
         return found
 
     def kernel(self, block: float) -> Float64:
@@ -165,7 +163,7 @@ class Arrangement:
         key = size.tobytes()
         if len(self._known) >= MOST_KNOWN:
             self._known.clear()
-        unknown = [k for k in number.tolist() if (k, key) not in self._known]
+        unknown = [k for k in dict.fromkeys(number.tolist()) if (k, key) not in self._known]
         self._known |= {(k, key): own for k, own in zip(unknown, self._moments(unknown, size), strict=True)}
         known = np.array([self._known[k, key] for k in number.tolist()]).T
         return Moments(known[:2], known[2:4], known[4:])
@@ -186,12 +184,6 @@ class Arrangement:
                 scale @ covariance @ scale, plain, both.trace(), of_kernel[0],
                 np.vdot(both, both.T), np.vdot(both, kernel), of_kernel[1],
             ])  # fmt: skip
-
-
-def _stretches(count: int, cells: int) -> Iterator[slice]:
-    """Of so many matrices of cells, those that are worked on together."""
-    step = max(1, AT_ONCE // cells**2)
-    return (slice(low, low + step) for low in range(0, count, step))
 
 
 # --- Cells of several numbers -----------------------------------------------------------------------------------------
