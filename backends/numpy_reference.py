@@ -131,7 +131,11 @@ class NumpySample(NumpyReference):
     """The reference on one in `ONE_IN` of the voxels, drawn at random by their index, through all frames."""
 
     def _pixels(self, frame: Frame) -> Mask:
-        return pixels_held(frame, super()._pixels(frame), self.voxel_size, in_sample)
+        return pixels_held(frame, frame.valid, self.voxel_size, self._holds)
+
+    def _holds(self, index: Int64) -> Mask:
+        drawn = in_sample(index)
+        return drawn if self.within is None else drawn & self.within.holds(index)
 
 
 def in_sample(index: npt.NDArray[np.integer]) -> Mask:
@@ -139,5 +143,5 @@ def in_sample(index: npt.NDArray[np.integer]) -> Mask:
     mixed = np.zeros(index.shape[1], np.int64)
     for axis, odd in zip(index, ODD, strict=True):
         mixed += axis * odd
-    drawn: Mask = (mixed >> 40) % ONE_IN == 0
+    drawn: Mask = (mixed >> 40) & (ONE_IN - 1) == 0
     return drawn

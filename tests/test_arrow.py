@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
-from semstab.runtime.arrow import column
+from semstab.runtime.arrow import column, values_of
 
 
 @pytest.mark.parametrize("dtype", ["int32", "uint16", "int64", "float64", "float32", "bool"])
@@ -20,6 +22,23 @@ def test_a_column_is_what_arrow_makes_of_the_array(dtype) -> None:
         assert column(some).equals(pa.array(some))
 
 
-def test_pandas_is_not_imported_for_a_column() -> None:
+@pytest.mark.parametrize("dtype", ["int32", "uint16", "int64", "float64", "float32", "bool"])
+def test_a_column_comes_back_as_it_was(dtype) -> None:
+    """In one piece, in two, and in none."""
+    values = np.arange(20).astype(dtype)
+    for parts in ([values], [values[:7], values[7:]], []):
+        found = values_of(pa.chunked_array([pa.array(part) for part in parts], pa.from_numpy_dtype(dtype)))
+        assert found.dtype == dtype
+        assert found.tolist() == [one for part in parts for one in part.tolist()]
+
+
+def test_a_column_with_gaps_has_none_filled_with_what_lay_there() -> None:
+    assert np.isnan(values_of(pa.chunked_array([pa.array([1.5, None])]))).tolist() == [False, True]
+
+
+def test_pandas_is_not_imported_for_a_column(tmp_path: Path) -> None:
+    """Neither for one that is made, nor for one that is read."""
+    pq.write_table(pa.table({"op": [1, 2]}), tmp_path / "map.parquet")
     code = "import sys, numpy; from semstab.runtime.arrow import column; column(numpy.ones(3))"
+    code += f"; from semstab.model.voxels import parquet; parquet.columns({str(tmp_path / 'map.parquet')!r}, ['op'])"
     subprocess.run([sys.executable, "-c", f"{code}; assert 'pandas' not in sys.modules"], check=True)

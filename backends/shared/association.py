@@ -24,8 +24,8 @@ LOOKED_AT = 2**12
 FAR, DISTINCT = 100.0, 8
 """Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
 
-FEW = 1 << 19
-"""Pixels that are looked at together, about."""
+FEW = 1 << 15
+"""Pixels that are looked at together, about: what is computed of them stays in a core's cache."""
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

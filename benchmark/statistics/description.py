@@ -19,6 +19,7 @@ from semstab.model.statistics import (
     BlockCut,
     ClassAgreement,
     CorrectnessStatistics,
+    Correlogram,
     DriftStatistics,
     EntropyParts,
     FlipRates,
@@ -36,7 +37,7 @@ from semstab.statistics.agreement import alpha_of, between_of, class_agreement_o
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
 from semstab.statistics.judging.ceiling import losses_of
 from semstab.statistics.judging.verdict import verdict
-from semstab.statistics.kinds import Kinds
+from semstab.statistics.kinds import Kinds, spread
 from semstab.statistics.looks import Sample, correlogram, reach_by, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
 from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, answered, judged_by, with_sample
@@ -113,7 +114,7 @@ def analyse(
     if events is not None:
         require_same_map(table, events)
     kinds = Kinds.found(table, events, None if truth is None else join_truth(table, truth))
-    measured = kinds.measured()
+    measured, one, of = kinds.measured(), kinds.one.table, kinds.of
     first, further, null = first_look(measured, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
     second, more = second_look(measured, whole.overall, limit)
@@ -128,8 +129,8 @@ def analyse(
         critical=critical,
     )
 
-    def maps() -> Maps:  # until they are asked for, what was measured takes no memory
-        found = kinds.spread({**maps_of(kinds.measured().one.table, null), **further, **more})
+    def maps() -> Maps:  # until they are asked for, neither what was measured nor the log takes memory
+        found = spread({**maps_of(one.measured(), null), **further, **more}, of)
         return {**found, **whole.overall.maps(table, found)}
 
     return Analysis(summary, first.own.table.summary(table.voxel_size, table.classes, edges), sums, maps)
@@ -142,20 +143,25 @@ def concluded(
     voxel_size: float,
     classes: tuple[str, ...] = (),
     sample: Sample | None = None,
+    by_lag: Correlogram | None = None,
     name: str = "",
     edges: Sequence[int] = STRATA,
     critical: Sequence[str] = (),
 ) -> tuple[MapStatistics, InfluenceSums]:
-    """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts."""
+    """What `analyse` says of a map, and its sums by frame and cube, from both looks at it or at its parts.
+
+    by_lag  the correlogram of the sample, where that is known by now
+    """
     first, own = whole.first, whole.first.own
     table, influence = own.table.summary(voxel_size, classes, edges), whole.influence
     if sample is not None:
         influence = with_sample(influence, sample.shared(), logged=first.log is not None)
-    found, judged, (unsteady,), reached = answered(
+    found, judged, (unsteady,), reached, of_flips = answered(
         own.places.asked(MEANS),
         judged_by(influence),
         second.flipping.asked(),
         () if sample is None else reach_by(influence, table.K),
+        () if first.log is None else first.log.places.asked(OF_FLIPS),
     )
     means = dict(zip(MEANS, found, strict=True))
     reach = None
@@ -165,10 +171,10 @@ def concluded(
         _About(name, whole.seed, table, Judged(*judged), reach),
         means,
         own.places,
-        sample,
+        correlogram(sample) if by_lag is None and sample is not None else by_lag,
         agreement=_agreement(means, class_agreement_of(own.classes, classes)),
         flipping=second.flipping.flipping(unsteady, classes),
-        drift=_drift(means, own.places, whole),
+        drift=_drift(means, own.places, whole, of_flips),
         strata=_strata(table, own.strata),
         geometry=_geometry(whole, second, voxel_size),
         correctness=_correctness(whole, second, edges),
@@ -212,15 +218,21 @@ MEANS: Mapping[str, Mean] = {
 OF_FLIPS: Mapping[str, Mean] = {
     **{name: Mean(name) for name in ("flip_rate", "flip_null")},
     "flip_excess": Mean("flip_excess", bounds=SIGNED),
-    "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
 }
+"""Over the very voxels that the first of `MEANS` are of, so that those are the same numbers without a log."""
+
+OF_CHANGES: Mapping[str, Mean] = {
+    "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
+    "trend_excess": Mean("trend_excess", bounds=SIGNED),
+}
+"""Over fewer voxels."""
 
 
 def _concluded(
     about: _About,
     means: Mapping[str, Interval],
     places: PlaceSums,
-    sample: Sample | None,
+    by_lag: Correlogram | None,
     **sections: Any,
 ) -> MapStatistics:
     """All of it, from what was found section by section."""
@@ -249,7 +261,7 @@ def _concluded(
         verdict=said,
         judged=judged,
         reach=reach,
-        correlogram=None if sample is None else correlogram(sample),
+        correlogram=by_lag,
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         beyond_coin=BeyondCoin(means["coin"], means["steadier"]),
         **sections,
@@ -261,22 +273,22 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(means: Mapping[str, Interval], places: PlaceSums, whole: Whole) -> DriftStatistics:
+def _drift(
+    means: Mapping[str, Interval], places: PlaceSums, whole: Whole, of_flips: Sequence[Interval]
+) -> DriftStatistics:
     """Against its null; without a log only for one-hot evidence, and without tests."""
-    log = whole.first.log
+    log, tests, flips = whole.first.log, None, None
+    if log is not None:
+        since, trend = log.places.estimates(OF_CHANGES).values()
+        tests, flips = whole.drift_tests(trend), FlipRates(*[*of_flips, since])
     return DriftStatistics(
         voxels=int(places["null"][1]),
         sbd=means["sbd"],
         null=means["null"],
         excess=means["excess"],
-        tests=None if log is None else whole.drift_tests(),
-        flips=None if log is None else _flips(log.places),
+        tests=tests,
+        flips=flips,
     )
-
-
-def _flips(places: PlaceSums) -> FlipRates:
-    found = places.estimates(OF_FLIPS)
-    return FlipRates(found["flip_rate"], found["flip_null"], found["flip_excess"], found["frames_since"])
 
 
 def _geometry(whole: Whole, second: SecondSums, voxel_size: float) -> Losses | None:

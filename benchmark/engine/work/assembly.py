@@ -26,10 +26,12 @@ from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
 from semstab.model.results import Agreement
+from semstab.model.statistics import Correlogram
 from semstab.model.voxels import VoxelTable
 from semstab.runtime.rows import Rows
 from semstab.statistics import Looks, Sample
 from semstab.statistics.description import concluded
+from semstab.statistics.looks.correlogram import correlogram
 from semstab.statistics.looks.sampler import merged
 from semstab.statistics.sums import FirstSums, SecondSums, Whole
 
@@ -39,10 +41,11 @@ UP_VOXELS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What was sampled of the frames of a unit, cell by cell and as observations; None where nothing was."""
+    """What was sampled of the frames of a unit, cell by cell, as observations, and by lag; None where nothing was."""
 
     looks: Looks | None
     sample: Sample | None
+    by_lag: Correlogram | None
 
     @classmethod
     def of(cls, finished: Iterable[Finished], folder: Path) -> Sampled:
@@ -52,7 +55,7 @@ class Sampled:
         sample = None if looks is None else looks.sample()
         if sample is not None and true_looks is not None:
             sample = sample.against(true_looks.sample())
-        return cls(looks, sample)
+        return cls(looks, sample, None if sample is None else correlogram(sample))
 
 
 def assembled(
@@ -86,6 +89,7 @@ def assembled(
             voxel_size=config.voxel_size,
             classes=task.mapping.target.classes,
             sample=sample,
+            by_lag=sampled.by_lag,
             name=task.backbone,
             edges=config.strata,
             critical=config.critical_classes,

@@ -176,10 +176,17 @@ def _start_worker(listening: Connection, threads: int) -> None:
     """Set a worker process up: with its share of the cores, and so that it ends with its parent."""
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))  # read when Open3D is loaded
     settle()
-    import numba
-
-    numba.set_num_threads(min(threads, numba.get_num_threads()))
+    _use_threads(threads)
     follow_parent(listening)
+
+
+def _use_threads(count: int) -> None:
+    """Let compiled loops, and the reading of tables, have so many."""
+    import numba
+    import pyarrow as pa
+
+    numba.set_num_threads(min(count, numba.get_num_threads()))
+    pa.set_cpu_count(count)
 
 
 class DaskCluster:
@@ -264,10 +271,8 @@ def _run_settled(job: Job) -> tuple[Outcome, ...]:
     It runs a job in each of its threads at once: frames are decoded in turn where nothing else is said.
     """
     settle()
-    import numba
-
     with contextlib.suppress(ValueError):  # called outside of a worker
-        numba.set_num_threads(min(_distributed().get_worker().state.nthreads, numba.get_num_threads()))
+        _use_threads(_distributed().get_worker().state.nthreads)
     return run_job(dataclasses.replace(job, threads=job.threads or 0))
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from semstab.errors import DataError, one_line
 from semstab.model.evidence import Evidence
-from semstab.runtime.arrow import column
+from semstab.runtime.arrow import column, values_of
 from semstab.runtime.files import atomic_path, parse_json
 
 if TYPE_CHECKING:
@@ -141,9 +141,9 @@ def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Columns (n,) of a file by name. Raises DataError where one is not there."""
     import pyarrow.parquet as pq
 
-    with reading(path):
-        content = pq.read_table(path, columns=list(names))
-        return {name: content.column(name).to_numpy() for name in names}
+    with reading(path), pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+        content = file.read(columns=list(names))
+        return {name: values_of(content.column(name)) for name in names}
 
 
 @contextmanager
@@ -193,6 +193,6 @@ def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:
     if column.null_count:
         raise DataError("a column has missing values")
     if pa.types.is_fixed_size_list(column.type):
-        return Evidence.of(column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size))
-    values: npt.NDArray[Any] = column.to_numpy()
-    return values
+        flat = pa.chunked_array([part.flatten() for part in column.chunks], column.type.value_type)
+        return Evidence.of(values_of(flat).reshape(-1, column.type.list_size))
+    return values_of(column)

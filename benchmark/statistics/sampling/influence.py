@@ -167,13 +167,14 @@ class InfluenceSums:
         import pyarrow.parquet as pq
 
         try:
-            content = pq.read_table(path)
+            with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+                content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
                 raise DataError("of another kind or version")
             about = dataclasses.asdict(from_json(About, about, path))
-            part, *keys = (_key(content.column(name).to_numpy(), name) for name in KEYS)
-            columns = np.stack([column.to_numpy() for column in content.columns[len(KEYS) :]], axis=1)
+            part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
+            columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
             if np.any(np.abs(columns) > LARGEST_SUM):

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.metrics.matching import shared_rows
-from semstab.model.statistics import DriftTests
+from semstab.model.statistics import DriftTests, Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import quadrant_sums, wrong_of_steady
 from semstab.statistics.judging.ceiling import loss_sums
 from semstab.statistics.judging.flipping import FlippingSums
@@ -118,7 +117,7 @@ class Whole:
         pairs, of = distinct_rows(np.stack([seen, most], axis=1))  # many places have the same
         return Votes(pairs[:, 0], pairs[:, 1], np.ones(len(pairs), np.int64)).stable(self.overall.shares)[of]
 
-    def drift_tests(self) -> DriftTests:
+    def drift_tests(self, trend_excess: Interval) -> DriftTests:
         """Of a map with its log."""
         log, orders = self.first.log, self.overall.orders
         assert log is not None
@@ -130,7 +129,7 @@ class Whole:
             sbd_p=self.order.p_value,
             trend=trend,
             trend_null=null,
-            trend_excess=log.places.estimate("trend_excess", ratio_of, (-1.0, 1.0)),
+            trend_excess=trend_excess,
             trend_p=self.order.trend_p,
             stretches=self.order.stretches,
             voxels=self.order.voxels,
