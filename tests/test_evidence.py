@@ -68,7 +68,7 @@ def test_measures_of_a_belief_count_the_classes_that_were_not_seen():
         np.testing.assert_array_equal(dominant(fused), dominant(rows))
 
 
-def test_voxels_of_one_class_are_fused_once_for_all():
+def test_some_voxels_of_a_log_are_fused_as_they_are_in_all_of_it():
     labels = np.where(RNG.random((300, 5)) < 0.2, 1, RNG.integers(0, 3, size=(300, 1)))
     events = log_of(np.where(np.arange(5) < RNG.integers(1, 6, size=(300, 1)), labels, -1), K=4)
     table = events.table()

@@ -144,6 +144,31 @@ def test_samples_of_other_voxels_are_refused_and_less_dense_ones_are_met():
     assert len(both.logs[0]) == len(both.logs[1]) == len(thinned.observations())
 
 
+def test_samples_that_began_elsewhere_meet_on_the_same_cells():
+    frames = list(flight(6, flicker=0.2, step=0.5))
+    looks, back = sampler_of(frames, 0.1).looks(), sampler_of(frames[::-1], 0.1).looks()
+    assert looks.low != back.low
+    both = common([looks, back])
+    assert both.missing == (0, 0)
+    np.testing.assert_array_equal(both.logs[0].evidence, both.logs[1].evidence)
+    np.testing.assert_array_equal(both.logs[0].evidence, looks.observations().evidence)
+    far = dataclasses.replace(back, low=(back.low[0], back.low[1] - (1 << 19), back.low[2]))
+    with pytest.raises(DataError, match="larger voxels"):
+        common([looks, far])
+
+
+def test_looks_stay_as_they_were_when_more_frames_come():
+    frames = list(flight(6, flicker=0.2))
+    sampler = sampler_of(frames[:3], 0.1, budget=6000)
+    before, share = sampler.looks(), sampler.looks().share
+    cells, seen = before.cell, sampler.sample().seen
+    for frame in frames[3:]:
+        sampler.add(frame)
+    assert sampler.looks().share < share
+    np.testing.assert_array_equal(before.cell, cells)
+    np.testing.assert_array_equal(before.sample().seen.evidence, seen.evidence)
+
+
 def test_nothing_in_common_leaves_everything_undefined():
     apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
     found = compared(a=list(flight(4)), b=apart)

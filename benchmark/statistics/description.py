@@ -37,7 +37,7 @@ from semstab.statistics.agreement import alpha_of, between_of, class_agreement_o
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
 from semstab.statistics.judging.ceiling import losses_of
 from semstab.statistics.judging.verdict import verdict
-from semstab.statistics.kinds import Kinds
+from semstab.statistics.kinds import Kinds, spread
 from semstab.statistics.looks import Sample, correlogram, reach_by, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
 from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, answered, judged_by, with_sample
@@ -114,7 +114,7 @@ def analyse(
     if events is not None:
         require_same_map(table, events)
     kinds = Kinds.found(table, events, None if truth is None else join_truth(table, truth))
-    measured = kinds.measured()
+    measured, one, of = kinds.measured(), kinds.one.table, kinds.of
     first, further, null = first_look(measured, limit, edges=edges, seed=seed)
     whole = Whole(first, seed)
     second, more = second_look(measured, whole.overall, limit)
@@ -129,8 +129,8 @@ def analyse(
         critical=critical,
     )
 
-    def maps() -> Maps:  # until they are asked for, what was measured takes no memory
-        found = kinds.spread({**maps_of(kinds.measured().one.table, null), **further, **more})
+    def maps() -> Maps:  # until they are asked for, neither what was measured nor the log takes memory
+        found = spread({**maps_of(one.measured(), null), **further, **more}, of)
         return {**found, **whole.overall.maps(table, found)}
 
     return Analysis(summary, first.own.table.summary(table.voxel_size, table.classes, edges), sums, maps)

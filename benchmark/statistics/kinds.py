@@ -87,6 +87,7 @@ class Kinds:
         """The same with what measures of one of each kind are functions of: see `VoxelTable.measured`."""
         return replace(self, one=replace(self.one, table=self.one.table.measured()))
 
-    def spread(self, maps: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-        """Values (n,) by name of all voxels, from those of one of each kind."""
-        return {name: values if self.of is None else values[self.of] for name, values in maps.items()}
+
+def spread(maps: Mapping[str, npt.NDArray[Any]], of: npt.NDArray[np.int32] | None) -> dict[str, npt.NDArray[Any]]:
+    """Values (n,) by name of all voxels, from those (k,) of one of each kind, and which one stands for each of them."""
+    return {name: values if of is None else values[of] for name, values in maps.items()}

@@ -52,7 +52,7 @@ from semstab.runtime.stopwatch import Stopwatch
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.kinds import Kinds
+from semstab.statistics.kinds import Kinds, spread
 from semstab.statistics.map_sums import maps_of
 from semstab.statistics.sums import first_look
 from semstab.task import Task, read
@@ -268,7 +268,7 @@ def _looked_at(one: UnitMap, table: VoxelTable, *, judged: bool) -> _Part:
     truth = None if one.truth is None else _table(one.truth, one.task)
     kinds = Kinds.found(table, events, None if truth is None else join_truth(table, truth)).measured()
     sums, further, null = first_look(kinds, truth, edges=config.strata)
-    maps = kinds.spread(further | maps_of(kinds.one.table, null))
+    maps = spread(further | maps_of(kinds.one.table, null), kinds.of)
     return _Part(table, sums.arrays(), maps, events, truth)
 
 

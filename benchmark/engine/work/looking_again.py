@@ -16,7 +16,7 @@ from semstab.model.records import TRUTH, VOXELS
 from semstab.model.voxels import VoxelTable
 from semstab.model.voxels.parquet import tile_of
 from semstab.statistics import Truth, join_truth
-from semstab.statistics.kinds import Kinds
+from semstab.statistics.kinds import Kinds, spread
 from semstab.statistics.sums import SecondSums, second_look
 
 
@@ -40,7 +40,7 @@ def look_again(again: Again, folder: Path) -> SeenAgain:
         found.append(sums)
         if again.written:
             maps = VoxelTable.columns(file, further_columns(file))
-            columns, tile = {**maps, **kinds.spread(more), **again.overall.maps(table, maps)}, tile_of(file)
+            columns, tile = {**maps, **spread(more, kinds.of), **again.overall.maps(table, maps)}, tile_of(file)
             savers: Savers = {
                 f"{VOXELS}/{again.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
             }

@@ -37,6 +37,7 @@ OWN, TRUTH = "its own labels in finer cells", "the ground truth"
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Entries = tuple[Int64, npt.NDArray[np.int32], npt.NDArray[np.uint16], Float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +104,10 @@ class Looks:
         """Observations of the voxels, and those of labels that do not depend on the view."""
         from semstab.statistics.looks.observing import settle
 
-        own = self._in_order()
-        kept, shown = np.empty(len(own), np.bool_), np.empty(len(own), np.uint16)
-        settle(own.key, own.view, own.label, own.weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
-        seen, limit = own._log(own.label, kept), own._log(shown, kept)
+        key, view, label, weight = self._in_order()
+        kept, shown = np.empty(len(key), np.bool_), np.empty(len(key), np.uint16)
+        settle(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
+        seen, limit = (self._log(key, view, which, weight, kept) for which in (label, shown))
         return Sample(seen, dataclasses.replace(seen, evidence=limit.evidence), self.views, self.soft)
 
     def only(self, rows: Any) -> Looks:
@@ -133,38 +134,47 @@ class Looks:
     def observations(self) -> Events:
         """The log of the sampled voxels: what the entries of a voxel and a frame say together."""
         own = self._in_order()
-        return own._log(own.label, np.ones(len(own), np.bool_))
+        return self._log(*own, np.ones(len(self), np.bool_))
 
-    def _in_order(self) -> Looks:
-        """The same by voxel and frame, entries of one as they come."""
-        from semstab.statistics.looks.observing import extent, places
+    def _in_order(self) -> Entries:
+        """Keys, views, labels and weights by voxel and frame, entries of one as they come."""
+        from semstab.statistics.looks.observing import extent, gather, places
 
         low, high, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(len(self), np.int64)
         extent(self.key, low, high)
-        size = high - low + 1
-        views = len(self.views)
+        size, views = high - low + 1, len(self.views)
         if math.prod(size.tolist()) * views < 2**63:
             places(self.key, self.view, low, size, views, place)
         else:
             place = np.unique(self.key >> DIGITS, return_inverse=True)[1] * views + self.view
-        return self.only(ranked(place))
+        entries: tuple[npt.NDArray[Any], ...] = self.key, self.view, self.label, self.weight
+        key, view, label, weight = (np.empty_like(column) for column in entries)
+        gather(ranked(place), *entries, key, view, label, weight)
+        return key, view, label, weight
 
-    def _log(self, label: npt.NDArray[np.uint16], kept: npt.NDArray[np.bool_]) -> Events:
-        """The log of the kept entries, which are in order and have these labels."""
+    def _log(
+        self,
+        key: Int64,
+        view: npt.NDArray[np.int32],
+        label: npt.NDArray[np.uint16],
+        weight: Float64,
+        kept: npt.NDArray[np.bool_],
+    ) -> Events:
+        """The log of the kept ones of entries that are in order."""
         from semstab.statistics.looks.observing import look
 
         n = len(self)
-        first, of, starts = (np.empty(n + more, np.int64) for more in (0, 0, 1))
+        first, of, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
         pixels, share, said = np.empty(n), np.empty(n), np.empty(n, np.uint16)
-        n, m = look(self.key, self.view, label, self.weight, kept, self.K, first, of, pixels, starts, said, share)
+        n, m = look(key, view, label, weight, kept, self.K, first, of, pixels, starts, said, share)
         first, of = first[:n], of[:n]
-        at = self.key[first[np.flatnonzero(np.diff(of, prepend=-1))]]
+        at = key[first[np.flatnonzero(np.diff(of, prepend=-1))]]
         return Events(
             **index_columns(cells_of(at, self.low) // CELLS),
             voxel=of,
-            frame=self.views.frame.astype(np.int32)[self.view[first]],
+            frame=self.views.frame.astype(np.int32)[view[first]],
             evidence=Evidence(starts[: n + 1], said[:m], share[:m], self.K),
-            pixels=np.rint(pixels[:n]).astype(np.int64),
+            pixels=np.rint(pixels[:n]).astype(np.int32),
             voxel_size=self.voxel_size,
             classes=self.classes,
         )

@@ -32,6 +32,14 @@ def places(key, view, low, size, views, place):
 
 
 @serial
+def gather(order, key, view, label, weight, own_key, own_view, own_label, own_weight):
+    """Entries (n,) in that order, into columns of their own."""
+    for i in range(len(order)):
+        k = order[i]
+        own_key[i], own_view[i], own_label[i], own_weight[i] = key[k], view[k], label[k], weight[k]
+
+
+@serial
 def settle(key, view, label, weight, cells, K, least, kept, shown):
     """Whether `least` frames or more saw each entry's cell, and the class with the largest sum of shares there.
 
@@ -95,7 +103,8 @@ def look(key, view, label, weight, kept, K, first, of, pixels, starts, classes, 
             voxels += voxel != before
             before = voxel
             first[n], of[n], pixels[n] = start, voxels, total
-            met[:many].sort()
+            if many > 1:
+                met[:many].sort()
             for own in met[:many]:
                 classes[m], shares[m], sums[own] = own, sums[own] / total, 0.0
                 m += 1

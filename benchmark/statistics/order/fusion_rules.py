@@ -99,14 +99,10 @@ def fuse_all(
     starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.bounds[1:]))
     belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(starts), len(starts)))
     op, count = ends - starts, np.diff(first)
-    alike, model, models = (_NONE,) * 3 if evidence is None else _alike(op, evidence)
-    each = np.concatenate([np.delete(np.arange(len(op)), alike), models])
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
-    rank = each[ranked((op * (most + 1) + count)[each])]
+    rank = ranked(op * (most + 1) + count)
     chunks.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, rest, drift_sum)
-    for own, to, by in ((belief, first[alike], first[model]), (rest, alike, model), (drift_sum, alike, model)):
-        own[:, to] = own[:, by]
     return [
         Fused(Belief(first, label, belief[r], K, rest[r]), op.astype(np.int32), drift_sum[r]) for r in range(len(rules))
     ]
@@ -124,21 +120,6 @@ def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
     label = np.zeros(first[-1], np.uint16)
     chunks.in_chunks(loops.list_classes, bounds, log, events.evidence.K, first, label)
     return first, label
-
-
-_NONE = np.zeros(0, np.int64)
-
-
-def _alike(op: Int64, evidence: Evidence) -> tuple[Int64, Int64, Int64]:
-    """Voxels (a,) of which all frames saw one class, and nothing else, one of as many frames (a,) for each, and those.
-
-    What a rule says of such a voxel depends on its OP only.
-    """
-    single = np.flatnonzero(np.diff(evidence.starts) == 1)
-    alike = single[evidence.weight[evidence.starts[single]] == op[single]]
-    by_op = np.full(int(op.max(initial=0)) + 1, -1)
-    by_op[op[alike]] = alike
-    return alike, by_op[op[alike]], by_op[by_op >= 0]
 
 
 def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:

@@ -40,8 +40,3 @@ def cubes(
     _, first, number = np.unique(key, return_index=True, return_inverse=True)
     loops.renumber(of, number)
     return cells[first].astype(np.int32), of, edge
-
-
-def cells_of(index: Int32, voxel_size: float, edge: float) -> tuple[Int32, Int64]:
-    """The cubes (G, 3) that hold voxels (n, 3), and which of them each is in."""
-    return cubes((index[:, 0], index[:, 1], index[:, 2]), voxel_size, edge)[:2]

@@ -64,7 +64,8 @@ class StableLooks:
         groups, group = frame_groups(every.events.frame, step)
         of = np.full(len(one.table), -1)
         of[counted] = voting
-        key, weight = _by_frame(every.events, kinds.spread({"": of})[""], len(votings), group, len(groups))
+        of = of if kinds.of is None else of[kinds.of]
+        key, weight = _by_frame(every.events, of, len(votings), group, len(groups))
         own = keys[key // max(len(groups), 1)]
         own[:, 3] = groups[key % max(len(groups), 1)]
         return cls(own.astype(np.int32), weight, edge, step)
