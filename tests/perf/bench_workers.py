@@ -32,7 +32,7 @@ from semstab.runtime.files import write_json
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 UNWATCHED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
-"""Dask looks 100 times a second where each thread is, 2 % of a core for each worker, which one of two cores has free."""
+"""Dask looks 100 times a second where each thread is: 2 % of a core for each worker, which one worker has beside it."""
 
 PORT = 8786
 

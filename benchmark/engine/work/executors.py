@@ -217,6 +217,7 @@ class DaskCluster:
 
         There are never more at the scheduler than its workers have threads, so that whoever is free has the next one;
         and that is sent before what is finished is looked at, so that nobody waits for it.
+        Raises ConfigError where the scheduler went away and jobs are left.
         """
         waiting, futures = iter(jobs), dict[Any, Job]()
         finished = _distributed().as_completed(loop=self._client.loop)
