@@ -32,12 +32,15 @@ from semstab.model.labels import LabelSpace
 from semstab.model.measures import SBD_MAX
 from semstab.model.palette import GLOW
 from semstab.model.records import RECORDING_PARTS
+from semstab.model.results import Unit
 from semstab.outputs.recording import Recording, camera
+from semstab.outputs.recording.drift_parts import DriftParts
 from semstab.outputs.recording.entities import Clock
 from semstab.outputs.recording.maps import drift_colors, flips, voxel_maps
 from semstab.outputs.recording.maps.flips import FlipLog
 from semstab.outputs.recording.maps.tracker import Tracker
 from semstab.outputs.recording.maps.voxel_maps import looks
+from semstab.runtime.array_files import write_arrays
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 
@@ -537,6 +540,38 @@ def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles
     expected = drawn(compared[1])
     assert len(expected) == tiny_scene.FRAMES
     assert drawn(tiles[0]) == drawn(tiles[1]) == expected
+
+
+def test_the_voxels_that_drifted_most_are_those_of_the_whole_map(compared, tiles) -> None:
+    def flips_of(folder: Path) -> dict[str, list[dict[str, Any]]]:
+        entities = read(folder / "recording.rrd")
+        assert entities["/wall/flips_at/a"][0]["Points3D:labels"] == [f"{k + 1}" for k in range(flips.SHOWN)]
+        return {
+            entity: sorted((without_ids(row) for row in rows), key=lambda row: row.get("frame", -1))
+            for entity, rows in entities.items()
+            if "flips" in entity
+        }
+
+    expected = flips_of(compared[1])
+    assert len(expected) == flips.SHOWN + 3
+    assert flips_of(tiles[0]) == flips_of(tiles[1]) == expected
+
+
+def without_ids(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if "RowId" not in name}
+
+
+def test_voxels_that_drifted_most_are_not_named_where_a_part_has_not_told_of_its_own(tmp_path) -> None:
+    tracker, log = tracked(alternating(6))
+    unit = Unit("s", "net", "numba")
+    for k, name in enumerate(("first", "second")):
+        found = flips.to_arrays(list(log.suspects(tracker))[k : k + 3]) | {"voxels": 10}
+        write_arrays(tmp_path / "flips" / unit.slug / f"{name}.npz", found)
+    told = DriftParts(tmp_path).suspects(unit, 20)
+    assert [suspect.number for suspect in told] == [1, 2, 3]
+    assert [suspect.bits for suspect in told] == sorted((suspect.bits for suspect in told), reverse=True)
+    assert DriftParts(tmp_path).suspects(unit, 21) is None
+    assert DriftParts(None).suspects(unit, 21) is None
 
 
 def test_a_merged_recording_has_one_layout_and_its_maps_are_looked_at(tiles) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of drift, of a map in tiles: each part writes what its frames did to its own pixels, frame by frame.
+"""What parts of a map in tiles leave for the recording: pictures of drift, frame by frame, and who drifted most.
 
 A part's file holds its frames in order; files of all parts are read side by side, a few pictures of each at a time, and
 what the parts say of a frame is laid into one picture, for each pixel's voxel is in one part alone.
@@ -24,16 +24,22 @@ import numpy.typing as npt
 from semstab.backends import FusionBackend, GrowingMap
 from semstab.engine.tiling.partition import Part
 from semstab.model.frames import Frame
+from semstab.model.results import Unit
 from semstab.outputs.recording.camera import coarse_stride
 from semstab.outputs.recording.maps.drift_colors import levels_of
+from semstab.outputs.recording.maps.flips import VIEW, FlipLog, Suspect, of_arrays, to_arrays, view_of, worst_of
 from semstab.outputs.recording.maps.tracker import Tracker
+from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.task import Task
 
-HEAD = struct.Struct("<iiiidI")
+HEAD = struct.Struct(f"<{VIEW}diI")
 """Before each picture: the fields of `Picture` but its levels, and how many bytes these are."""
 
-DRIFT, STARTED = "drift", ".started"
-"""Folder in which parts leave their files, unit by unit; and how one ends that is still being written."""
+DRIFT, FLIPS, STARTED = "drift", "flips", ".started"
+"""Folders in which parts leave their files, unit by unit; and how one ends that is still being written."""
+
+MOST_MOVES = 1 << 19
+"""Moves of voxels that a part keeps."""
 
 BATCH = 16
 """Pictures of a part that are read together."""
@@ -41,14 +47,26 @@ BATCH = 16
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """Levels of drift behind every stride-th pixel of a frame of that height and width."""
+    """Levels of drift behind every stride-th pixel of a frame; see `view_of`."""
 
-    frame: int
-    height: int
-    width: int
+    view: tuple[float, ...]
     stride: int
-    timestamp: float | None
     levels: npt.NDArray[np.uint8]
+
+    @property
+    def frame(self) -> int:
+        """Its number."""
+        return int(self.view[0])
+
+    @property
+    def timestamp(self) -> float | None:
+        """In seconds, where it has one."""
+        return None if math.isnan(self.view[1]) else self.view[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return int(self.view[2]), int(self.view[3])
 
 
 class DriftParts:
@@ -57,6 +75,7 @@ class DriftParts:
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._tracker: Tracker | None = None
+        self._flips = FlipLog()
         self._file = Path()
         self._stream: BinaryIO | None = None
 
@@ -67,6 +86,7 @@ class DriftParts:
             return
         growing = backend if isinstance(backend, GrowingMap) else None
         self._tracker = Tracker(voxel_size, len(task.mapping.target), growing, part.extent)
+        self._flips = FlipLog(MOST_MOVES)
         self._file = self._folder / DRIFT / task.units[0].slug / part.name
         self._file.parent.mkdir(parents=True, exist_ok=True)
         self._stream = self._file.with_suffix(STARTED).open("wb")
@@ -76,16 +96,18 @@ class DriftParts:
         if self._stream is None or self._tracker is None:
             return
         self._tracker.follow(frame)
+        self._flips.update(self._tracker, frame)
         stride = coarse_stride(frame.shape)
         data = zlib.compress(levels_of(*self._tracker.drift_of(frame).at(stride)).tobytes(), 1)
-        timestamp = math.nan if frame.timestamp is None else frame.timestamp
-        self._stream.write(HEAD.pack(frame.index, *frame.shape, stride, timestamp, len(data)) + data)
+        self._stream.write(HEAD.pack(*view_of(frame), stride, len(data)) + data)
 
     def finish(self) -> None:
         """All frames of the part are there: the file gets its name, and the map is let go of."""
-        if self._stream is not None:
+        if self._stream is not None and self._tracker is not None and self._folder is not None:
             self._stream.close()
             self._file.with_suffix(STARTED).replace(self._file)
+            found = to_arrays([*self._flips.suspects(self._tracker)]) | {"voxels": np.int64(len(self._tracker.map))}
+            write_arrays(self._folder / FLIPS / self._file.parent.name / f"{self._file.name}.npz", found)
         self._stream = self._tracker = None
 
     def end(self) -> None:
@@ -95,16 +117,23 @@ class DriftParts:
             self._file.with_suffix(STARTED).unlink(missing_ok=True)
         self._stream = self._tracker = None
 
-    def pictures(self, task: Task) -> Iterator[Picture]:
-        """Frame after frame, what all parts say of each; of the first unit of the task whose parts left some."""
-        left = [] if self._folder is None else [self._folder / DRIFT / unit.slug for unit in task.units]
-        files = next((sorted(unit.iterdir()) for unit in left if unit.is_dir()), [])
+    def pictures(self, unit: Unit) -> Iterator[Picture]:
+        """Frame after frame, what all parts of a unit's map say of each."""
+        files = [] if self._folder is None else sorted((self._folder / DRIFT / unit.slug).glob("*"))
         found = heapq.merge(*(_read(file) for file in files if file.suffix != STARTED), key=attrgetter("frame"))
         for _, parts in itertools.groupby(found, key=attrgetter("frame")):
             first, *others = parts
             for other in others:
                 np.maximum(first.levels, other.levels, out=first.levels)
             yield first
+
+    def suspects(self, unit: Unit, voxels: int) -> list[Suspect] | None:
+        """The voxels of its map, of so many, that drifted most; None where not all parts have said which those are."""
+        left = [] if self._folder is None else sorted((self._folder / FLIPS / unit.slug).glob("*.npz"))
+        found = [arrays for file in left if (arrays := read_arrays(file)) is not None]
+        if sum(int(arrays["voxels"]) for arrays in found) != voxels:
+            return None
+        return worst_of([suspect for arrays in found for suspect in of_arrays(arrays)])
 
     def remove(self) -> None:
         """The folder, with all that is in it."""
@@ -127,6 +156,7 @@ def _next(stream: BinaryIO) -> Picture | None:
     head = stream.read(HEAD.size)
     if len(head) < HEAD.size:
         return None
-    frame, height, width, stride, timestamp, size = HEAD.unpack(head)
-    levels = np.frombuffer(zlib.decompress(stream.read(size)), np.uint8).reshape(-(-height // stride), -1).copy()
-    return Picture(frame, height, width, stride, None if math.isnan(timestamp) else timestamp, levels)
+    *view, stride, size = HEAD.unpack(head)
+    rows = -(-int(view[2]) // stride)
+    levels = np.frombuffer(zlib.decompress(stream.read(size)), np.uint8).reshape(rows, -1).copy()
+    return Picture(tuple(view), stride, levels)

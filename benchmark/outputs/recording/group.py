@@ -28,7 +28,7 @@ from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.layout import drawn, is_pointwise
 from semstab.outputs.recording.maps import drift_colors
 from semstab.outputs.recording.maps.difference import log_difference
-from semstab.outputs.recording.maps.flips import FlipLog
+from semstab.outputs.recording.maps.flips import FlipLog, Suspect
 from semstab.outputs.recording.maps.tracker import FrameDrift, Tracker
 from semstab.outputs.recording.maps.voxel_maps import MapLog
 from semstab.task import Task
@@ -121,9 +121,9 @@ class GroupLog:
                 self._compare(stream, first, backend, tolerance)
         self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
 
-    def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
-        """Log which frames changed the voxels that drifted most."""
-        suspects = list(self._flips.suspects(self._tracker))
+    def log_flips(self, stream: rr.RecordingStream, clock: Clock, suspects: list[Suspect] | None = None) -> None:
+        """Log which frames changed the voxels that drifted most: those that are said to, of a map in tiles."""
+        suspects = list(self._flips.suspects(self._tracker)) if suspects is None else suspects
         self._flips.log(
             stream, self.task.scene.name, self.task.backbone, suspects, self._classes, self._translation, clock
         )
@@ -151,7 +151,8 @@ class GroupLog:
 
     def log_drift(self, stream: rr.RecordingStream, found: Picture) -> None:
         """Log what parts of a map in tiles say of a frame's drift."""
-        self._log_picture(stream, (found.height, found.width), "drift", found.levels, found.stride)
+        self._flips.see(found.view)
+        self._log_picture(stream, found.shape, "drift", found.levels, found.stride)
 
     def _log_picture(
         self, stream: rr.RecordingStream, shape: tuple[int, int], name: str, picture: Any, stride: int

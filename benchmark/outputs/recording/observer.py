@@ -90,7 +90,7 @@ class Recording(Observer):
         self._background: Background | None = None
         self._parts: Parts | None = None
         self._drift = DriftParts(None if run is None else run / RECORDING_PARTS)
-        self._whole: set[tuple[str, str]] = set()  # of which a map has seen all frames: their pictures are there
+        self._whole: set[tuple[str, str]] = set()  # of which all pictures are there
         self._cut = False  # whether there is no earlier recording that is whole
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
@@ -179,7 +179,7 @@ class Recording(Observer):
         background.drain()
         self._kept.append((self._tasks[task.scene.name, task.backbone], [summary]))
         self._log_kept(stream)
-        self._log_drift(stream, task)
+        self._log_drift(stream, task, summary)
 
     def unit_fused(self, unit: Unit, table: VoxelTable) -> None:
         """Log the unit's voxels, while they are measured; the time is that of its last frame."""
@@ -245,8 +245,9 @@ class Recording(Observer):
             if place not in logged and summaries:
                 self._kept.append((task, summaries))
         stream, _ = self._opened()
-        for task in self._tasks.values():
-            self._log_drift(stream, task)
+        for run in result.runs:
+            if (run.unit.scene, run.unit.backbone) in self._tasks:
+                self._log_drift(stream, self._tasks[run.unit.scene, run.unit.backbone], run)
         self._send_blueprint(stream, last=True)
         self.close()
         self.target = parts.merged(self.target)
@@ -376,15 +377,18 @@ class Recording(Observer):
             if group is not None:
                 self._lay_out(stream, group, table)
 
-    def _log_drift(self, stream: rr.RecordingStream, task: Task) -> None:
-        """Log the pictures of drift that parts of a map in tiles have left."""
-        group: GroupLog | None = None
-        if (task.scene.name, task.backbone) in self._whole:
-            return
-        for picture in self._drift.pictures(task):
+    def _log_drift(self, stream: rr.RecordingStream, task: Task, summary: UnitSummary) -> None:
+        """Log what parts of a map in tiles have left: pictures of drift, and the voxels that drifted most."""
+        group, place = None, (task.scene.name, task.backbone)
+        for picture in self._drift.pictures(summary.unit) if place not in self._whole else ():
             group = group or GroupLog(task, self._plan.config.voxel_size, self._origins[task.scene.name])
             self._clock.set(stream, picture.frame, picture.timestamp)
             group.log_drift(stream, picture)
+        suspects = self._drift.suspects(summary.unit, summary.table.voxels)
+        if group is not None and suspects is not None:
+            group.log_flips(stream, self._clock, suspects)
+        if group is not None:
+            self._whole.add(place)
 
     def _follow(self, stream: rr.RecordingStream, task: Task, *, log: bool) -> None:
         """Know where the camera was in frames that are not logged here, and log the track where nobody else does."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
@@ -11,15 +13,19 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from semstab.model.frames import Frame
+from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import mean_drift
 from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.maps.tracker import Tracker
 from semstab.outputs.recording.series import LINE_COLORS
+from semstab.runtime.rows import Rows
 
 SHOWN = 10
 """Voxels that are shown of a backbone on a scene."""
+
+VIEW = 20
+"""Numbers of `view_of`."""
 
 MAX_MOVES = 2_000_000
 """Moves that are kept of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
@@ -43,6 +49,7 @@ class Suspect:
     center  (3,) metres, world
     bits    its drift, summed over all frames
     moves   records of `MOVE`, in the order of the frames
+    files   names of the files from which the labels of each came, where they have one
     """
 
     number: int
@@ -53,6 +60,7 @@ class Suspect:
     sbd: float
     bits: float
     moves: npt.NDArray[np.void]
+    files: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +70,13 @@ class Camera:
     K: npt.NDArray[np.float64]
     T_wc: npt.NDArray[np.float64]
     shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, view: Sequence[float]) -> Camera:
+        """The camera of a frame, from its `view_of`."""
+        _, _, height, width, fx, fy, cx, cy, *pose = view
+        T_wc = np.array([*pose[:12], 0, 0, 0, 1]).reshape(4, 4)
+        return cls(Intrinsics(fx, fy, cx, cy).matrix, T_wc, (int(height), int(width)))
 
     def project(self, points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
         """Of points (n, 3) where they are in the viewer's image (n, 2), and which of them with their number inside."""
@@ -74,15 +89,30 @@ class Camera:
         return pixels, before & np.all((pixels >= first) & (pixels <= size - last), axis=1)
 
 
-class FlipLog:
-    """Keeps what moved a voxel's belief, above all its dominant class, and from which file the frame's labels came."""
+def view_of(frame: Frame) -> list[float]:
+    """Number, time stamp or NaN, height and width, fx, fy, cx, cy, and the upper rows of T_wc."""
+    stamp, camera = math.nan if frame.timestamp is None else frame.timestamp, frame.intrinsics
+    return [frame.index, stamp, *frame.shape, camera.fx, camera.fy, camera.cx, camera.cy, *frame.T_wc[:3].ravel()]
 
-    def __init__(self) -> None:
+
+class FlipLog:
+    """Keeps what moved a voxel's belief, above all its dominant class, and from which file the frame's labels came.
+
+    most  moves that are kept
+    """
+
+    def __init__(self, most: int | None = None) -> None:
         self.moves: list[npt.NDArray[np.void]] = []
         """Records of `MOVE`, in the order of the frames."""
+        self._most = MAX_MOVES if most is None else most
         self._count = 0
-        self._frames: dict[int, tuple[float | None, str]] = {}  # timestamp, label file
-        self._cameras: dict[int, Camera] = {}
+        self._views = Rows(VIEW + 1)  # of the frames, and where the name of each one's file ends
+        self._names = bytearray()
+
+    def see(self, view: Sequence[float], name: str = "") -> None:
+        """The next frame, by its `view_of`, and the name of its label file."""
+        self._names += name.encode("utf-8", "surrogatepass")
+        self._views.append([*view, len(self._names)])
 
     def update(self, tracker: Tracker, frame: Frame) -> None:
         """Keep what the frame that the tracker followed last has moved."""
@@ -95,9 +125,8 @@ class FlipLog:
         self._count += len(at)
         name = frame.files.get("labels") or frame.files.get("scores") or ""
         file = PurePath(name)
-        self._frames[frame.index] = frame.timestamp, file.name if file.suffix else ""
-        self._cameras[frame.index] = Camera(frame.intrinsics.matrix, frame.T_wc, frame.shape)
-        if self._count > MAX_MOVES:
+        self.see(view_of(frame), file.name if file.suffix else "")
+        if self._count > self._most:
             self._drop(tracker.map.column("drift_sum"))
 
     def suspects(self, tracker: Tracker) -> Iterator[Suspect]:
@@ -105,18 +134,21 @@ class FlipLog:
         total = tracker.map.column("drift_sum")
         most = np.partition(total, -SHOWN)[-SHOWN] if len(total) > SHOWN else 0.0
         rows = np.flatnonzero((total >= most) & (total > 0))
-        rows = rows[np.argsort(-total[rows], kind="stable")][:SHOWN]
         fused = tracker.map
+        rows = rows[np.lexsort([*fused.index_of(rows).T[::-1], -total[rows]])][:SHOWN]
         first_frame, op = (fused.column(name, rows) for name in ("first_frame", "op"))
         centers = (fused.index_of(rows) + 0.5) * fused.voxel_size
         dominant, sbd = fused.evidence_of(rows).argmax(axis=1), mean_drift(total[rows], op)
         moves = np.concatenate([np.zeros(0, dtype=MOVE), *self.moves])
+        frames, ends = self._views.column(0), [0, *self._views.column(VIEW).astype(np.int64).tolist()]
         for i, row in enumerate(rows):
             own = moves[moves["row"] == row]
             first = int(own["before"][0]) if len(own) else int(dominant[i])
+            files = [self._names[ends[k] : ends[k + 1]] for k in np.searchsorted(frames, own["frame"]).tolist()]
             yield Suspect(
-                i + 1, centers[i], int(first_frame[i]), first, int(op[i]), float(sbd[i]), float(total[row]), own
-            )
+                i + 1, centers[i], int(first_frame[i]), first, int(op[i]), float(sbd[i]), float(total[row]), own,
+                tuple(file.decode("utf-8", "surrogatepass") for file in files),
+            )  # fmt: skip
 
     def log(
         self,
@@ -129,14 +161,20 @@ class FlipLog:
         clock: Clock,
     ) -> None:
         """A lane with each suspect's dominant class, a line of text for each flip, and where the suspects are."""
+        frames, stamps = self._views.column(0), self._views.column(1)
+
+        def log_state(lane: str, frame: int, name: str) -> None:
+            clock.set(stream, frame, _known(stamps[np.searchsorted(frames, frame)]))
+            stream.log(lane, rr.StateChange(state=name))
+
         for suspect in suspects:
             lane = path(scene, "flips", backbone, f"voxel_{suspect.number}")
             names = list(classes.classes)
             colors = [(*color, 255) for color in classes.colors]
             stream.log(lane, rr.StateConfiguration(values=names, labels=names, colors=colors), static=True)
-            self._log_state(stream, lane, suspect.first_frame, classes.classes[suspect.first_class], clock)
+            log_state(lane, suspect.first_frame, classes.classes[suspect.first_class])
             for flip in suspect.moves[suspect.moves["before"] != suspect.moves["after"]]:
-                self._log_state(stream, lane, int(flip["frame"]), classes.classes[flip["after"]], clock)
+                log_state(lane, int(flip["frame"]), classes.classes[flip["after"]])
         report = rr.TextDocument(self._report(backbone, suspects, classes), media_type=rr.MediaType.MARKDOWN)
         stream.log(path(scene, "flips_report", backbone), report, static=True)
         if suspects:
@@ -150,10 +188,11 @@ class FlipLog:
 
     def _log_numbers(self, stream: rr.RecordingStream, entity: str, suspects: list[Suspect], clock: Clock) -> None:
         """Where the suspects are in each frame; in the view of an image 3D points would stand beside it as well."""
-        for frame, camera in self._cameras.items():
-            pixels, inside = camera.project(np.array([suspect.center for suspect in suspects]))
+        centers = np.array([suspect.center for suspect in suspects])
+        for view in self._views:
+            pixels, inside = Camera.of(view[:VIEW]).project(centers)
             seen = np.flatnonzero(inside)
-            clock.set(stream, frame, self._frames[frame][0])
+            clock.set(stream, int(view[0]), _known(view[1]))
             numbers = rr.Points2D(
                 pixels[seen],
                 labels=[f"{suspects[k].number}" for k in seen],
@@ -162,10 +201,6 @@ class FlipLog:
                 show_labels=True,
             )
             stream.log(entity, numbers)
-
-    def _log_state(self, stream: rr.RecordingStream, lane: str, frame: int, name: str, clock: Clock) -> None:
-        clock.set(stream, frame, self._frames.get(frame, (None, ""))[0])
-        stream.log(lane, rr.StateChange(state=name))
 
     def _report(self, backbone: str, suspects: list[Suspect], classes: LabelSpace) -> str:
         """Markdown: for each suspect the frames that are to blame."""
@@ -177,8 +212,7 @@ class FlipLog:
                 f"- **voxel {s.number}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {s.op}, drift {s.bits:.3f} bits in all,"
                 f" SBD {s.sbd:.4f} bits; {classes.classes[s.first_class]} in frame {s.first_frame}"
             )
-            for move in s.moves:
-                file = self._frames.get(int(move["frame"]), (None, ""))[1]
+            for move, file in zip(s.moves, s.files, strict=True):
                 where = f"frame {move['frame']}{f' ({file})' if file else ''}"
                 before, after = (classes.classes[move[when]] for when in ("before", "after"))
                 what = f"**{before} → {after}**" if before != after else f"stays {before}"
@@ -188,6 +222,36 @@ class FlipLog:
     def _drop(self, total_drift: npt.NDArray[np.float64]) -> None:
         """Keep half as many: the moves of the voxels that drifted most."""
         moves = np.concatenate(self.moves)
-        order = np.argsort(-total_drift[moves["row"]], kind="stable")[: MAX_MOVES // 2]
+        order = np.argsort(-total_drift[moves["row"]], kind="stable")[: self._most // 2]
         self.moves = [moves[np.sort(order)]]
         self._count = len(order)
+
+
+def _known(stamp: float) -> float | None:
+    return None if math.isnan(stamp) else float(stamp)
+
+
+def to_arrays(suspects: Sequence[Suspect]) -> dict[str, npt.NDArray[Any]]:
+    """What `of_arrays` makes them of again."""
+    said = [(s.first_frame, s.first_class, s.op, s.sbd, s.bits, len(s.moves)) for s in suspects]
+    return {
+        "said": np.array(said, np.float64).reshape(-1, 6),
+        "center": np.array([s.center for s in suspects], np.float64).reshape(-1, 3),
+        "moves": np.concatenate([np.zeros(0, MOVE), *(s.moves for s in suspects)]),
+        "files": np.frombuffer(json.dumps([s.files for s in suspects]).encode(), np.uint8),
+    }
+
+
+def of_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[Suspect]:
+    """In their order."""
+    moves = np.split(arrays["moves"], np.cumsum(arrays["said"][:, 5]).astype(np.int64))
+    files = json.loads(arrays["files"].tobytes())
+    for i, (first_frame, first_class, op, sbd, bits, _) in enumerate(arrays["said"].tolist()):
+        center, numbers = arrays["center"][i], (int(first_frame), int(first_class), int(op))
+        yield Suspect(i + 1, center, *numbers, sbd, bits, moves[i], tuple(files[i]))
+
+
+def worst_of(suspects: Sequence[Suspect]) -> list[Suspect]:
+    """Those of several parts of a map that drifted most, numbered anew, as the whole map would have them."""
+    worst = sorted(suspects, key=lambda suspect: (-suspect.bits, *suspect.center.tolist()))[:SHOWN]
+    return [replace(suspect, number=k) for k, suspect in enumerate(worst, start=1)]
