@@ -182,29 +182,41 @@ def dask(*command: str):
 
 @pytest.fixture
 def cluster(tmp_path):
-    """The address of a scheduler with two workers, and the workers' processes."""
+    """The address of a scheduler with two workers, its process and the workers'."""
     distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     file = tmp_path / "scheduler.json"
     arguments = ("--scheduler-file", str(file), "--no-dashboard")
-    with dask("scheduler", "--port", "0", *arguments):
+    with dask("scheduler", "--port", "0", *arguments) as scheduler:
         wait_until(file.exists)
         quiet = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path), *arguments)
         with dask(*quiet) as first, dask(*quiet) as second:
             address = json.loads(file.read_text())["address"]
             with distributed.Client(address, set_as_default=False) as client:
                 client.wait_for_workers(2, timeout=30)
-            yield address, (first, second)
+            yield address, scheduler, (first, second)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(config, tmp_path, expected, cluster) -> None:
-    address, workers = cluster
+def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
+    config, tmp_path, expected, cluster, monkeypatch
+) -> None:
+    """Without its scheduler, which is killed as well then, it says in one line that jobs are left."""
+    address, scheduler, workers = cluster
     killing = Killing(lambda: workers[0].pid)
     result = run_study(config, tmp_path / "out", executor=DaskCluster(address), observers=[killing])
     assert workers[0].wait(10) == -signal.SIGKILL
     assert result.failures == ()
     assert summary(tmp_path / "out") == expected
     assert result.manifest["units"]["executor"] == "Dask, 2 threads"
+
+    monkeypatch.setattr("semstab.engine.work.executors.CONNECT_SECONDS", 1)  # after which it is given up
+    executor = DaskCluster(address)
+    finished = executor.run([Job("nowhere", "none", (), "start", tmp_path)] * 9, Observers([]))
+    next(finished)
+    scheduler.kill()
+    with pytest.raises(ConfigError, match="the scheduler went away; start it again"):
+        list(finished)
+    executor.close()
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:

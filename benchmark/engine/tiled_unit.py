@@ -32,11 +32,11 @@ class TiledUnit:
     def __init__(self, planned: PlannedUnit, tiling: Tiling, folder: Folder, width: int = 1) -> None:
         self.planned, self._folder, self._tiling = planned, folder, tiling
         self._key = unit_key(planned.identity, planned.digest)
-        whole = Request.portions(planned, self._key, tiling, width)
+        self._there: dict[str, Finished] = {}
         there = folder.portions(self._key)
+        whole = self._evened(Request.portions(planned, self._key, tiling, width), width, there)
         requests = [each for request in whole for each in self._as_cut(request, there - {_name(one) for one in whole})]
         self._requests = {_name(request): request for request in requests}
-        self._there: dict[str, Finished] = {}
         self._whole: Whole | None = None
         self._second: dict[str, Request] | None = None  # looks at the parts, once all of them are there
         self._again: dict[str, SeenAgain] = {}
@@ -47,7 +47,7 @@ class TiledUnit:
         self._sampled: Sampled | None = None
         self._waiting = [request for name, request in self._requests.items() if name not in self._there]
         if width > 1:
-            self._balance(width)
+            self._waiting.sort(key=self._turn)
         folder.clear(planned, {name for each in self._there.values() for name in each.about.files})
         shares = itertools.pairwise(k * planned.frames // len(self._requests) for k in range(len(self._requests) + 1))
         self._steps = iter([last - first for first, last in shares])
@@ -135,17 +135,15 @@ class TiledUnit:
             with contextlib.suppress(SemstabError):  # raised again where the unit is put together
                 self._sampled = Sampled.of([self._there[name] for name in frames], self._folder.path)
 
-    def _balance(self, width: int) -> None:
+    def _evened(self, requests: list[Request], width: int, there: Collection[str]) -> list[Request]:
+        """With the smallest parts cut in two, one for each of several tasks: the same ones whenever it is started."""
+        parts = sorted((each for each in requests if _kind(each) == PART), key=self._expected)
+        last = {_name(each) for each in parts[:width]} - {*there} if 1 < width < len(parts) else set[str]()
+        return [half for each in requests for half in (self._halves(each) if _name(each) in last else ()) or (each,)]
+
+    def _turn(self, request: Request) -> tuple[bool, bool, float]:
         """Stretches first, as what they tell is put together meanwhile; then parts, the largest first."""
-        parts = [each for each in self._waiting if _kind(each) == PART]
-        parts.sort(key=lambda each: -self._expected(each))
-        frames = [each for each in self._waiting if _kind(each) == STRETCH]
-        rest = [each for each in self._waiting if _kind(each) not in (PART, STRETCH)]
-        self._waiting = []
-        for last in parts[-width:] if len(parts) > width else []:
-            if self._cut(last):
-                parts.remove(last)
-        self._waiting = [*frames, *parts, *self._waiting, *rest]
+        return _kind(request) != STRETCH, _kind(request) != PART, -self._expected(request)
 
     def _as_cut(self, request: Request, names: Collection[str]) -> list[Request]:
         """A part as an earlier start cut it, where something of that is there."""
@@ -157,13 +155,17 @@ class TiledUnit:
 
     def _cut(self, request: Request) -> bool:
         """Put a part's halves in its place, to be begun next; not where it is a single tile."""
-        part = _part(request)
-        halves = [] if part is None else [request.of_part(half) for half in self._tiling.halves(part)]
+        halves = self._halves(request)
         if halves:
             parts = ((each,) if each is not request else halves for each in self._requests.values())
             self._requests = {_name(each): each for some in parts for each in some}
             self._waiting[:0] = halves
         return bool(halves)
+
+    def _halves(self, request: Request) -> list[Request]:
+        """Of a part; none of a single tile, or of what is no part."""
+        part = _part(request)
+        return [] if part is None else [request.of_part(half) for half in self._tiling.halves(part)]
 
     def _expected(self, request: Request) -> float:
         """Bytes that it takes, by what is known by now; 0 of what is no part."""

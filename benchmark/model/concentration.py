@@ -64,10 +64,12 @@ def by_group(
     """
     from semstab.model.row_kernel import add_by_group
 
+    ones = np.ones(max(BLOCK, groups))
+
     def of(some: slice) -> Float64:
         part = np.zeros((2, groups, len(values)))
         own = np.stack([column[some] for column in values], dtype=np.float64)
-        many = np.ones(own.shape[1]) if voxels is None else voxels[some]
+        many = ones[: own.shape[1]] if voxels is None else voxels[some]
         add_by_group(group[some].astype(np.int64, copy=False), own, many, *part)
         return part
 

@@ -1,10 +1,11 @@
 """CPU time of the statistics beside that of the loop whose log they read, and the memory that both take.
 
     python tests/perf/bench_statistics.py [--frames 200] [--size 640x480] [--voxel-size 0.05] [--classes 7] [--rooms 1]
-    python tests/perf/bench_statistics.py --flight --frames 50 --voxel-size 0.2
+    python tests/perf/bench_statistics.py --flight --frames 50 --voxel-size 0.2 [--flipped 0.05]
 
 A camera walks round a furnished room and sees each place again and again (room.py); with --rooms it goes on to the next
-one; with --flight it flies over a field and sees most places twice (flight.py). The frames are read from PNG, as the
+one; with --flight it flies over a field and sees most places twice (flight.py); --flipped is a share of pixels whose
+label is any. The frames are read from PNG, as the
 loop of a run does, whose other parts are flicker and fusion. Time is user and system time of all threads; compiled code
 is loaded before. Memory is the most that the process took since the step before, above what it took with its modules
 loaded.
@@ -95,6 +96,17 @@ def flown(frames: int, size: tuple[int, int], K: int) -> list[Frame]:
     return [flight.frame(index, *size, K, place) for index, place in enumerate(places)]
 
 
+def flipped(frames: list[Frame], share: float, K: int) -> list[Frame]:
+    """The frames with any label in a share of their pixels."""
+    rng, found = np.random.default_rng(0), []
+    for frame in frames:
+        assert frame.labels is not None
+        labels, where = frame.labels.copy(), rng.random(frame.shape) < share
+        labels[where] = rng.integers(K, size=np.count_nonzero(where))
+        found.append(replace(frame, labels=labels))
+    return found
+
+
 def written(folder: Path, frames: list[Frame], K: int) -> Path:
     """The frames as PNGs in a folder."""
     frames = [replace(frame, depth=(np.round(frame.depth * UNITS) / UNITS).astype(np.float32)) for frame in frames]
@@ -138,7 +150,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         warm = fused(Watch(), written(Path(there) / "few", few, K), 4 * arguments.voxel_size, K)
         statistics.describe(warm.table(), warm.events(), warm.table())
         count, rooms = arguments.frames, arguments.rooms
-        folder = written(Path(there), flown(count, size, K) if arguments.flight else walked(count, size, K, rooms), K)
+        frames = flown(count, size, K) if arguments.flight else walked(count, size, K, rooms)
+        folder = written(Path(there), flipped(frames, arguments.flipped, K) if arguments.flipped else frames, K)
         watch = Watch()
         fusion = fused(watch, folder, arguments.voxel_size, K)
     table = watch("table", fusion.table)
@@ -162,6 +175,7 @@ def main() -> None:
     parser.add_argument("--classes", type=int, default=7)
     parser.add_argument("--rooms", type=int, default=1)
     parser.add_argument("--flight", action="store_true")
+    parser.add_argument("--flipped", type=float, default=0.0, help="share of pixels with any label")
     arguments = parser.parse_args()
     found = measure(arguments)
     n, m, fusion = found["voxels"], found["observations"], found["seconds"]["fusion"]

@@ -31,6 +31,9 @@ from semstab.model.voxels import VoxelTable
 from semstab.runtime.files import write_json
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+UNWATCHED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
+"""Dask looks 100 times a second where each thread is: 2 % of a core for each worker, which one worker has beside it."""
+
 PORT = 8786
 
 
@@ -59,7 +62,7 @@ def start(module: str, *words: str, folder: Path) -> subprocess.Popen[bytes]:
     """A process that is quiet, and has one thread for each loop."""
     with (folder / "dask.log").open("a") as log:
         command = [sys.executable, "-m", module, "--no-dashboard", *words]
-        return subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | ONE_THREAD)
+        return subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | ONE_THREAD | UNWATCHED)
 
 
 def _import() -> None:

@@ -25,6 +25,9 @@ from semstab.runtime.process import follow_parent, settle
 
 CONNECT_SECONDS = 10
 
+AWAY = OSError, RuntimeError
+"""What a client of Dask raises where its scheduler does not answer, and where it has given it up."""
+
 LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
 
 Finished = tuple[Job, tuple[Outcome, ...]]
@@ -206,7 +209,7 @@ class DaskCluster:
                 f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
             ) from error
         self.width = 1
-        self.width = self._threads()
+        self._threads()
         self.name = f"Dask, {self.width} threads"
 
     def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
@@ -214,6 +217,7 @@ class DaskCluster:
 
         There are never more at the scheduler than its workers have threads, so that whoever is free has the next one;
         and that is sent before what is finished is looked at, so that nobody waits for it.
+        Raises ConfigError where the scheduler went away and jobs are left.
         """
         waiting, futures = iter(jobs), dict[Any, Job]()
         finished = _distributed().as_completed(loop=self._client.loop)
@@ -236,13 +240,18 @@ class DaskCluster:
                 send()
                 yield job, outcomes
                 send()
+            if next(waiting, None) is not None:
+                raise ConfigError(LOST)
         finally:
-            self._client.cancel(list(futures))
+            if futures:
+                self._client.cancel(list(futures))
 
     def _threads(self) -> int:
-        """Of the workers that there are now; they come and go."""
-        with contextlib.suppress(OSError):
+        """Of the workers that there are now, which come and go; 0 where the scheduler does not answer."""
+        try:
             self.width = max(1, sum(self._client.nthreads().values()))
+        except AWAY:
+            return 0
         return self.width
 
     def close(self) -> None:
@@ -256,7 +265,7 @@ class DaskCluster:
             there = self._client.run(importlib.metadata.version, "semstab")
         except importlib.metadata.PackageNotFoundError as error:
             raise ConfigError("a worker of the scheduler has no semstab; install semstab there") from error
-        except OSError as error:
+        except AWAY as error:
             raise ConfigError(LOST) from error
         if not there:
             raise ConfigError("the scheduler has no worker; start some with 'dask worker'")
