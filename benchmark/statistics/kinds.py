@@ -1,4 +1,4 @@
-"""What is the same for many voxels of a map is computed once: most of a clean one are of few kinds."""
+"""What is the same for many voxels of a map is computed once: few looks at labels differ in few ways."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.correctness import Truth
 from semstab.statistics.sampling.places import Places
 
-FEW = 4
+FEW = 2
 """One voxel of each kind is looked at where there are at most one kind for so many voxels, else all of them."""
 
 
@@ -40,7 +40,7 @@ class Known:
 class Kinds:
     """The voxels of a map, and one of each kind, whose `copies` are how many voxels and `pixels` those of all of them.
 
-    All that is summed over voxels, but by frame, is the same for those of a kind.
+    All that is summed over voxels is the same for those of a kind.
 
     every, one  all of the voxels, and one of each kind
     of          (n,) which of the latter stands for each of the former; None where they are the same
@@ -54,18 +54,21 @@ class Kinds:
     def found(cls, table: VoxelTable, events: Events | None = None, truth: Truth | None = None) -> Kinds:
         """Those of a table, of its log, and of its true classes."""
         from semstab.statistics.loops.kinds import tell_apart
+        from semstab.statistics.loops.orders import ENUMERATED
 
         every = Known(table, events, truth, Places.of(table))
-        most, of = len(table) // FEW, np.empty(len(table), np.int32)
+        most, of, none = len(table) // FEW, np.empty(len(table), np.int32), np.zeros(0, np.int64)
         rows, voxels, pixels = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64)
         count = tell_apart(
-            table.evidence.entries,
-            table.K,
             table.op,
-            int(table.op.max(initial=0)),
             (table.drift_sum, table.self_sum, table.frame_entropy_sum),
             every.places.at,
-            np.zeros(0, np.int64) if truth is None else truth.label,
+            none if truth is None else truth.label,
+            table.evidence.entries,
+            (table if events is None else events).evidence.entries,
+            none if events is None else events.bounds,
+            table.op if events is None else events.frame,
+            int(table.op.max(initial=0)) if events is None else ENUMERATED,  # above, orders hang on the place
             table.pixels,
             rows,
             voxels,

@@ -20,7 +20,7 @@ from semstab.statistics.agreement import class_sums, disagreement, psa
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, merged
-from semstab.statistics.sampling.collect import of_log, of_table, with_places
+from semstab.statistics.sampling.collect import frame_step, of_log, of_table, with_places
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]
@@ -60,8 +60,8 @@ class MapSums:
         null (n,) is the SBD of one voxel of each kind in random order, which comes with a log. How likely places are
         stable only the whole map tells: `StableLooks`.
         """
-        one, every = kinds.one, kinds.every
-        alone = every.events is None and every.truth is None
+        one, log = kinds.one, kinds.every.events
+        alone = log is None and one.truth is None
         parts = (
             cls._of_few(one.table.rows(some), one.places.rows(some), None if null is None else null[some], edges, alone)
             for some in stretches(len(one.table))
@@ -72,8 +72,8 @@ class MapSums:
         excess = sbd(one.table) - (expected_sbd(one.table) if null is None else null)
         influence = with_places(
             of_table(one.table, one.places, one.label)
-            if every.events is None
-            else of_log(every.events, every.places, every.label),
+            if log is None or one.events is None
+            else of_log(one.events, one.places, one.label, step=frame_step(log)),
             one.table,
             one.places,
             one.label,

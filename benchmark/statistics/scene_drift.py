@@ -87,9 +87,14 @@ def scene_drift(
     )
 
 
-def sampled(table: VoxelTable, events: Events, seed: int = 0) -> tuple[VoxelTable, Events]:
-    """The voxels of a map from which it is told whether it drifts, with their observations: see `drawn`."""
-    rows = drawn(table, events, SAMPLE, seed)
+def sampled(
+    table: VoxelTable, events: Events, seed: int = 0, vary: npt.NDArray[np.bool_] | None = None
+) -> tuple[VoxelTable, Events]:
+    """The voxels of a map from which it is told whether it drifts, with their observations: see `drawn`.
+
+    vary (n,) says whose observations differ, where that is known.
+    """
+    rows = drawn(table, varying(table, events)[0] if vary is None else vary, SAMPLE, seed)
     return table.rows(rows), events.rows(rows)
 
 

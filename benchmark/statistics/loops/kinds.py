@@ -4,48 +4,84 @@ from __future__ import annotations
 
 import numpy as np
 
+from semstab.backends.shared.hashing import mix
+from semstab.backends.shared.prefetch import touch
 from semstab.runtime.compiled import serial
 
-ROOM = 1 << 14
-"""Places of a table of kinds, half of which are used: voxels beyond that stand for themselves."""
+FACTORS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1342543DE82EF95), np.uint64(0xAEF17502108EF2D9))
+"""Odd numbers without a pattern."""
+
+AT_ONCE = 256
+"""Voxels whose places in the table of kinds are asked for before they are read."""
 
 
 @serial
-def tell_apart(evidence, K, op, longest, sums, at, truth, pixels, rows, voxels, together, of):
+def _with(key, value, place):
+    """A hash of 128 bits with a value in its place: what differs in anything has another one, as far as can be."""
+    x = (value + np.uint64(place) * FACTORS[0]) * FACTORS[1]
+    x = (x ^ (x >> np.uint64(32))) * FACTORS[2]
+    x ^= x >> np.uint64(29)
+    return key[0] + x, key[1] + x * FACTORS[0] ^ (x >> np.uint64(31))
+
+
+@serial
+def _kind_of(key, keys, kinds):
+    """Where a table of kinds, a power of 2, has the one with this key (2,) of keys (k, 2), or room for it."""
+    slot = np.int64(key[0]) & (kinds.shape[0] - 1)
+    while kinds[slot] >= 0 and (keys[kinds[slot], 0] != key[0] or keys[kinds[slot], 1] != key[1]):
+        slot = (slot + 1) & (kinds.shape[0] - 1)
+    return slot
+
+
+@serial
+def tell_apart(op, sums, at, truth, evidence, log, bounds, frame, longest, pixels, rows, voxels, together, of):
     """Which kind (n,) each voxel is of, and of each kind (k,) its first row, how many voxels and pixels it has.
 
-    Voxels whose frames saw one class and nothing else are of one kind where class, OP, cube `at` (n,) and true class
-    agree; each of the others is one of its own. sums are drift, ||s||^2 and entropy of the frames (n,); truth is empty
-    where it is not known. Returns how many kinds there are, -1 where they are more than there is room for.
+    Voxels of one kind agree in OP, sums (drift, ||s||^2 and entropy of the frames), cube `at` (n,), true class (n,) and
+    evidence; with a log in all observations instead, and in the frames of these where they are two or more. Without a
+    log bounds (n + 1,) are empty, truth where it is not known. Where the OP is above `longest` and there was more than
+    one class, a voxel is of a kind of its own. Returns how many kinds there are, -1 where there is no room for them.
     """
-    starts, label, weight = evidence
+    starts, _, weight = evidence
     drift, squares, entropy = sums
-    keys, kinds, taken = np.full(ROOM, -1), np.empty(ROOM, np.int64), 0
-    found, before, kind = 0, np.int64(-1), np.int64(-1)
-    for i in range(op.shape[0]):
-        e, T, key = starts[i], op[i], np.int64(-1)
-        if starts[i + 1] - e == 1 and weight[e] == T and squares[i] == T and entropy[i] == 0.0 and drift[i] == 0.0:
-            true = truth[i] if truth.shape[0] else -1
-            key = (((at[i] + 1) * K + label[e]) * (longest + 1) + T) * (K + 1) + true + 1
-        if key < 0 or key != before:
-            before, kind, slot = key, np.int64(found), 0
-            if key >= 0:
-                slot = ((key ^ (key >> 15)) * 73856093 >> 5) & (ROOM - 1)
-                while keys[slot] >= 0 and keys[slot] != key:
-                    slot = (slot + 1) & (ROOM - 1)
-                if keys[slot] == key:
-                    kind = kinds[slot]
-                elif 2 * taken < ROOM:
-                    keys[slot], kinds[slot] = key, kind
-                    taken += 1
-                else:
-                    before = np.int64(-1)
-            if kind == found:
+    of_drift, of_squares, of_entropy = drift.view(np.uint64), squares.view(np.uint64), entropy.view(np.uint64)
+    known, logged, found = truth.shape[0] > 0, bounds.shape[0] > 0, 0
+    ends, classes, weights = log if logged else evidence
+    bits = weights.view(np.uint64)
+    some, keys = np.empty((AT_ONCE, 2), np.uint64), np.empty((rows.shape[0], 2), np.uint64)
+    kinds = np.full(1 << 12, np.int32(-1))
+    for first in range(0, op.shape[0], AT_ONCE):
+        last = min(first + AT_ONCE, op.shape[0])
+        for i in range(first, last):
+            T, place = op[i], np.uint64(at[i] + 1) << np.uint64(32) | np.uint64(truth[i] + 1 if known else 0)
+            key = _with((np.uint64(T), np.uint64(0)), place, 0)
+            if longest < T and (starts[i + 1] - starts[i] > 1 or weight[starts[i]] != T or squares[i] != T):
+                key = _with(key, np.uint64(i), 1)
+            row, end = (bounds[i], bounds[i + 1]) if logged else (i, i + 1)
+            if logged:
+                for t in range(row, end):
+                    count = np.uint64(ends[t + 1] - ends[t]) << np.uint64(32)
+                    key = _with(key, count | np.uint64(frame[t] if T > 1 else 0), 2 + t - row)
+            else:
+                key = _with(_with(_with(key, of_drift[i], 2), of_squares[i], 3), of_entropy[i], 4)
+            for e in range(ends[row], ends[end]):
+                key = _with(key, bits[e] * FACTORS[2] + np.uint64(classes[e]), ends[row] - 1 - e)
+            some[i - first, 0], some[i - first, 1] = mix(key[0]), key[1]
+            touch(kinds, np.int64(some[i - first, 0]) & (kinds.shape[0] - 1))
+        for i in range(first, last):
+            key = some[i - first]
+            slot = _kind_of(key, keys, kinds)
+            if kinds[slot] < 0:
                 if found == rows.shape[0]:
                     return -1
-                rows[found], voxels[found], together[found] = i, 0.0, 0
+                keys[found], kinds[slot], rows[found], voxels[found], together[found] = key, found, i, 0.0, 0
                 found += 1
-        voxels[kind] += 1.0
-        together[kind] += pixels[i]
-        of[i] = kind
+            kind = kinds[slot]
+            voxels[kind] += 1.0
+            together[kind] += pixels[i]
+            of[i] = kind
+        if 2 * (found + AT_ONCE) > kinds.shape[0]:
+            kinds = np.full(4 * kinds.shape[0], np.int32(-1))
+            for kind in range(found):
+                kinds[_kind_of(keys[kind], keys, kinds)] = kind
     return found

@@ -186,7 +186,7 @@ class _Orders:
     def sampled(self, count: int) -> Int64:
         """Numbers of so many voxels with many orders, by chance."""
         many = np.flatnonzero(self.many)
-        return many[np.argsort(self.streams[many])[:count]]
+        return many[lowest(self.streams[many], count)]
 
     def measure(
         self, known: npt.NDArray[np.bool_], draws: int, most: int, enough: int
@@ -221,20 +221,28 @@ class _Orders:
         )
 
 
-def drawn(table: VoxelTable, events: Events, observations: int, seed: int = 0) -> Int64:
-    """The rows (r,) of the voxels whose orders stand for all: those of the lowest hashes whose observations differ.
+def drawn(table: VoxelTable, vary: npt.NDArray[np.bool_], observations: int, seed: int = 0) -> Int64:
+    """The rows (r,) of the voxels whose orders stand for all: those of the lowest hashes whose observations `vary`.
 
     They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
     what is drawn of a map is drawn of any part of it that holds it.
     """
     from semstab.statistics.loops import orders
 
-    vary, _, T = varying(table, events)
-    order = np.argsort(streams(table.index[vary], seed))
-    enough = order[: np.searchsorted(np.cumsum(T[order]), observations) + 1]
-    tested = order[T[order] > orders.ENUMERATED][:DRIFT_SAMPLE]
-    rows: Int64 = np.flatnonzero(vary)[np.union1d(enough, tested)]
-    return rows
+    rows = np.flatnonzero(vary)
+    own, T = streams(table.index[rows], seed), table.op[rows].astype(np.int64)
+    order = lowest(own, observations // 2 + 1)  # each has two or more
+    enough, many = (
+        order[: np.searchsorted(np.cumsum(T[order]), observations) + 1],
+        np.flatnonzero(T > orders.ENUMERATED),
+    )
+    return rows[np.union1d(enough, many[lowest(own[many], DRIFT_SAMPLE)])]
+
+
+def lowest(numbers: npt.NDArray[np.uint64], count: int) -> Int64:
+    """Which of numbers (n,) are the lowest so many, ascending."""
+    few = np.argpartition(numbers, count)[:count] if count < len(numbers) else np.arange(len(numbers))
+    return few[np.argsort(numbers[few])]
 
 
 def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]:

@@ -74,11 +74,16 @@ def of_table(
 
 
 def of_log(
-    events: Events, places: Places, true_label: Int64 | None = None, likely: Float64 | None = None
+    events: Events,
+    places: Places,
+    true_label: Int64 | None = None,
+    likely: Float64 | None = None,
+    *,
+    step: int | None = None,
 ) -> InfluenceSums:
-    """The same by the frames of a log."""
+    """The same by the frames of a log, so many in a group, `frame_step` of them if not given."""
     K = events.K
-    step = _step(events.frame, K)
+    step = frame_step(events) if step is None else step
     frames, group = frame_groups(events.frame, step)
     sums = _sums_of_log(events, places, group, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
@@ -149,9 +154,10 @@ def with_places(
     )
 
 
-def _step(frame: npt.NDArray[np.int32], K: int) -> int:
-    step, seen = 1, distinct(frame)
-    while len(seen) > most_groups(K):
+def frame_step(events: Events) -> int:
+    """How many frames of a log are taken together."""
+    step, seen = 1, distinct(events.frame)
+    while len(seen) > most_groups(events.K):
         step, seen = 2 * step, np.unique(seen // 2)
     return step
 
@@ -184,6 +190,7 @@ def _sums_of_log(
         loops.add_influences,
         order,
         bounds,
+        np.ones(len(places.at)) if places.voxels is None else places.voxels,
         events.bounds,
         int(np.diff(events.bounds).max(initial=0)),
         events.evidence.entries,

@@ -79,8 +79,11 @@ def _label_without(total, row, active, A):
 
 
 @serial
-def _add_truth(sums, base, rows, first, T, group, truth, likely, total, active, A, without, mean, column, K):
-    """What is right: of the fused label by leaving a frame out, of each look by itself; mean (K,) is room."""
+def _add_truth(sums, base, rows, first, T, many, group, truth, likely, total, active, A, without, mean, column, K):
+    """What is right of so many voxels: of the fused label by leaving a frame out, of each look by itself.
+
+    mean (K,) is room.
+    """
     label = _label(total, active, A)
     right = 1.0 if label == truth else 0.0
     for j in range(A):
@@ -101,20 +104,21 @@ def _add_truth(sums, base, rows, first, T, group, truth, likely, total, active, 
             mean[without[t]] += part
     for t in range(T):
         r = base + group[first + t]
-        own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) * part
-        sums[r, column + KNOWN] += part
+        share = part * many
+        own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) * share
+        sums[r, column + KNOWN] += share
         sums[r, column + RIGHT] += own
-        sums[r, column + LOOKS] += 1.0
-        sums[r, column + LOOKS_RIGHT] += rows[t, truth]
+        sums[r, column + LOOKS] += many
+        sums[r, column + LOOKS_RIGHT] += rows[t, truth] * many
         if T > 2:
-            sums[r, column + STABLE] += likely * part
-            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * part
+            sums[r, column + STABLE] += likely * share
+            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * share
         if K:
-            sums[r, column + 6 + truth] += part
+            sums[r, column + 6 + truth] += share
             sums[r, column + 6 + K + truth] += own
             for j in range(A):
                 k = active[j]
-                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) * part
+                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) * share
 
 
 @serial
@@ -144,33 +148,33 @@ def _one_class(log, first, T):
 
 
 @serial
-def _add_agreed(sums, base, k, first, T, group, truth, likely, column, K, by_class):
-    """Add a voxel whose observations are all of class k: they agree with each other, and leaving one out changes none.
+def _add_agreed(sums, base, k, first, T, many, group, truth, likely, column, K, by_class):
+    """Add so many voxels whose observations are all of class k: they agree, and leaving one out changes none.
 
     column is the first with ground truth, where that is known; K classes.
     """
-    share, right = 1.0 / T, 1.0 if k == truth else 0.0
+    share, right = many / T, 1.0 if k == truth else 0.0
     for t in range(first, first + T):
         r = base + group[t]
         sums[r, VOXELS] += share
         sums[r, PSA] += share
-        sums[r, OBSERVATIONS] += 1.0
-        sums[r, AGREEING] += 1.0
-        sums[r, OWN] += 1.0
-        sums[r, ENTROPY + 1 + k] += 1.0
+        sums[r, OBSERVATIONS] += many
+        sums[r, AGREEING] += many
+        sums[r, OWN] += many
+        sums[r, ENTROPY + 1 + k] += many
         if by_class:
-            sums[r, ENTROPY + 1 + 2 * K + k] += 1.0
+            sums[r, ENTROPY + 1 + 2 * K + k] += many
         if T == 2:
-            sums[r, TWICE] += 1.0
-            sums[r, TWICE_AGREEING] += 1.0
+            sums[r, TWICE] += many
+            sums[r, TWICE_AGREEING] += many
         else:
             sums[r, RECURRENT] += share
             sums[r, VSS] += share
         if truth >= 0:
             sums[r, column + KNOWN] += share
             sums[r, column + RIGHT] += share * right
-            sums[r, column + LOOKS] += 1.0
-            sums[r, column + LOOKS_RIGHT] += right
+            sums[r, column + LOOKS] += many
+            sums[r, column + LOOKS_RIGHT] += right * many
             if T > 2:
                 sums[r, column + STABLE] += likely * share
                 sums[r, column + STABLE_WRONG] += likely * share * (1.0 - right)
@@ -182,13 +186,13 @@ def _add_agreed(sums, base, k, first, T, group, truth, likely, column, K, by_cla
 
 @serial
 def add_influences(
-    chunk, order, bounds, starts, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
+    chunk, order, bounds, voxels, starts, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
-    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; starts (n + 1,) bound a voxel's rows
-    of the log, `longest` at most, and of group (m,), truth (n,) is its true class or -1, likely (n,) how likely it is
-    stable, which is left open where that is empty. A place's
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,). starts
+    (n + 1,) bound a voxel's rows of the log, `longest` at most, and of group (m,), truth (n,) is its true class or -1,
+    likely (n,) how likely it is stable, which is left open where that is empty. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
     against, and the shares add up to T P.
@@ -202,15 +206,15 @@ def add_influences(
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
             first, T, steady = starts[i], starts[i + 1] - starts[i], likely[i] if likely.shape[0] else 0.0
-            k = _one_class(log, first, T)
+            k, many = _one_class(log, first, T), voxels[i]
             if k >= 0:
                 known = truth[i] if with_truth else -1
-                _add_agreed(sums, cell * groups, k, first, T, group, known, steady, first_truth, K, by_class)
+                _add_agreed(sums, cell * groups, k, first, T, many, group, known, steady, first_truth, K, by_class)
                 continue
             A = _classes_of(log, first, T, rows, total, squares, own, active)
             best, agreed = _label(total, active, A), _agreement(total, squares, T, active, A, surprise, apart)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
-            part, of_others = 1.0 / T, 1.0 / (T - 1.0)
+            part, of_others = many / T, 1.0 / (T - 1.0)
             for t in range(T):
                 r = cell * groups + group[first + t]
                 with_others = surprised = 0.0
@@ -218,43 +222,43 @@ def add_influences(
                     k = active[j]
                     s = rows[t, k]
                     with_others += s * total[k]
-                    sums[r, ENTROPY + 1 + k] += s
+                    sums[r, ENTROPY + 1 + k] += s * many
                     surprised += s * surprise[k]
                     if by_class:
                         others = (total[k] - s) * of_others
                         differs = s + others - 2.0 * s * others
-                        sums[r, ENTROPY + 1 + K + k] += apart[k] + spread * (differs - apart[k])
-                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2
+                        sums[r, ENTROPY + 1 + K + k] += (apart[k] + spread * (differs - apart[k])) * many
+                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2 * many
                 share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
                 sums[r, VOXELS] += part
                 sums[r, PSA] += share * part
-                sums[r, OBSERVATIONS] += 1.0
-                sums[r, AGREEING] += share
-                sums[r, OWN] += own[t]
-                sums[r, ENTROPY] += surprised
+                sums[r, OBSERVATIONS] += many
+                sums[r, AGREEING] += share * many
+                sums[r, OWN] += own[t] * many
+                sums[r, ENTROPY] += surprised * many
                 if T == 2:
-                    sums[r, TWICE] += 1.0
-                    sums[r, TWICE_AGREEING] += agreed
+                    sums[r, TWICE] += many
+                    sums[r, TWICE_AGREEING] += agreed * many
                 else:
                     sums[r, RECURRENT] += part
                     sums[r, VSS] += rows[t, best] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, rows, first, T, group, truth[i], steady, total, active, A, without, mean,
+                    sums, cell * groups, rows, first, T, many, group, truth[i], steady, total, active, A, without, mean,
                     first_truth, K if by_class else 0,
                 )  # fmt: skip
             _cleared(log, first, T, rows)
 
 
 @serial
-def add_kinds(kind, first, bounds, group, groups, total):
-    """Add 1 / T for each of the T looks at the voxels of kinds (n,) that there is room for, from the first on.
+def add_kinds(kind, voxels, first, bounds, group, groups, total):
+    """Add 1 / T for each of the T looks at voxels of kinds (n,) that there is room for, from the first on.
 
-    At (kind - first) * groups + group; bounds (n + 1,) are of a voxel's rows of group (m,).
+    At (kind - first) * groups + group; each stands for voxels (n,), bounds (n + 1,) are of its rows of group (m,).
     """
     last = first + total.shape[0] // groups
     for i in range(kind.shape[0]):
         if first <= kind[i] < last:
-            share, at = 1.0 / (bounds[i + 1] - bounds[i]), (kind[i] - first) * groups
+            share, at = voxels[i] / (bounds[i + 1] - bounds[i]), (kind[i] - first) * groups
             for row in range(bounds[i], bounds[i + 1]):
                 total[at + group[row]] += share

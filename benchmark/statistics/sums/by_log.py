@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +14,10 @@ from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
-from semstab.statistics.kinds import Known
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order import fusion_rules
-from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns
+from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns, varying
 from semstab.statistics.order.p_values import PValues
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
@@ -48,14 +48,15 @@ class LogSums:
     @classmethod
     def of(
         cls,
-        known: Known,
+        kinds: Kinds,
         drift: VoxelDrift,
         changes: Flips,
         seed: int,
     ) -> LogSums:
-        """Of voxels with their log."""
-        table, events, places = known.table, known.events, known.places
-        assert events is not None
+        """Of a map with its log, from what is known of one voxel of each kind."""
+        every, (table, events, truth, places) = kinds.every, vars(kinds.one).values()
+        assert every.events is not None
+        vary = varying(table, events)[0]
         rows, trend = trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
@@ -69,8 +70,8 @@ class LogSums:
             PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
             trends.sum(axis=0),
             PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
-            _rules(table, events, known.truth),
-            *sampled(replace(table, copies=None), events, seed),  # of those that differ, none stands for another
+            _rules(table, events, truth),
+            *sampled(every.table, every.events, seed, vary if kinds.of is None else vary[kinds.of]),
         )
 
     @classmethod

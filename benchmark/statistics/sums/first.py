@@ -124,7 +124,7 @@ def first_look(
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if events is not None and drift is not None:
         changes = flips(events)
-        log = LogSums.of(kinds.one, drift, changes, seed)
+        log = LogSums.of(kinds, drift, changes, seed)
         more = log_maps(drift, changes) | more
     found = FirstSums(
         own,

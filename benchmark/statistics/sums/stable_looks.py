@@ -46,7 +46,7 @@ class StableLooks:
     @classmethod
     def of(cls, kinds: Kinds, step: int) -> StableLooks:
         """Those of a map with true classes."""
-        one, every = kinds.one, kinds.every
+        one = kinds.one
         assert one.truth is not None
         counted = np.flatnonzero(one.truth.known & (one.table.op >= RECURRENT))
         some, edge = one.table.rows(counted), one.places.edge
@@ -58,14 +58,13 @@ class StableLooks:
         pairs, is_wrong = np.divmod(votings, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
         keys = np.column_stack([cell[ofs], np.full(len(votings), -1), *np.divmod(votes, longest), is_wrong])
-        if every.events is None:
+        if one.events is None:
             count = np.bincount(voting, weights=some.voxels, minlength=len(votings))
             return cls(keys.astype(np.int32), count.astype(np.float64), edge, 0)
-        groups, group = frame_groups(every.events.frame, step)
+        groups, group = frame_groups(one.events.frame, step)
         of = np.full(len(one.table), -1)
         of[counted] = voting
-        of = of if kinds.of is None else of[kinds.of]
-        key, weight = _by_frame(every.events, of, len(votings), group, len(groups))
+        key, weight = _by_frame(one.events, of, one.table.voxels, len(votings), group, len(groups))
         own = keys[key // max(len(groups), 1)]
         own[:, 3] = groups[key % max(len(groups), 1)]
         return cls(own.astype(np.int32), weight, edge, step)
@@ -99,17 +98,19 @@ class StableLooks:
         ).coarsened(sums.edge, sums.step)
 
 
-def _by_frame(events: Events, kind: Int64, kinds: int, group: Int64, groups: int) -> tuple[Int64, Float64]:
+def _by_frame(
+    events: Events, kind: Int64, voxels: Float64, kinds: int, group: Int64, groups: int
+) -> tuple[Int64, Float64]:
     """What kinds (n,) of voxels, -1 is none, which groups (m,) of frames saw: kind * groups + group, and how many.
 
-    A place counts 1 / T for each of its T frames.
+    A row stands for voxels (n,), of which each counts 1 / T for each of its T frames.
     """
     from semstab.statistics.sampling.loops import add_kinds
 
     step, found = max(1, AT_ONCE // max(groups, 1)), [(kind[:0], np.zeros(0))]
     for first in range(0, kinds, step):
         total = np.zeros(min(step, kinds - first) * groups)
-        add_kinds(kind, first, events.bounds, group, groups, total)
+        add_kinds(kind, voxels, first, events.bounds, group, groups, total)
         key = np.flatnonzero(total)
         found.append((key + first * groups, total[key]))
     keys, weights = zip(*found, strict=True)
