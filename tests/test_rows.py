@@ -72,7 +72,7 @@ def test_memory_does_not_grow_with_the_rows(monkeypatch) -> None:
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("small", [0, 1 << 20])
+@pytest.mark.parametrize("small", [0, scratch.SMALL])
 def test_digests_are_there_for_files_that_were_read(monkeypatch, small) -> None:
     monkeypatch.setattr(scratch, "SMALL", small)
     digests = Digests(5)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 DISK = Path("/var/tmp")
 """Where TMPDIR says nothing: /tmp often is in memory, and this is for what is too large for that."""
 
-SMALL = 1 << 20
+SMALL = 1 << 21
 """Bytes that may be in memory."""
 
 

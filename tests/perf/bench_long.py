@@ -1,10 +1,11 @@
 """What a frame costs beside its pixels: opening and planning a long sequence, and the memory that a run takes a frame.
 
-    python tests/perf/bench_long.py [--frames 100000] [--fused 2000 10000] [--json FILE]
+    python tests/perf/bench_long.py [--frames 100000] [--fused 2000 10000] [--still] [--json FILE]
 
 A posed folder of tiny frames, of which all but 50 are links. CPU seconds and resident memory in MB after each step:
 open the scene, select frames (each pose is read: tracking may have been lost), hash the input, pickle what a task is
-sent of a stretch of 4096 frames. Then the command fuses so many of its frames: peak memory, and what a frame adds.
+sent of a stretch of 4096 frames. Then the command fuses so many of its frames: peak memory, and what a frame adds. The
+camera goes over new ground, or with --still back and forth over the same: the map does not grow then.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from semstab.runtime.memory import resident_bytes  # noqa: E402
 WIDTH, HEIGHT, OWN, LEG = 16, 12, 50, 500
 
 
-def write(root: Path, count: int) -> Path:
-    """A sequence of so many frames in legs; some images are links to others."""
+def write(root: Path, count: int, *, still: bool = False) -> Path:
+    """A sequence of so many frames in legs, or over one place; some images are links to others."""
     rng, frames = np.random.default_rng(0), []
     for index in range(OWN):
         depth = (rng.integers(5000, 6000, (HEIGHT, WIDTH)) / 1000).astype(np.float32)
@@ -47,7 +48,7 @@ def write(root: Path, count: int) -> Path:
         frames.append(Frame(index, depth, camera, np.eye(4), labels=labels))
     write_posed(root, [f"{k:06d}" for k in range(OWN)], {"a": frames}, classes=["x", "y", "z"], up_axis="z")
     for index in range(count):
-        leg, along = divmod(index, LEG)
+        leg, along = (0, index % 4) if still else divmod(index, LEG)
         x = along if leg % 2 == 0 else LEG - 1 - along
         (root / f"pose/{index:06d}.txt").write_text(f"1 0 0 {0.5 * x}\n0 1 0 {2.0 * leg}\n0 0 1 0\n0 0 0 1\n")
         for folder in ("depth", "labels/a") if index >= OWN else ():
@@ -100,10 +101,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--fused", nargs="*", type=int, default=[2000, 10_000])
+    parser.add_argument("--still", action="store_true", help="all frames see the same place")
     parser.add_argument("--json", help="also write the figures there")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        root = write(Path(folder) / "long", arguments.frames)
+        root = write(Path(folder) / "long", arguments.frames, still=arguments.still)
         found = steps(root)
         for step, (seconds, megabytes) in found.items():
             print(f"{step:45} {seconds:7.2f} s {megabytes:7.0f} MB", flush=True)

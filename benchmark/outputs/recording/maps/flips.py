@@ -121,7 +121,7 @@ class FlipLog:
         moves = np.zeros(len(at), dtype=MOVE)
         moves["row"], moves["frame"], moves["bits"] = changes.row[at], frame.index, changes.drift[at]
         moves["before"], moves["after"] = changes.before[at], changes.after[at]
-        self.moves.append(moves)
+        self.moves += [moves] if len(moves) else []
         self._count += len(at)
         name = frame.files.get("labels") or frame.files.get("scores") or ""
         file = PurePath(name)
