@@ -25,8 +25,8 @@ from semstab.runtime.process import follow_parent, settle
 
 CONNECT_SECONDS = 10
 
-AWAY = OSError, RuntimeError
-"""What a client of Dask raises where its scheduler does not answer, and where it has given it up."""
+AWAY = OSError, RuntimeError, AttributeError
+"""What a client of Dask raises where its scheduler does not answer, while it gives it up, and once it has none."""
 
 LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
 
