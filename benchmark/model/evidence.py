@@ -121,11 +121,13 @@ class Evidence(NDArrayOperatorsMixin):
             starts = self.starts[first : max(first, last) + 1]
             entries = slice(starts[0], starts[-1])
             return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K, known=known)
+        from semstab.model.row_kernel import copy_rows
+
         first, end = self.starts[:-1][rows], self.starts[1:][rows]
-        count = end - first
-        starts = np.concatenate([[0], np.cumsum(count)])
-        entry = np.arange(starts[-1]) + np.repeat(first - starts[:-1], count)
-        return Evidence(starts, self.label[entry], self.weight[entry], self.K, known=known)
+        starts = np.concatenate([[0], np.cumsum(end - first)])
+        label, weight = np.empty(starts[-1], np.uint16), np.empty(starts[-1])
+        copy_rows(first, *self.entries[1:], starts, label, weight)
+        return Evidence(starts, label, weight, self.K, known=known)
 
     def only(self, labels: npt.NDArray[np.uint16]) -> Evidence:
         """Of these classes (k,), ascending, among which are all that have an entry: they become 0 to k - 1."""

@@ -60,6 +60,15 @@ def concentrate(
 
 
 @serial
+def copy_rows(first: Any, label: Any, weight: Any, starts: Any, to_label: Any, to_weight: Any) -> None:
+    """Copy the entries of rows from first (n,) on to where starts (n + 1,) say."""
+    for i in range(first.shape[0]):
+        for e in range(starts[i], starts[i + 1]):
+            at = first[i] + e - starts[i]
+            to_label[e], to_weight[e] = label[at], weight[at]
+
+
+@serial
 def add_by_group(group: Any, values: Any, voxels: Any, sums: Any, defined: Any) -> None:
     """Add values (C, n) that are not NaN to the row of sums (G, C) of each group (n,), and count them; -1 is none.
 

@@ -338,9 +338,11 @@ class Events:
 
     def rows(self, voxels: Int64) -> Events:
         """The log of these of its voxels (r,), ascending."""
-        count = self.bounds[voxels + 1] - self.bounds[voxels]
-        number = np.repeat(np.arange(len(voxels)), count)
-        rows = np.arange(len(number)) + (self.bounds[voxels] - np.cumsum(count) + count)[number]
+        first = self.bounds[voxels]
+        count = self.bounds[voxels + 1] - first
+        number = np.repeat(np.arange(len(voxels), dtype=np.int32), count)
+        rows = np.repeat(first - np.cumsum(count) + count, count)
+        rows += np.arange(len(rows))
         own: dict[str, Any] = {name: getattr(self, name)[voxels] for name in _INDEX_TYPES}
         own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
         return replace(self, **own, voxel=number, evidence=self.evidence.take(rows))

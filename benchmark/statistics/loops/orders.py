@@ -219,6 +219,15 @@ def _trend(x, A, T, at):
 
 
 @serial
+def _share(value, lanes, sign, least):
+    """The share of the lanes whose value times a sign is as high."""
+    hits = 0
+    for lane in range(lanes):
+        hits += sign * value[lane] >= least
+    return hits / lanes
+
+
+@serial
 def _tail(hits, tried, value, least, lanes, enough):
     """The p-value, NaN until there are `enough` hits, and the hits, values >= least, after `lanes` more orders.
 
@@ -275,11 +284,10 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
                 drifts(x, A, steps, order, lanes, work, value)
                 seen = value[lanes - 1]  # the last order is the one that was seen
                 null[i] = value[:lanes].mean()
-                p[i, 0] = (value[:lanes] <= seen + ROUNDING).mean()
-                p[i, 1] = (value[:lanes] >= seen - ROUNDING).mean()
+                p[i, 0], p[i, 1] = _share(value, lanes, -1.0, -seen - ROUNDING), _share(value, lanes, 1.0, seen - ROUNDING)
                 trends(x, A, steps, age, lanes, work, value)
                 trend[i] = _trend(x, A, steps, at)
-                p[i, 2] = (value[:lanes] >= trend[i] - ROUNDING * (1.0 + trend[i])).mean()
+                p[i, 2] = _share(value, lanes, 1.0, trend[i] - ROUNDING * (1.0 + trend[i]))
             continue
         base, left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
         hits = np.zeros(left, np.int64)
