@@ -284,7 +284,8 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
                 drifts(x, A, steps, order, lanes, work, value)
                 seen = value[lanes - 1]  # the last order is the one that was seen
                 null[i] = value[:lanes].mean()
-                p[i, 0], p[i, 1] = _share(value, lanes, -1.0, -seen - ROUNDING), _share(value, lanes, 1.0, seen - ROUNDING)
+                p[i, 0] = _share(value, lanes, -1.0, -seen - ROUNDING)
+                p[i, 1] = _share(value, lanes, 1.0, seen - ROUNDING)
                 trends(x, A, steps, age, lanes, work, value)
                 trend[i] = _trend(x, A, steps, at)
                 p[i, 2] = _share(value, lanes, 1.0, trend[i] - ROUNDING * (1.0 + trend[i]))
