@@ -146,7 +146,7 @@ def in_share(table: VoxelTable, share: float) -> npt.NDArray[np.bool_]:
     """(n,) which voxels are in the sample that is so large a part of all, by a hash of their index."""
     if share >= 1:
         return np.ones(len(table), np.bool_)
-    drawn: npt.NDArray[np.bool_] = streams(table.index, 0) >> np.uint64(11) < np.uint64(share * 2**53)
+    drawn: npt.NDArray[np.bool_] = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
     return drawn
 
 

@@ -167,7 +167,7 @@ class _Sampled:
 def _sampled(table: VoxelTable, events: Events, seed: int) -> _Sampled:
     """So many voxels that they have about SAMPLE observations, with the stretches that frames are cut into."""
     vary, first, T = varying(table, events)
-    order = np.argsort(streams(table.rows(vary).index, seed))
+    order = np.argsort(streams(table, vary, seed))
     chosen = np.sort(order[: np.searchsorted(np.cumsum(T[order]), SAMPLE) + 1])
     voxel, first, T = np.flatnonzero(vary)[chosen], first[chosen], T[chosen]
     of = np.repeat(np.arange(len(T)), T)

@@ -167,7 +167,7 @@ class _Orders:
         spread = variation(table)
         vary = _vary(table, spread)
         T = table.op[vary].astype(np.int64)
-        own = streams(table.index[vary], seed)
+        own = streams(table, vary, seed)
         base = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
         return cls(vary, spread, events.starts[vary], T, events.evidence.entries, table.K, own, base)
 
@@ -230,7 +230,7 @@ def drawn(table: VoxelTable, vary: npt.NDArray[np.bool_], observations: int, see
     from semstab.statistics.loops import orders
 
     rows = np.flatnonzero(vary)
-    own, T = streams(table.index[rows], seed), table.op[rows].astype(np.int64)
+    own, T = streams(table, rows, seed), table.op[rows].astype(np.int64)
     order = lowest(own, observations // 2 + 1)  # each has two or more
     enough, many = (
         order[: np.searchsorted(np.cumsum(T[order]), observations) + 1],
@@ -283,10 +283,11 @@ def _vary(table: VoxelTable, spread: Float64) -> npt.NDArray[np.bool_]:
     return vary
 
 
-def streams(index: npt.NDArray[np.int32], seed: int) -> npt.NDArray[np.uint64]:
-    """A random number (n,) of each voxel that depends on its index (n, 3) and the seed only."""
+def streams(table: VoxelTable, rows: npt.NDArray[Any], seed: int) -> npt.NDArray[np.uint64]:
+    """A random number (r,) of each of some voxels that depends on its index and the seed only."""
     from semstab.statistics.loops import orders
 
+    index = np.stack([table.ix[rows], table.iy[rows], table.iz[rows]], axis=1)
     drawn = np.empty(len(index), np.uint64)
     orders.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
     return drawn
