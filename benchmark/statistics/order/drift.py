@@ -283,7 +283,7 @@ def _vary(table: VoxelTable, spread: Float64) -> npt.NDArray[np.bool_]:
     return vary
 
 
-def streams(table: VoxelTable, rows: npt.NDArray[Any], seed: int) -> npt.NDArray[np.uint64]:
+def streams(table: VoxelTable, rows: Any, seed: int) -> npt.NDArray[np.uint64]:
     """A random number (r,) of each of some voxels that depends on its index and the seed only."""
     from semstab.statistics.loops import orders
 
