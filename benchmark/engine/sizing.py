@@ -91,7 +91,7 @@ def _size(
     voxels, observations = float(sights.voxels.sum()), float(sights.observations.sum())
     kinds, load = _kinds(group, first, soft=soft), _load(group, first, soft=soft)
     needed = sum(kind.bytes(voxels, observations) for kind in kinds)
-    own = room(config, width, load.beside(voxels, needed))
+    own = room(config, width, load.beside(needed))
     if not forced and needed <= own:
         return
     if (why := _cannot_be_tiled(config, group)) is not None:
@@ -103,7 +103,7 @@ def _size(
         return
     outgrown = outgrown and needed <= own
     more = own / needed if outgrown and needed else 1.0
-    budget = SHARE * room(config, width, load.beside(voxels, needed, in_tiles=True)) / more
+    budget = SHARE * room(config, width, load.beside(needed, in_tiles=True)) / more
     if outgrown and size is None:  # small ones, as nobody knows how much more it will be
         size = tile_size(sights, kinds[0].bytes, budget / ROOM / SMALLER)
     for each, kind in zip(group, kinds, strict=True):
@@ -125,7 +125,7 @@ def _surely_fits(config: Config, width: int, group: Sequence[PlannedUnit], first
 
     def fits(*, soft: bool) -> bool:
         needed = sum(kind.bytes(voxels, voxels) for kind in _kinds(group, first, soft=soft))
-        return needed <= room(config, width, _load(group, first, soft=soft).beside(voxels, needed))
+        return needed <= room(config, width, _load(group, first, soft=soft).beside(needed))
 
     return fits(soft=True) or (fits(soft=False) and not _is_soft(task))
 

@@ -95,7 +95,7 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
     voxels, looks = summary.table.voxels, summary.table.observations
     own = {"backend": backend, "K": K, "kind": kind, "voxels": voxels}
     whole = of.bytes(voxels, looks)
-    yield {**own, "run": "whole", "bytes": found, "estimate": whole + load.beside(voxels, whole), "stage": stage}
+    yield {**own, "run": "whole", "bytes": found, "estimate": whole + load.beside(whole), "stage": stage}
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
     part, voxels = largest_part(out, of, limit, looks / voxels)
@@ -103,7 +103,7 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
         **own,
         "run": "tiles",
         "bytes": found,
-        "estimate": part + load.beside(voxels, part, in_tiles=True),
+        "estimate": part + load.beside(part, in_tiles=True),
         "stage": stage,
     }
 

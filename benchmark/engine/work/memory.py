@@ -84,19 +84,18 @@ class Load:
     soft: bool
     threads: int | None
 
-    def beside(self, voxels: float, maps: float, *, in_tiles: bool = False) -> float:
-        """Beside maps of so many voxels and bytes: what is loaded, and frames.
+    def beside(self, maps: float, *, in_tiles: bool = False) -> float:
+        """Beside maps of so many bytes: what is loaded, and frames.
 
-        And dense rows, when a tile is looked at again, or some frames fused once more, before half of what is loaded
-        comes; as far as they are more than what is gone by then, or not yet there.
+        And some frames fused once more, before half of what is loaded comes, as far as they are more than what is gone
+        by then, or not yet there.
         """
         pixels = self.first.shape[0] * self.first.shape[1]
         threads = default_threads() if self.threads is None else self.threads
         frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
-        dense = 8 * self.K * min(voxels, STRETCH) if in_tiles else 0
         sizes = sizes_bytes(self.first, self.frames, self.K, soft=self.soft)
         loaded = LOADED + self.soft * LOADED_FOR_SCORES + in_tiles * LOADED_FOR_TILES
-        return loaded + frames + max(0.0, dense - maps / 2, sizes - LOADED / 2 - maps)
+        return loaded + frames + max(0.0, sizes - LOADED / 2 - maps)
 
 
 def room(config: Config, width: int, taken: float) -> float:
