@@ -208,8 +208,7 @@ class DaskCluster:
             raise ConfigError(
                 f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
             ) from error
-        self.width = 1
-        self._threads()
+        self.width = self._threads() or 1
         self.name = f"Dask, {self.width} threads"
 
     def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:

@@ -20,6 +20,8 @@ BITS = 19
 
 SPAN = 1 << BITS
 SHIFTS = DIGITS + 2 * BITS, DIGITS + BITS, DIGITS
+WITHIN = 4, 2, 0
+"""Where in a key the three voxel indices begin, and the three digits."""
 
 Voxel = tuple[int, int, int]
 Int64 = npt.NDArray[np.int64]
@@ -28,7 +30,7 @@ Int64 = npt.NDArray[np.int64]
 def cells_of(key: Int64, low: Voxel) -> Int64:
     """(n, 3) indices of the cells with these keys, which begin at voxel `low`."""
     cells = np.empty((len(key), 3), np.int64)
-    for axis, (shift, first, digit) in enumerate(zip(SHIFTS, low, (4, 2, 0), strict=True)):
+    for axis, (shift, first, digit) in enumerate(zip(SHIFTS, low, WITHIN, strict=True)):
         voxel = ((key >> shift) & (SPAN - 1)) + first
         cells[:, axis] = CELLS * voxel + ((key >> digit) & (CELLS - 1))
     return cells
@@ -37,7 +39,7 @@ def cells_of(key: Int64, low: Voxel) -> Int64:
 def keys_of(cells: Int64) -> tuple[Int64, Voxel]:
     """Keys (n,) of cells (n, 3), and the voxel at which they begin. Raises DataError where they span too much."""
     key, low = np.zeros(len(cells), np.int64), [0, 0, 0]
-    for axis, (shift, digit) in enumerate(zip(SHIFTS, (4, 2, 0), strict=True)):
+    for axis, (shift, digit) in enumerate(zip(SHIFTS, WITHIN, strict=True)):
         voxel = cells[:, axis] // CELLS
         low[axis] = int(voxel.min()) if len(voxel) else 0
         key |= (_near(voxel - low[axis]) << shift) | ((cells[:, axis] % CELLS) << digit)

@@ -6,7 +6,10 @@ import numpy as np
 
 from semstab.backends.shared.pixels.pixel_keys import in_voxels
 from semstab.runtime.compiled import serial
-from semstab.statistics.looks.keys import CELLS
+from semstab.statistics.looks.keys import CELLS, DIGITS, SHIFTS, WITHIN
+
+FIRST, SECOND, THIRD = SHIFTS
+HIGH, MIDDLE, LOW = WITHIN
 
 ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uint32(0x8CB92BA7)
 """Weights of a voxel's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no
@@ -87,14 +90,12 @@ def cells_of(at_x, at_y, at_z, T, size, origin, reach, key):
         b = in_voxels(y0, y1, y2, y3, x, y, z, size)
         c = in_voxels(z0, z1, z2, z3, x, y, z, size)
         i, j, k = np.floor(a), np.floor(b), np.floor(c)
-        child = (digit(a - i) << np.int64(4)) | (digit(b - j) << np.int64(2)) | digit(c - k)
+        child = (digit(a - i) << HIGH) | (digit(b - j) << MIDDLE) | (digit(c - k) << LOW)
         i, j, k = i - low_x, j - low_y, k - low_z
         near = (i >= 0.0) & (i < span) & (j >= 0.0) & (j < span) & (k >= 0.0) & (k < span)
         i, j, k = i if near else 0.0, j if near else 0.0, k if near else 0.0
-        voxel = (
-            (np.int64(np.int32(i)) << np.int64(38)) | (np.int64(np.int32(j)) << np.int64(19)) | np.int64(np.int32(k))
-        )
-        key[n] = (voxel << np.int64(6)) | child if near else np.int64(-1)
+        voxel = (np.int64(np.int32(i)) << FIRST) | (np.int64(np.int32(j)) << SECOND) | (np.int64(np.int32(k)) << THIRD)
+        key[n] = voxel | child if near else np.int64(-1)
 
 
 @serial
@@ -119,7 +120,8 @@ def grouped(cell, label, drawn, of, pixels):
     n = 0
     for i in range(len(cell)):
         own, its_label = cell[i], label[i]
-        slot = np.int64((np.uint64((own >> 6) ^ (np.int64(its_label) << 48)) * GOLDEN) >> shift) << 6 | (own & 63)
+        near = np.int64((np.uint64((own >> DIGITS) ^ (np.int64(its_label) << 48)) * GOLDEN) >> shift)
+        slot = near << DIGITS | (own & ((1 << DIGITS) - 1))
         there = table[slot] if table[slot] >= 0 else i
         while (cell[there] != own) | (label[there] != its_label):
             slot = (slot + 1) & mask

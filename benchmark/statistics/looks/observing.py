@@ -11,12 +11,17 @@ FIRST, SECOND, THIRD = SHIFTS
 
 
 @serial
+def voxel_of(key):
+    """The three voxel indices of a key, from where keys begin."""
+    return key >> FIRST, (key >> SECOND) & (SPAN - 1), (key >> THIRD) & (SPAN - 1)
+
+
+@serial
 def extent(key, low, high):
     """Set low and high (3,) to the least and largest voxel index of each axis in keys (n,), 0 where there are none."""
-    mask = SPAN - 1
-    low[:], high[:] = mask if len(key) else 0, 0
+    low[:], high[:] = SPAN - 1 if len(key) else 0, 0
     for i in range(len(key)):
-        x, y, z = key[i] >> FIRST, (key[i] >> SECOND) & mask, (key[i] >> THIRD) & mask
+        x, y, z = voxel_of(key[i])
         low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
         high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
 
@@ -24,9 +29,8 @@ def extent(key, low, high):
 @serial
 def places(key, view, low, size, views, place):
     """A number (n,) for the voxel and frame of each entry, ascending with x, y, z and frame, of voxels in a box."""
-    mask = SPAN - 1
     for i in range(len(key)):
-        x, y, z = key[i] >> FIRST, (key[i] >> SECOND) & mask, (key[i] >> THIRD) & mask
+        x, y, z = voxel_of(key[i])
         voxel = ((x - low[0]) * size[1] + (y - low[1])) * size[2] + (z - low[2])
         place[i] = voxel * views + view[i]
 
