@@ -32,7 +32,7 @@ from semstab.model.measures import SBD_MAX, measures
 from semstab.model.records import Record, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import SERIES, Recording, background, looks, observer
+from semstab.outputs.recording import SERIES, Recording, Target, background, looks, observer
 from semstab.outputs.recording.entities import Clock
 from semstab.outputs.recording.eye import Scenery, direction, fit
 from semstab.outputs.recording.maps import tracker, voxel_maps
@@ -427,7 +427,7 @@ def summary_of(table: VoxelTable) -> UnitSummary:
     return UnitSummary(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0)
 
 
-def record(path: Path, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
+def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
     """Drive a recording as the pipeline does."""
     watching = Recording(path)
     task = Task(Scene(), "net/x", [f.index for f in frames], CLASSES.mapping_to(CLASSES), ("numpy",))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from semstab.config import Config
+from semstab.engine.beside import Beside
 from semstab.engine.observer import Observers
 from semstab.engine.sizing import begun_again
 from semstab.engine.survey import Survey
@@ -19,13 +20,14 @@ class InTiles:
     def __init__(self, config: Config, survey: Survey, waiting: Waiting, told: Observers) -> None:
         self._config, self._survey, self._waiting, self._told = config, survey, waiting, told
         self._units: dict[str, TiledUnit] = {}
+        self._beside = Beside(threaded=survey.executor.elsewhere)
 
     def __contains__(self, identity: str) -> bool:
         return identity in self._units
 
     def begin(self, planned: PlannedUnit, tiling: Tiling) -> Outcome | None:
         """A unit; its own outcome where it has failed already."""
-        tiled = TiledUnit(planned, tiling, self._survey.folder, self._survey.executor.width)
+        tiled = TiledUnit(planned, tiling, self._survey.folder, self._survey.executor.width, self._beside)
         self._units[planned.identity] = tiled
         self._waiting.add_tiled(tiled)
         return tiled.take(None)

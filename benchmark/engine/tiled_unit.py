@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
+import concurrent.futures as cf
 import itertools
 from collections.abc import Collection
+from functools import partial
 
+from semstab.engine.beside import Beside
 from semstab.engine.folder import Folder, unit_key
 from semstab.engine.tiling.again import SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
 from semstab.engine.tiling.portion import PART, STRETCH, Finished
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.assembly import Sampled, assembled, second_looks
+from semstab.engine.work.assembly import Joined, Sampled, assembled, joined, second_looks
 from semstab.engine.work.jobs import Outcome, Request, failed
 from semstab.engine.work.looking_again import look_again
 from semstab.errors import DataError, OutgrownError, SemstabError
@@ -27,10 +29,14 @@ class TiledUnit:
     A part that turned out larger than there is memory for it is cut in two, and so are those that would, judged by how
     many voxels the parts before had, of how many were expected. Where several tasks share the parts, the largest are
     first, and the last one of each is cut in two as well: none is left with a large one when the others are done.
+    What needs no part, or no second look at one, is put together `beside` those who are at them.
     """
 
-    def __init__(self, planned: PlannedUnit, tiling: Tiling, folder: Folder, width: int = 1) -> None:
+    def __init__(
+        self, planned: PlannedUnit, tiling: Tiling, folder: Folder, width: int = 1, beside: Beside | None = None
+    ) -> None:
         self.planned, self._folder, self._tiling = planned, folder, tiling
+        self._beside = beside or Beside()
         self._key = unit_key(planned.identity, planned.digest)
         self._there: dict[str, Finished] = {}
         there = folder.portions(self._key)
@@ -44,7 +50,8 @@ class TiledUnit:
             if (found := folder.portion(self._key, name)) is not None:
                 self._there[name] = found.without_rows()
         self._failed = False
-        self._sampled: Sampled | None = None
+        self._sampled: cf.Future[Sampled] | None = None  # what all frames tell, once they are looked at
+        self._joined: cf.Future[Joined] | None = None  # what all portions come to
         self._waiting = [request for name, request in self._requests.items() if name not in self._there]
         if width > 1:
             self._waiting.sort(key=self._turn)
@@ -103,16 +110,22 @@ class TiledUnit:
         """The unit's own outcome, once all parts have been looked at again, which is asked for first."""
         finished = {name: self._there[name] for name in self._requests}  # sums do not hang on who was first
         try:
-            sampled = self._sampled or Sampled.of(finished.values(), self._folder.path)
+            self._look_ahead()
+            assert self._sampled is not None
+            sampled = self._sampled.result()
             if self._second is None:
                 parts = {name: each for name, each in finished.items() if each.about.kind == PART}
                 self._whole, looks = second_looks(self.planned, parts, sampled)
                 self._waiting = Request.of(self.planned).looking_again(looks)
                 self._second = {each.name: request for each, request in zip(looks, self._waiting, strict=True)}
+                together = partial(joined, self.planned, finished, self._loaded, self._folder.path, sampled)
+                self._joined = self._beside.submit(together)
             if len(self._again) < len(self._second):
                 return None
+            assert self._joined is not None
             again = [self._again[name] for name in self._second]
-            content = assembled(self.planned, finished, self._loaded, self._folder.path, sampled, self._whole, again)
+            own = self._joined.result()
+            content = assembled(self.planned, finished, own, self._folder.path, sampled, self._whole, again)
             return Outcome(self.planned.identity, content)
         except SemstabError as error:
             return failed([*self._requests.values()][:1], error)[0]
@@ -132,8 +145,8 @@ class TiledUnit:
         """Prepare what all frames tell, once they are looked at, while others fuse the parts."""
         frames = [name for name, request in self._requests.items() if _kind(request) == STRETCH]
         if self._sampled is None and self._there.keys() >= set(frames):
-            with contextlib.suppress(SemstabError):  # raised again where the unit is put together
-                self._sampled = Sampled.of([self._there[name] for name in frames], self._folder.path)
+            stretches = [self._there[name] for name in frames]
+            self._sampled = self._beside.submit(partial(Sampled.of, stretches, self._folder.path))
 
     def _evened(self, requests: list[Request], width: int, there: Collection[str]) -> list[Request]:
         """With the smallest parts cut in two, one for each of several tasks: the same ones whenever it is started."""

@@ -171,7 +171,7 @@ def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     return rule_means_of(rule_sums(fused, where.astype(np.float64), truth))
 
 
-def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None) -> Float64:
+def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None = None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
 
     Each of what was fused stands for so many voxels (n,), 0 leaves it out.

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.correctness import Truth
+from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling.places import Places
 
 FEW = 2
@@ -43,11 +44,13 @@ class Kinds:
     All that is summed over voxels is the same for those of a kind.
 
     every, one  all of the voxels, and one of each kind
+    patterns    of the looks at the latter
     of          (n,) which of the latter stands for each of the former; None where they are the same
     """
 
     every: Known
     one: Known
+    patterns: Patterns
     of: npt.NDArray[np.int32] | None = None
 
     @classmethod
@@ -58,7 +61,7 @@ class Kinds:
 
         every = Known(table, events, truth, Places.of(table))
         most, of, none = len(table) // FEW, np.empty(len(table), np.int32), np.zeros(0, np.int64)
-        rows, voxels, pixels = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64)
+        rows, voxels, pixels = np.empty(most, np.int64), np.zeros(most), np.zeros(most, np.int64)
         count = tell_apart(
             table.op,
             (table.drift_sum, table.self_sum, table.frame_entropy_sum),
@@ -76,7 +79,7 @@ class Kinds:
             of,
         )
         if count < 0:
-            return cls(every, every)
+            return cls(every, every, Patterns.found(table, events))
         rows, voxels = rows[:count].copy(), voxels[:count].copy()
         one = Known(
             replace(table.rows(rows), copies=voxels, pixels=pixels[:count].copy()),
@@ -84,11 +87,12 @@ class Kinds:
             None if truth is None else Truth(truth.known[rows], truth.label[rows]),
             replace(every.places, at=every.places.at[rows], voxels=voxels),
         )
-        return cls(every, one, of)
+        return cls(every, one, Patterns.found(one.table, one.events), of)
 
     def measured(self) -> Kinds:
         """The same with what measures of one of each kind are functions of: see `VoxelTable.measured`."""
-        return replace(self, one=replace(self.one, table=self.one.table.measured()))
+        patterns, table = self.patterns.measured(self.one.table)
+        return replace(self, one=replace(self.one, table=table), patterns=patterns)
 
 
 def spread(maps: Mapping[str, npt.NDArray[Any]], of: npt.NDArray[np.int32] | None) -> dict[str, npt.NDArray[Any]]:

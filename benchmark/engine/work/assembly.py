@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.series import NUMBERS
+from semstab.engine.series import NUMBERS, Series
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.finish import Savers, no_voxels, reduced_of, unit_summary
+from semstab.engine.work.finish import no_voxels, reduced_of, unit_summary
 from semstab.engine.work.image_space import COLUMNS, image_space_of
 from semstab.engine.work.stream import AXES, some_poses
 from semstab.engine.work.up_axis import estimate_up
@@ -58,72 +58,109 @@ class Sampled:
         return cls(looks, sample, None if sample is None else correlogram(sample))
 
 
-def assembled(
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """What becomes of a unit's portions without a second look at its parts.
+
+    sums     over all voxels
+    rows     its time series, image (F, C) what its frames tell in image coordinates
+    reduced  sums of the map of labels that soft scores were reduced to; None where there are none
+    up       the scene's up axis
+    files    digests of what is in the folder by now, by path
+    """
+
+    sums: TableSums
+    rows: Series
+    image: Rows
+    reduced: npt.NDArray[np.float64] | None
+    up: tuple[float, float, float] | None
+    files: Mapping[str, str]
+
+
+def joined(
     planned: PlannedUnit,
     finished: Mapping[str, Finished],
     load: Callable[[str], Finished],
     folder: Path,
     sampled: Sampled,
-    whole: Whole | None,
-    again: Sequence[SeenAgain],
-) -> UnitContent:
-    """The unit's content, from its portions by name, and second looks at its parts, in order; its series is written.
+) -> Joined:
+    """What the portions of a unit come to, by name; its series and its looks are written.
 
     load  a portion with what it has of each frame: those are not together in memory
 
     Raises DataError where no pixel was valid, or a portion is no longer there.
     """
-    task, unit, config = planned.task, planned.unit, planned.config
-    stretches = [each for each in finished.values() if each.about.kind == STRETCH]
-    parts = [each for each in finished.values() if each.about.kind == PART]
+    unit, parts = planned.unit, _of_kind(finished, PART)
     sums = functools.reduce(operator.add, (TableSums.read(part.sums) for part in parts))
     if not sums.total[2]:
-        raise no_voxels(task, config)
+        raise no_voxels(planned.task, planned.config)
+    of_frames, of_parts = _rows(load, finished, STRETCH), _rows(load, finished, PART)
+    rows = joined_series(of_frames.series, of_parts.series, of_parts.sizes)
+    reduced = [part.reduced for part in parts if len(part.reduced)]
     files = {name: digest for each in finished.values() for name, digest in each.about.files.items()}
-    looks, sample = sampled.looks, sampled.sample
+    files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
+    tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
+    if planned.kept:
+        files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", rows.save_csv)
+        if sampled.looks is not None:
+            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", sampled.looks.save)
+    return Joined(
+        sums,
+        rows,
+        of_frames.image,
+        np.sum(reduced, axis=0) if reduced else None,
+        _up(planned, tiles, int(sums.total[2]), some_poses(of_frames.poses)) if planned.image_space else None,
+        files,
+    )
+
+
+def assembled(
+    planned: PlannedUnit,
+    finished: Mapping[str, Finished],
+    joined: Joined,
+    folder: Path,
+    sampled: Sampled,
+    whole: Whole | None,
+    again: Sequence[SeenAgain],
+) -> UnitContent:
+    """The unit's content, from what its portions come to, and second looks at its parts, in order."""
+    task, config, files = planned.task, planned.config, {**joined.files}
+    classes, strata = task.mapping.target.classes, config.strata
     found = None
     if whole is not None:
         found = concluded(
             whole,
             SecondSums.merged([each.sums for each in again]),
             voxel_size=config.voxel_size,
-            classes=task.mapping.target.classes,
-            sample=sample,
+            classes=classes,
+            sample=sampled.sample,
             by_lag=sampled.by_lag,
             name=task.backbone,
-            edges=config.strata,
+            edges=strata,
             critical=config.critical_classes,
         )
-    of_frames, of_parts = _rows(load, finished, STRETCH), _rows(load, finished, PART)
-    rows = joined_series(of_frames.series, of_parts.series, of_parts.sizes)
-    reduced = [part.reduced for part in parts if len(part.reduced)]
+        if planned.kept:
+            files |= _saved(folder, f"{INFLUENCE}/{planned.unit.slug}.parquet", found[1].save)
+            files |= {name: digest for each in again for name, digest in each.files.items()}
     summary = unit_summary(
         task,
-        rows,
-        sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
+        joined.rows,
+        joined.sums.summary(config.voxel_size, classes, strata),
         None if found is None else found[0],
-        reduced_of(np.sum(reduced, axis=0)) if reduced else None,
+        None if joined.reduced is None else reduced_of(joined.reduced),
         next((each.about.sizes for each in finished.values() if each.about.sizes), ()),
     )
-    files = {name: digest for name, digest in files.items() if not name.startswith(f"{PORTIONS}/")}
-    savers: Savers = {}
-    if planned.kept:
-        savers[f"{FRAMES}/{unit.slug}.csv"] = rows.save_csv
-        if found is not None:
-            savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found[1].save
-            files |= {name: digest for each in again for name, digest in each.files.items()}
-        if looks is not None:
-            savers[f"{LOOKS}/{unit.slug}.parquet"] = looks.save
-    files |= {name: _saved(save, folder / name) for name, save in savers.items()}
-    content = UnitContent(
-        planned.digest, summary, files=files, checked=_checked([part.about.checked for part in parts])
-    )
+    checked = _checked([part.about.checked for part in _of_kind(finished, PART)])
+    content = UnitContent(planned.digest, summary, files=files, checked=checked)
     if not planned.image_space:
         return content
-    image_space = image_space_of(of_frames.image, summary.flicker_percent)
-    tiles = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
-    up = _up(planned, tiles, int(sums.total[2]), some_poses(of_frames.poses))
-    return replace(content, image_space=image_space, quality=stretches[0].about.quality, up=up)
+    image_space = image_space_of(joined.image, summary.flicker_percent)
+    quality = _of_kind(finished, STRETCH)[0].about.quality
+    return replace(content, image_space=image_space, quality=quality, up=joined.up)
+
+
+def _of_kind(finished: Mapping[str, Finished], kind: str) -> list[Finished]:
+    return [each for each in finished.values() if each.about.kind == kind]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +185,10 @@ def _rows(load: Callable[[str], Finished], finished: Mapping[str, Finished], kin
     return rows
 
 
-def _saved(save: Callable[[Path], None], path: Path) -> str:
-    """The digest of a file that was written."""
-    save(path)
-    return file_digest(path).hex()
+def _saved(folder: Path, name: str, save: Callable[[Path], None]) -> dict[str, str]:
+    """The digest of a file of the folder that was written, by its path there."""
+    save(folder / name)
+    return {name: file_digest(folder / name).hex()}
 
 
 def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> Looks | None:

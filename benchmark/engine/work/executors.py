@@ -10,6 +10,7 @@ import importlib.metadata
 import itertools
 import multiprocessing
 import os
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
@@ -24,6 +25,8 @@ from semstab.runtime.prefetch import default_threads
 from semstab.runtime.process import follow_parent, settle
 
 CONNECT_SECONDS = 10
+MOMENT = 0.2
+"""Seconds for which the number of workers, which come and go, holds: to ask takes as long as a small job."""
 
 AWAY = OSError, RuntimeError, AttributeError
 """What a client of Dask raises where its scheduler does not answer, while it gives it up, and once it has none."""
@@ -208,6 +211,7 @@ class DaskCluster:
             raise ConfigError(
                 f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
             ) from error
+        self._asked = 0.0
         self.width = self._threads() or 1
         self.name = f"Dask, {self.width} threads"
 
@@ -246,11 +250,13 @@ class DaskCluster:
                 self._client.cancel(list(futures))
 
     def _threads(self) -> int:
-        """Of the workers that there are now, which come and go; 0 where the scheduler does not answer."""
-        try:
-            self.width = max(1, sum(self._client.nthreads().values()))
-        except AWAY:
-            return 0
+        """Of the workers that there are now, or were a moment ago; 0 where the scheduler does not answer."""
+        if (now := time.monotonic()) - self._asked > MOMENT:
+            try:
+                self.width = max(1, sum(self._client.nthreads().values()))
+            except AWAY:
+                return 0
+            self._asked = now
         return self.width
 
     def close(self) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import rerun as rr
+from rerun.error_utils import RerunWarning
 
 from semstab.model.results import Unit
 from semstab.outputs.recording import series
@@ -23,7 +25,9 @@ def entities_of(unit: Unit, task: Task, *, pictures: bool) -> tuple[str, ...]:
 def copy(file: Path, stream: rr.RecordingStream, without: tuple[str, ...]) -> None:
     """Send a recording to another one, but for what these entities, and those below them, show in its course."""
     below = tuple(f"/{entity.lstrip('/')}/" for entity in without)
-    reader = rr.chunk.RrdReader(file)
+    with warnings.catch_warnings():  # while it is served a recording has no end
+        warnings.simplefilter("ignore", RerunWarning)
+        reader = rr.chunk.RrdReader(file)
     for store in reader.recordings():
         kept = (
             chunk

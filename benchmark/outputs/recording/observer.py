@@ -79,6 +79,7 @@ class Recording(Observer):
         self._plan: Plan
         self._tasks: dict[tuple[str, str], Task] = {}
         self._stream: rr.RecordingStream | None = None
+        self._server: rr.RecordingStream | None = None  # an earlier one, that serves what this one sends
         self._clock = Clock()
         self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
         self._origins: dict[str, npt.NDArray[np.int64]] = {}
@@ -147,17 +148,24 @@ class Recording(Observer):
         self._group.see(stream, frame, background)
 
     def unit_begun_again(self, unit: Unit) -> None:
-        """Take what was logged of its map out of the file; a viewer that follows the run has seen it."""
-        if self._stream is None or self._background is None or self._parts is not None or self.target.live:
+        """Go on in a recording that has nothing of its map, in place of this one: in the file and in a viewer."""
+        if self._stream is None or self._background is None or self._parts is not None:
             return
         task, pictures = self._tasks[unit.scene, unit.backbone], (unit.scene, unit.backbone) not in self._whole
+        before = self._stream
         self._background.close()
-        self._finish(self._stream)
+        if self.target.viewer == "serve":
+            self._server = self._server or before
+        if self.target.live:
+            before.send_recording_name("given up, and begun again in tiles")
+        self._finish(before)
         with atomic_path(self.target.file) as file:
-            self._stream = stream = dataclasses.replace(self.target, file=file).open()
+            target = dataclasses.replace(self.target, file=file, viewer=self.target.viewer_url)
+            self._stream = stream = target.open()
             given_up.copy(self.target.file, stream, given_up.entities_of(unit, task, pictures=pictures))
         self._background, self._group = Background(stream, self._clock), None
         self._send_blueprint(stream)
+        self.target.drop(before.get_recording_id())
 
     def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
         """Follow the part's map: pictures of drift wait in the folder until the parts are all there."""
@@ -277,6 +285,8 @@ class Recording(Observer):
                     stream.log(path(camera.scene.name, "log"), rr.TextLog(f"without colour: {camera.unread}"))
         finally:
             self._finish(stream)
+            if self._server is not None:
+                self._server.disconnect()
 
     def _finish(self, stream: rr.RecordingStream) -> None:
         """Write the file's end. Raises ConfigError where that fails: the disk is full, for example."""
@@ -289,7 +299,8 @@ class Recording(Observer):
                 " same command makes it again"
             ) from error
         finally:
-            stream.disconnect()
+            if stream is not self._server:
+                stream.disconnect()
 
     @property
     def _fused(self) -> GroupLog:

@@ -8,17 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import stretches
+from semstab.model.evidence import STRETCH, Evidence, stretches
 from semstab.model.measures import Beliefs, Voxels
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
+from semstab.statistics.correctness import judged_where, rule_means_of, rule_sums
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order import fusion_rules
 from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns, varying
 from semstab.statistics.order.p_values import PValues
+from semstab.statistics.patterns import Alike
+from semstab.statistics.ranks import ordered
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
 
@@ -54,7 +56,7 @@ class LogSums:
         seed: int,
     ) -> LogSums:
         """Of a map with its log, from what is known of one voxel of each kind."""
-        every, (table, events, truth, places) = kinds.every, vars(kinds.one).values()
+        every, (table, events, _, places) = kinds.every, vars(kinds.one).values()
         assert every.events is not None
         vary = varying(table, events)[0]
         rows, trend = trend_columns(table, drift)
@@ -70,7 +72,7 @@ class LogSums:
             PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
             trends.sum(axis=0),
             PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
-            _rules(table, events, truth),
+            _rules(kinds),
             *sampled(every.table, every.events, seed, vary if kinds.of is None else vary[kinds.of]),
         )
 
@@ -112,20 +114,36 @@ def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
     }
 
 
-def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
-    """(R, 2 + C), over the voxels with OP >= 2, some after the others."""
+def _rules(kinds: Kinds) -> Float64:
+    """(R, 2 + C), over the voxels with OP >= 2, by their patterns, some after the others."""
     _, *others = fusion_rules.RULES  # the map's own rule is the first
-    total, seen = np.zeros(()), np.flatnonzero(table.op >= 2)
+    (table, _, truth, _), patterns = vars(kinds.one).values(), kinds.patterns
+    assert patterns.events is not None
+    again = patterns.table.op >= 2
+    total, seen, number = np.zeros(()), np.flatnonzero(again), np.cumsum(again) - 1
+    rows = np.flatnonzero(table.op >= 2)
+    at = number[rows if patterns.of is None else patterns.of[rows]]
+    if len(seen) > STRETCH:
+        at, order = ordered(at)
+        rows = rows[order]
     for some in stretches(len(seen)):
-        own = seen[some]
-        part = Voxels(table.op[own], table.evidence.take(own), table.drift_sum[own])
-        usual, voxels = fusion_rules.labels(part.evidence), table.voxels[own]
-        known = None if truth is None else Truth(truth.known[own], truth.label[own])
+        own, one = seen[some], slice(None)
+        if len(seen) > STRETCH:
+            one = slice(*np.searchsorted(at, [some.start, some.stop]))
+        of = patterns.table.rows(own)
+        part = Voxels(of.op, of.evidence, of.drift_sum)
+        usual = fusion_rules.labels(part.evidence)
         by_rule: list[Beliefs] = [part]
-        by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
-        rows = []
+        by_rule += fusion_rules.fuse_all(patterns.events, others, evidence=part.evidence, rows=own)
+        alike = None
+        if truth is not None:
+            alike = Alike.of(part.evidence, at[one] - some.start, table, rows[one], truth.label[rows[one]])
+        sums = []
         for fused in by_rule:
-            relabelled = voxels.sum(where=fusion_rules.labels(fused.evidence) != usual)
-            rows.append(np.concatenate([[relabelled, voxels.sum()], rule_sums(fused, voxels, known)]))
-        total = total + np.stack(rows)
+            belief = Evidence.of(fused.evidence).measured()
+            relabelled = of.voxels.sum(where=fusion_rules.labels(belief) != usual)
+            sums.append([relabelled, of.voxels.sum(), *rule_sums(Voxels(of.op, belief, fused.drift_sum), of.voxels)])
+            if alike is not None:
+                sums[-1] += [*judged_where(alike.judged(belief), alike.truth >= 0)]
+        total = total + np.array(sums)
     return total

@@ -17,7 +17,8 @@ from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
-from semstab.statistics.order.drift import flips, voxel_drift
+from semstab.statistics.order.drift import VoxelDrift, flips, voxel_drift
+from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
@@ -118,7 +119,7 @@ def first_look(
     """
     kinds = kinds.measured()
     table, events = kinds.one.table, kinds.one.events
-    drift = None if events is None else voxel_drift(table, events, seed=seed, sample=0)
+    drift = None if events is None else _drift_of(kinds.patterns, seed)
     null = None if drift is None else drift.null
     own = MapSums.of(kinds, edges, null=null)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
@@ -134,3 +135,10 @@ def first_look(
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null
+
+
+def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
+    """Of all voxels (n,), from one of each pattern; their SBD itself is not tested."""
+    assert patterns.events is not None
+    drift = voxel_drift(patterns.table, patterns.events, seed=seed, sample=0)
+    return VoxelDrift(*(patterns.spread(values) for values in vars(drift).values()))

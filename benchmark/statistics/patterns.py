@@ -1,0 +1,120 @@
+"""What the same looks at other classes have in common is computed once: only the names of classes differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.model.concentration import Concentration
+from semstab.model.evidence import Evidence
+from semstab.model.voxels import Events, VoxelTable
+from semstab.statistics.correctness import Judged
+from semstab.statistics.order.fusion_rules import FLOOR
+
+Int64 = npt.NDArray[np.int64]
+
+LEAST = 2 * FLOOR
+"""Where a look gives a class less than this, a rule of fusion may take it for one that was never seen."""
+
+MOST = 0.75
+"""Patterns are looked for where there are at most so many for one voxel, else each voxel is looked at by itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patterns:
+    """The voxels of a map by their looks, where each class goes by its rank among those that a voxel ever saw.
+
+    table, events  one voxel of each pattern, of which `copies` are all of them, with its log
+    of             (n,) which of these stands for each voxel; None where they are the same
+    """
+
+    table: VoxelTable
+    events: Events | None
+    of: npt.NDArray[np.int32] | None = None
+
+    @classmethod
+    def found(cls, table: VoxelTable, events: Events | None) -> Patterns:
+        """Those of a table with its log; without one each voxel has its own."""
+        if events is None:
+            return cls(table, None)
+        from semstab.statistics.loops.orders import ENUMERATED
+        from semstab.statistics.loops.patterns import tell_patterns
+
+        rows, of = np.empty(int(MOST * len(table)), np.int64), np.empty(len(table), np.int32)
+        count = tell_patterns(
+            table.op,
+            (table.drift_sum, table.self_sum, table.frame_entropy_sum),
+            table.evidence.entries,
+            events.evidence.entries,
+            events.bounds,
+            table.K,
+            ENUMERATED,  # above, orders hang on the place
+            LEAST,
+            rows,
+            of,
+        )
+        if count < 0:
+            return cls(table, events)
+        rows = rows[:count].copy()
+        voxels = np.bincount(of, weights=table.voxels, minlength=count).astype(np.float64)
+        return cls(replace(table.rows(rows), copies=voxels), events.rows(rows), of)
+
+    def measured(self, table: VoxelTable) -> tuple[Patterns, VoxelTable]:
+        """The same, and the table that they are of, with what measures are functions of: see `VoxelTable.measured`."""
+        from semstab.statistics.loops.patterns import spread_labels
+
+        own = self.table.measured()
+        if self.of is None or table.evidence.known is not None:
+            return replace(self, table=own), table if self.of is not None else own
+        known, label = own.evidence.concentration, np.empty(len(table), np.uint16)
+        spread_labels(own.evidence.entries, known.label, self.of, *table.evidence.entries[:2], label)
+        largest, lead, bits, squares = (self.spread(v) for v in (known.largest, known.lead, known.bits, known.squares))
+        evidence = replace(table.evidence, known=Concentration(largest, lead, bits, label, squares))
+        return replace(self, table=own), replace(table, evidence=evidence)
+
+    def spread(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Values (n,) of all voxels from those (p,) of their patterns."""
+        return values if self.of is None else values[self.of]
+
+
+@dataclass(frozen=True, eq=False)
+class Alike:
+    """Voxels (n,) with beliefs (p, K) that are those of their patterns, and their true classes.
+
+    at      (n,) which of the beliefs each has
+    begins  (n,) where its own classes begin in the labels of all
+    place   (n,) where the true class stands among the classes of its beliefs, see `place_of`
+    voxels  (n,) how many each stands for
+    """
+
+    at: Int64
+    begins: Int64
+    labels: npt.NDArray[np.uint16]
+    truth: Int64
+    place: Int64
+    voxels: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, belief: Evidence, at: Int64, table: VoxelTable, rows: Int64, label: Int64) -> Alike:
+        """Some rows (n,) of a table with true classes (n,)."""
+        from semstab.statistics.loops.patterns import place_of
+
+        starts, labels, _ = table.evidence.entries
+        bounds, place = np.stack([starts[rows], starts[rows + 1]]), np.empty(len(rows), np.int64)
+        place_of(at, bounds, labels, label, belief.starts, place)
+        return cls(at, bounds[0], labels, label, place, table.voxels[rows])
+
+    def judged(self, belief: Evidence) -> Judged:
+        """These beliefs, or others about the same classes, beside the true classes."""
+        from semstab.statistics.loops.patterns import errors_of
+
+        found, rest = belief.concentration, np.zeros(0) if belief.unseen is None else belief.unseen
+        top, errors = np.empty(len(belief), np.int64), np.empty(len(belief.label) + len(belief))
+        errors_of(belief.entries, rest, found.label, belief.K, top, errors)
+        of = top[self.at]
+        predicted = self.labels[self.begins + of].astype(np.int64)
+        if (top < 0).any():  # a class that was never seen: no other voxel has the pattern
+            predicted = np.where(of < 0, found.label[self.at], predicted)
+        return Judged(self.truth, predicted, found.largest[self.at], errors[self.place], self.voxels, belief.K)
