@@ -36,16 +36,27 @@ class Concentration:
     squares: Float64
 
     @classmethod
-    def of(cls, starts: Int64, label: UInt16, weight: Float64, K: int, rest: Float64 | None = None) -> Concentration:
-        """Of entries as `Evidence` has them; rest (n,) is what each class without one has, 0 where it is not given."""
+    def of(
+        cls,
+        starts: Int64,
+        label: UInt16,
+        weight: Float64,
+        K: int,
+        rest: Float64 | None = None,
+        bits: Float64 | None = None,
+    ) -> Concentration:
+        """Of entries as `Evidence` has them; rest (n,) is what each class without one has, 0 where it is not given.
+
+        bits (n,) is the entropy, where that is known.
+        """
         from semstab.model.row_kernel import concentrate
 
         n = len(starts) - 1
-        largest, lead, bits, squares = (np.empty(n) for _ in range(4))
-        found = np.empty(n, np.uint16)
+        largest, lead, squares = (np.empty(n) for _ in range(3))
+        found, own = np.empty(n, np.uint16), np.empty(n) if bits is None else bits
         others = np.zeros(0) if rest is None else rest
-        concentrate(starts, label, weight, others, K, largest, lead, bits, found, squares)
-        return cls(largest, lead, bits, found, squares)
+        concentrate(starts, label, weight, others, K, bits is not None, largest, lead, own, found, squares)
+        return cls(largest, lead, own, found, squares)
 
     def take(self, rows: Any) -> Concentration:
         """Of some rows: a slice, their numbers, or a mask (n,)."""

@@ -16,6 +16,7 @@ def concentrate(
     weight: Any,
     rest: Any,
     K: int,
+    known: bool,
     largest: Any,
     lead: Any,
     bits: Any,
@@ -24,7 +25,8 @@ def concentrate(
 ) -> None:
     """Fill largest, lead, bits, dominant and squares (n,), see `Concentration`.
 
-    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty.
+    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty. Where bits are
+    known they are left as they are.
     """
     for i in range(starts.shape[0] - 1):
         first, end = starts[i], starts[i + 1]
@@ -47,7 +49,10 @@ def concentrate(
             elif unseen > second:
                 second = unseen
         squares[i], dominant[i] = square, best
-        largest[i], lead[i], bits[i] = top / total, top / total - second / total, 0.0
+        largest[i], lead[i] = top / total, top / total - second / total
+        if known:
+            continue
+        bits[i] = 0.0
         if end - first > 1 or unseen > 0.0:
             spread = 0.0
             for e in range(first, end):

@@ -104,7 +104,8 @@ class Alike:
         starts, labels, _ = table.evidence.entries
         bounds, place = np.stack([starts[rows], starts[rows + 1]]), np.empty(len(rows), np.int64)
         place_of(at, bounds, labels, label, belief.starts, place)
-        return cls(at, bounds[0], labels, label, place, table.voxels[rows])
+        voxels = np.ones(len(rows)) if table.copies is None else table.copies[rows]
+        return cls(at, bounds[0], labels, label, place, voxels)
 
     def judged(self, belief: Evidence) -> Judged:
         """These beliefs, or others about the same classes, beside the true classes."""

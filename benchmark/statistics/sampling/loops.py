@@ -95,7 +95,8 @@ def _add_truth(sums, base, rows, first, T, many, group, truth, likely, total, ac
         lead = min(lead, total[label] - total[active[j]]) if active[j] != label else lead
     for t in range(T):
         most = max(most, rows[t, label])
-    if lead > most + TIE:  # whichever is left out
+    settled = lead > most + TIE  # whichever is left out
+    if settled:
         without[:T] = label
         mean[label] = 1.0
     else:
@@ -116,9 +117,12 @@ def _add_truth(sums, base, rows, first, T, many, group, truth, likely, total, ac
         if K:
             sums[r, column + 6 + truth] += share
             sums[r, column + 6 + K + truth] += own
-            for j in range(A):
+            predicted = column + 6 + 2 * K
+            sums[r, predicted + label] += (1.0 + (T - 1) * (mean[label] - (without[t] == label))) * share
+            for j in range(0 if settled else A):
                 k = active[j]
-                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) * share
+                if k != label and mean[k] > 0.0:
+                    sums[r, predicted + k] += (T - 1) * (mean[k] - (without[t] == k)) * share
 
 
 @serial

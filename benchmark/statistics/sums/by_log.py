@@ -131,7 +131,7 @@ def _rules(kinds: Kinds) -> Float64:
         if len(seen) > STRETCH:
             one = slice(*np.searchsorted(at, [some.start, some.stop]))
         of = patterns.table.rows(own)
-        part = Voxels(of.op, of.evidence, of.drift_sum)
+        part, voxels = Voxels(of.op, of.evidence, of.drift_sum), of.voxels
         usual = fusion_rules.labels(part.evidence)
         by_rule: list[Beliefs] = [part]
         by_rule += fusion_rules.fuse_all(patterns.events, others, evidence=part.evidence, rows=own)
@@ -141,8 +141,8 @@ def _rules(kinds: Kinds) -> Float64:
         sums = []
         for fused in by_rule:
             belief = Evidence.of(fused.evidence).measured()
-            relabelled = of.voxels.sum(where=fusion_rules.labels(belief) != usual)
-            sums.append([relabelled, of.voxels.sum(), *rule_sums(Voxels(of.op, belief, fused.drift_sum), of.voxels)])
+            relabelled = voxels.sum(where=fusion_rules.labels(belief) != usual)
+            sums.append([relabelled, voxels.sum(), *rule_sums(Voxels(of.op, belief, fused.drift_sum), voxels)])
             if alike is not None:
                 sums[-1] += [*judged_where(alike.judged(belief), alike.truth >= 0)]
         total = total + np.array(sums)
