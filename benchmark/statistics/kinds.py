@@ -56,8 +56,8 @@ class Kinds:
     @classmethod
     def found(cls, table: VoxelTable, events: Events | None = None, truth: Truth | None = None) -> Kinds:
         """Those of a table, of its log, and of its true classes."""
+        from semstab.statistics.loops.few_looks import ENUMERATED
         from semstab.statistics.loops.kinds import tell_apart
-        from semstab.statistics.loops.orders import ENUMERATED
 
         every = Known(table, events, truth, Places.of(table))
         most, of, none = len(table) // FEW, np.empty(len(table), np.int32), np.zeros(0, np.int64)

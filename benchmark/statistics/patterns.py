@@ -39,7 +39,7 @@ class Patterns:
         """Those of a table with its log; without one each voxel has its own."""
         if events is None:
             return cls(table, None)
-        from semstab.statistics.loops.orders import ENUMERATED
+        from semstab.statistics.loops.few_looks import ENUMERATED
         from semstab.statistics.loops.patterns import tell_patterns
 
         rows, of = np.empty(int(MOST * len(table)), np.int64), np.empty(len(table), np.int32)

@@ -8,7 +8,7 @@ import functools
 import logging
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,7 @@ class Recording(Observer):
             scene: Legend(task.mapping.target for task in plan.tasks if task.scene.name == scene)
             for scene in self._known.chunks
         }
-        unmerged = self._run is not None and (self._run / RECORDING_PARTS).exists()
+        unmerged = self._run is not None and any((self._run / RECORDING_PARTS).glob("*.rrd"))
         self._cut = unmerged or not is_whole(self.target.file)
 
     def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
@@ -166,6 +166,10 @@ class Recording(Observer):
         self._background, self._group = Background(stream, self._clock), None
         self._send_blueprint(stream)
         self.target.drop(before.get_recording_id())
+
+    def unit_in_tiles(self, unit: Unit, key: str, parts: Collection[str]) -> None:
+        """Keep what an earlier start left of its parts."""
+        self._drift.keep(unit, key, parts)
 
     def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
         """Follow the part's map: pictures of drift wait in the folder until the parts are all there."""
@@ -275,8 +279,6 @@ class Recording(Observer):
         stream, self._stream = self._stream, None
         if stream is None:
             return
-        if self._parts is None and not self.pictures_only:
-            self._drift.remove()
         try:
             if self._background is not None:
                 self._background.close()
@@ -400,6 +402,7 @@ class Recording(Observer):
             group.log_flips(stream, self._clock, suspects)
         if group is not None:
             self._whole.add(place)
+        self._drift.remove(summary.unit)
 
     def _follow(self, stream: rr.RecordingStream, task: Task, *, log: bool) -> None:
         """Know where the camera was in frames that are not logged here, and log the track where nobody else does."""

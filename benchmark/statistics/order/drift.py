@@ -6,6 +6,7 @@ less. So it is compared with what a random order of the very same observations g
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -174,9 +175,9 @@ class _Orders:
     @property
     def many(self) -> npt.NDArray[np.bool_]:
         """(n,) whether there are too many orders to go through all of them."""
-        from semstab.statistics.loops import orders
+        from semstab.statistics.loops.few_looks import ENUMERATED
 
-        above: npt.NDArray[np.bool_] = self.T > orders.ENUMERATED
+        above: npt.NDArray[np.bool_] = self.T > ENUMERATED
         return above
 
     def part(self, which: Int64) -> _Orders:
@@ -192,12 +193,20 @@ class _Orders:
         self, known: npt.NDArray[np.bool_], draws: int, most: int, enough: int
     ) -> tuple[Float64, Float64, Float64]:
         """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
-        from semstab.statistics.loops import chunks, orders
+        from semstab.statistics.loops import chunks, few_looks, orders
 
         n = len(self.T)
-        trend, null, p = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
-        chunks.in_chunks(orders.measure_voxels, *self._shared(), known, draws, most, enough, trend, null, p)
-        return trend, null, p
+        found = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
+        rank, *shared = self._shared()
+        bounds = np.searchsorted(self.T, np.arange(2, few_looks.ENUMERATED + 2), sorter=rank)
+        for T, (begin, end) in enumerate(itertools.pairwise(bounds), 2):
+            orders_of = few_looks.orders_and_steps(T)
+            log, K, entries = shared[2:5]
+            chunks.in_chunks(few_looks.measure_few, rank[begin:end], self.first, T, log, K, entries, *orders_of, *found)
+        if bounds[-1] < n:
+            rank = rank[bounds[-1] :]
+            chunks.in_chunks(orders.measure_voxels, rank, *shared, known, draws, most, enough, *found)
+        return found
 
     def test(self, which: Int64, most: int, enough: int) -> Float64:
         """P-values (r,) of the drifts of the voxels of these numbers."""
@@ -227,14 +236,14 @@ def drawn(table: VoxelTable, vary: npt.NDArray[np.bool_], observations: int, see
     They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
     what is drawn of a map is drawn of any part of it that holds it.
     """
-    from semstab.statistics.loops import orders
+    from semstab.statistics.loops.few_looks import ENUMERATED
 
     rows = np.flatnonzero(vary)
     own, T = streams(table, rows, seed), table.op[rows].astype(np.int64)
     order = lowest(own, observations // 2 + 1)  # each has two or more
     enough, many = (
         order[: np.searchsorted(np.cumsum(T[order]), observations) + 1],
-        np.flatnonzero(T > orders.ENUMERATED),
+        np.flatnonzero(T > ENUMERATED),
     )
     return rows[np.union1d(enough, many[lowest(own[many], DRIFT_SAMPLE)])]
 
