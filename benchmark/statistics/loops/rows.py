@@ -52,6 +52,19 @@ def add_class_sums(evidence, op, voxels, exact, bounds, log, sums):
 
 
 @serial
+def majorities(evidence, share, found):
+    """The class (n,) that has more than this share of a row's evidence, at least a half; -1 where none has."""
+    starts, label, weight = evidence
+    for i in range(found.shape[0]):
+        first, end = starts[i], starts[i + 1]
+        total, best = 0.0, first
+        for e in range(first, end):
+            total += weight[e]
+            best = e if weight[e] > weight[best] else best
+        found[i] = label[best] if first < end and weight[best] / total > share else -1
+
+
+@serial
 def square_errors(evidence, rest, K, truth, errors):
     """Squared distance (n,) of each belief from certainty of the true class (n,); rest as in `concentrate`."""
     starts, label, weight = evidence

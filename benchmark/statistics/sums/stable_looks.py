@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events
 from semstab.statistics.kinds import Kinds
@@ -49,17 +48,17 @@ class StableLooks:
         one = kinds.one
         assert one.truth is not None
         counted = np.flatnonzero(one.truth.known & (one.table.op >= RECURRENT))
-        some, edge = one.table.rows(counted), one.places.edge
+        evidence, edge = one.table.evidence.concentration, one.places.edge
         cell, of = one.places.cell, one.places.at[counted]
-        T, wrong = some.op.astype(np.int64), dominant(some) != one.truth.label[counted]
+        T, wrong = one.table.op[counted].astype(np.int64), evidence.label[counted] != one.truth.label[counted]
         longest = int(T.max(initial=0)) + 1
-        packed = ((of * longest + T) * longest + np.rint(vss(some) * T).astype(np.int64)) * 2 + wrong
+        packed = ((of * longest + T) * longest + np.rint(evidence.largest[counted] * T).astype(np.int64)) * 2 + wrong
         votings, voting = numbered(packed)
         pairs, is_wrong = np.divmod(votings, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
         keys = np.column_stack([cell[ofs], np.full(len(votings), -1), *np.divmod(votes, longest), is_wrong])
         if one.events is None:
-            count = np.bincount(voting, weights=some.voxels, minlength=len(votings))
+            count = np.bincount(voting, weights=one.table.voxels[counted], minlength=len(votings))
             return cls(keys.astype(np.int32), count.astype(np.float64), edge, 0)
         groups, group = frame_groups(one.events.frame, step)
         of = np.full(len(one.table), -1)
