@@ -65,6 +65,16 @@ class TiledUnit:
         """What the progress calls it."""
         return f"{self.planned.unit.scene} · {self.planned.unit.backbone}"
 
+    @property
+    def key(self) -> str:
+        """Under which it is kept."""
+        return self._key
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of its parts that are finished."""
+        return [name for name, each in self._there.items() if each.about.kind == PART]
+
     def step(self) -> int:
         """The frames that the portion which is finished now stands for."""
         return next(self._steps, 0)

@@ -18,6 +18,10 @@ BLOCK = 1 << 13
 """Rows that are added one after the other."""
 
 
+APART = 8
+"""Columns of a block begin as many numbers further: a power of 2 apart, a core's cache has no room for many of them."""
+
+
 @dataclass(frozen=True, eq=False)
 class Concentration:
     """Of rows of evidence e (n, K), in one pass over their entries; p is e scaled to sum to 1.
@@ -79,7 +83,8 @@ def by_group(
 
     def of(some: slice) -> Float64:
         part = np.zeros((2, groups, len(values)))
-        own = np.stack([column[some] for column in values], dtype=np.float64)
+        room = np.empty((len(values), some.stop - some.start + APART))
+        own = np.stack([column[some] for column in values], out=room[:, :-APART])
         many = ones[: own.shape[1]] if voxels is None else voxels[some]
         add_by_group(group[some].astype(np.int64, copy=False), own, many, *part)
         return part

@@ -9,8 +9,9 @@ import numpy.typing as npt
 
 from semstab.model.concentration import Concentration
 from semstab.model.evidence import Evidence
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import Judged
+from semstab.statistics.observed import Observed
 from semstab.statistics.order.fusion_rules import FLOOR
 
 Int64 = npt.NDArray[np.int64]
@@ -26,18 +27,18 @@ MOST = 0.75
 class Patterns:
     """The voxels of a map by their looks, where each class goes by its rank among those that a voxel ever saw.
 
-    table, events  one voxel of each pattern, of which `copies` are all of them, with its log
-    of             (n,) which of these stands for each voxel; None where they are the same
+    table, log  one voxel of each pattern, of which `copies` are all of them, with its observations
+    of          (n,) which of these stands for each voxel; None where they are the same
     """
 
     table: VoxelTable
-    events: Events | None
+    log: Observed | None
     of: npt.NDArray[np.int32] | None = None
 
     @classmethod
-    def found(cls, table: VoxelTable, events: Events | None) -> Patterns:
+    def found(cls, table: VoxelTable, log: Observed | None) -> Patterns:
         """Those of a table with its log; without one each voxel has its own."""
-        if events is None:
+        if log is None:
             return cls(table, None)
         from semstab.statistics.loops.few_looks import ENUMERATED
         from semstab.statistics.loops.patterns import tell_patterns
@@ -47,8 +48,9 @@ class Patterns:
             table.op,
             (table.drift_sum, table.self_sum, table.frame_entropy_sum),
             table.evidence.entries,
-            events.evidence.entries,
-            events.bounds,
+            log.evidence.entries,
+            log.starts,
+            log.ends,
             table.K,
             ENUMERATED,  # above, orders hang on the place
             LEAST,
@@ -56,10 +58,10 @@ class Patterns:
             of,
         )
         if count < 0:
-            return cls(table, events)
+            return cls(table, log)
         rows = rows[:count].copy()
         voxels = np.bincount(of, weights=table.voxels, minlength=count).astype(np.float64)
-        return cls(replace(table.rows(rows), copies=voxels), events.rows(rows), of)
+        return cls(replace(table.rows(rows), copies=voxels), log.rows(rows), of)
 
     def measured(self, table: VoxelTable) -> tuple[Patterns, VoxelTable]:
         """The same, and the table that they are of, with what measures are functions of: see `VoxelTable.measured`."""

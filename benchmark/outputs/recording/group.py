@@ -13,7 +13,8 @@ import rerun as rr
 from semstab.backends import GrowingMap
 from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame
-from semstab.model.results import Unit
+from semstab.model.measures import measures
+from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import series
 from semstab.outputs.recording.background import Background
@@ -27,6 +28,7 @@ from semstab.outputs.recording.drift_parts import Picture
 from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.layout import drawn, is_pointwise
 from semstab.outputs.recording.maps import drift_colors
+from semstab.outputs.recording.maps.agreement import looks_report
 from semstab.outputs.recording.maps.difference import log_difference
 from semstab.outputs.recording.maps.flips import FlipLog, Suspect
 from semstab.outputs.recording.maps.tracker import FrameDrift, Tracker
@@ -121,6 +123,14 @@ class GroupLog:
                 self._compare(stream, first, backend, tolerance)
         self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
 
+    def log_numbers(self, stream: rr.RecordingStream, summary: UnitSummary) -> None:
+        """Log the final numbers of a unit, and what its frames agree on."""
+        text = final(summary) + self.remarks.get(summary.unit.backend, "")
+        stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
+        if summary.statistics is not None:
+            document = rr.TextDocument(looks_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
+            stream.log(path(summary.unit.scene, "agreement", summary.unit.backbone), document, static=True)
+
     def log_flips(self, stream: rr.RecordingStream, clock: Clock, suspects: list[Suspect] | None = None) -> None:
         """Log which frames changed the voxels that drifted most: those that are said to, of a map in tiles."""
         suspects = list(self._flips.suspects(self._tracker)) if suspects is None else suspects
@@ -174,3 +184,13 @@ class GroupLog:
             entity = path(self.task.scene.name, "map", self.task.backbone, backend)
             self._maps[backend] = MapLog(entity, self._classes, self.origin, len(self.task.indices))
         return self._maps[backend]
+
+
+def final(summary: UnitSummary) -> str:
+    """Its numbers, in a line."""
+    unit, table = summary.unit, summary.table
+    means = (f"{m.symbol} {table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
+    return (
+        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, {', '.join(means)}"
+        f" (K = {table.K})"
+    )

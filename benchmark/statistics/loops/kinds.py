@@ -48,6 +48,8 @@ def number_block(some, first, last, keys, kinds, rows, of, found):
     are hardly fewer than voxels.
     """
     for i in range(first, last):
+        touch(keys, max(kinds[np.int64(some[i - first, 0]) & (kinds.shape[0] - 1)], 0))
+    for i in range(first, last):
         key = some[i - first]
         slot = _kind_of(key, keys, kinds)
         if kinds[slot] < 0:

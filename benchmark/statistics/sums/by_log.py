@@ -56,9 +56,9 @@ class LogSums:
         seed: int,
     ) -> LogSums:
         """Of a map with its log, from what is known of one voxel of each kind."""
-        every, (table, events, _, places) = kinds.every, vars(kinds.one).values()
-        assert every.events is not None
-        vary = varying(table, events)[0]
+        every, (table, seen, _, places) = kinds.every, vars(kinds.one).values()
+        assert every.log is not None
+        vary = varying(table, seen)[0]
         rows, trend = trend_columns(table, drift)
         means = {
             "flip_rate": changes.rate,
@@ -73,7 +73,7 @@ class LogSums:
             trends.sum(axis=0),
             PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
             _rules(kinds),
-            *sampled(every.table, every.events, seed, vary if kinds.of is None else vary[kinds.of]),
+            *sampled(every.table, every.log.events, seed, vary if kinds.of is None else vary[kinds.of]),
         )
 
     @classmethod
@@ -118,7 +118,7 @@ def _rules(kinds: Kinds) -> Float64:
     """(R, 2 + C), over the voxels with OP >= 2, by their patterns, some after the others."""
     _, *others = fusion_rules.RULES  # the map's own rule is the first
     (table, _, truth, _), patterns = vars(kinds.one).values(), kinds.patterns
-    assert patterns.events is not None
+    assert patterns.log is not None
     again = patterns.table.op >= 2
     total, seen, number = np.zeros(()), np.flatnonzero(again), np.cumsum(again) - 1
     rows = np.flatnonzero(table.op >= 2)
@@ -134,7 +134,7 @@ def _rules(kinds: Kinds) -> Float64:
         part, voxels = Voxels(of.op, of.evidence, of.drift_sum), of.voxels
         usual = fusion_rules.labels(part.evidence)
         by_rule: list[Beliefs] = [part]
-        by_rule += fusion_rules.fuse_all(patterns.events, others, evidence=part.evidence, rows=own)
+        by_rule += fusion_rules.fuse_all(patterns.log, others, evidence=part.evidence, rows=own)
         alike = None
         if truth is not None:
             alike = Alike.of(part.evidence, at[one] - some.start, table, rows[one], truth.label[rows[one]])
