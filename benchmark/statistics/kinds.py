@@ -81,9 +81,9 @@ class Kinds:
         )
         if count < 0:
             return cls(every, every, Patterns.found(table, every.log))
-        rows, voxels = rows[:count].copy(), voxels[:count].copy()
+        rows, voxels, pixels = rows[:count], voxels[:count], pixels[:count]  # what is not written takes no memory
         one = Known(
-            replace(table.rows(rows), copies=voxels, pixels=pixels[:count].copy()),
+            replace(table.rows(rows), copies=voxels, pixels=pixels),
             None if every.log is None else every.log.rows(rows),
             None if truth is None else Truth(truth.known[rows], truth.label[rows]),
             replace(every.places, at=every.places.at[rows], voxels=voxels),

@@ -120,13 +120,13 @@ def first_look(
     kinds = kinds.measured()
     table, seen = kinds.one.table, kinds.one.log
     drift = None if seen is None else _drift_of(kinds.patterns, seed)
-    null = None if drift is None else drift.null
+    null = None if drift is None else kinds.patterns.spread(drift.null)
     own = MapSums.of(kinds, edges, null=null)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if seen is not None and drift is not None:
         changes = flips(seen)
         log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(drift, changes) | more
+        more = log_maps(kinds.patterns, drift, changes) | more
     found = FirstSums(
         own,
         Votes.of(table),
@@ -138,7 +138,6 @@ def first_look(
 
 
 def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
-    """Of all voxels (n,), from one of each pattern; their SBD itself is not tested."""
+    """Of one voxel of each pattern (p,); their SBD itself is not tested."""
     assert patterns.log is not None
-    drift = voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)
-    return VoxelDrift(*(patterns.spread(values) for values in vars(drift).values()))
+    return voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)
