@@ -115,7 +115,7 @@ def test_blocks_of_which_frames_see_little_take_as_much_as_full_ones() -> None:
     """Pixels further apart than voxels; the map had to grow."""
     side = 100
     frame = Frame(
-        0, np.full((side, side), 30.0), Intrinsics(100, 100, 50, 50), np.eye(4), np.zeros((side, side), "uint8")
+        0, np.full((side, side), 30.0), Intrinsics(30, 30, 50, 50), np.eye(4), np.zeros((side, side), "uint8")
     )
     backend = create("open3d", voxel_size=0.2, num_classes=7)
     seen = backend.integrate(frame).map_voxels

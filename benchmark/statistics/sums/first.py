@@ -17,8 +17,7 @@ from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
-from semstab.statistics.order.drift import VoxelDrift, flips, voxel_drift
-from semstab.statistics.patterns import Patterns
+from semstab.statistics.order.drift import flips, untested_drift
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
@@ -119,14 +118,15 @@ def first_look(
     """
     kinds = kinds.measured()
     table, seen = kinds.one.table, kinds.one.log
-    drift = None if seen is None else _drift_of(kinds.patterns, seed)
-    null = None if drift is None else kinds.patterns.spread(drift.null)
+    patterns = kinds.patterns
+    drift = None if patterns.log is None else untested_drift(patterns.table, patterns.log, seed=seed)
+    null = None if drift is None else patterns.spread(drift.null)
     own = MapSums.of(kinds, edges, null=null)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if seen is not None and drift is not None:
         changes = flips(seen)
         log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(kinds.patterns, drift, changes) | more
+        more = log_maps(patterns, drift, changes) | more
     found = FirstSums(
         own,
         Votes.of(table),
@@ -135,9 +135,3 @@ def first_look(
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null
-
-
-def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
-    """Of one voxel of each pattern (p,); their SBD itself is not tested."""
-    assert patterns.log is not None
-    return voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)
