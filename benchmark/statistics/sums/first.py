@@ -17,7 +17,8 @@ from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
-from semstab.statistics.order.drift import VoxelDrift, flips, voxel_drift
+from semstab.statistics.observed import Log
+from semstab.statistics.order.drift import Flips, VoxelDrift, changes, flips_of, voxel_drift
 from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.steady import Votes
@@ -124,9 +125,9 @@ def first_look(
     own = MapSums.of(kinds, edges, null=null)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if seen is not None and drift is not None:
-        changes = flips(seen)
-        log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(kinds.patterns, drift, changes) | more
+        changed = _flips_of(kinds.patterns, seen)
+        log = LogSums.of(kinds, drift, changed, seed)
+        more = log_maps(kinds.patterns, drift, changed) | more
     found = FirstSums(
         own,
         Votes.of(table),
@@ -141,3 +142,9 @@ def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
     """Of one voxel of each pattern (p,); their SBD itself is not tested."""
     assert patterns.log is not None
     return voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)
+
+
+def _flips_of(patterns: Patterns, seen: Log) -> Flips:
+    """Of all voxels (n,), whose log is `seen`."""
+    assert patterns.log is not None
+    return flips_of(seen, *(patterns.spread(values) for values in changes(patterns.log)))
