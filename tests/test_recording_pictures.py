@@ -561,6 +561,18 @@ def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles
     assert all(drawn(folder) == expected for folder in tiles)
 
 
+def test_an_interrupted_run_in_tiles_is_recorded_as_one_in_one_go(tiles) -> None:
+    """Each entity has the same frames."""
+    once, _, resumed = (read(folder / "recording.rrd") for folder in tiles)
+    assert resumed.keys() == once.keys()
+    for entity, rows in once.items():
+        assert frames_in(resumed[entity]) == frames_in(rows), entity
+
+
+def frames_in(rows: list[dict[str, Any]]) -> list[int]:
+    return sorted(row["frame"] for row in rows if "frame" in row)
+
+
 def test_the_voxels_that_drifted_most_are_those_of_the_whole_map(compared, tiles) -> None:
     def flips_of(folder: Path) -> dict[str, list[dict[str, Any]]]:
         entities = read(folder / "recording.rrd")
