@@ -60,7 +60,7 @@ class MapSums:
         null (n,) is the SBD of one voxel of each kind in random order, which comes with a log. How likely places are
         stable only the whole map tells: `StableLooks`.
         """
-        one, log = kinds.one, kinds.every.events
+        one, log = kinds.one, kinds.every.log
         alone = log is None and one.truth is None
         parts = (
             cls._of_few(one.table.rows(some), one.places.rows(some), None if null is None else null[some], edges, alone)
@@ -72,14 +72,14 @@ class MapSums:
         excess = sbd(one.table) - (expected_sbd(one.table) if null is None else null)
         influence = with_places(
             of_table(one.table, one.places, one.label)
-            if log is None or one.events is None
-            else of_log(one.events, one.places, one.label, step=frame_step(log)),
+            if log is None or one.log is None
+            else of_log(one.log, one.places, one.label, step=frame_step(log)),
             one.table,
             one.places,
             one.label,
             excess,
         )
-        return replace(found, classes=class_sums(one.table, one.events), influence=influence)
+        return replace(found, classes=class_sums(one.table, one.log), influence=influence)
 
     @classmethod
     def _of_few(

@@ -86,6 +86,11 @@ class Events:
         """(n,) first row of each voxel."""
         return self.bounds[:-1]
 
+    @property
+    def ends(self) -> Int64:
+        """(n,) the row after each voxel's last."""
+        return self.bounds[1:]
+
     def table(self) -> VoxelTable:
         """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
         parts = [log._columns() for log in self._few_at_a_time()]

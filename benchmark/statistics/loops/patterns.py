@@ -14,7 +14,7 @@ TRIAL = 1 << 14
 
 
 @serial
-def tell_patterns(op, sums, evidence, log, bounds, K, longest, least, rows, of):
+def tell_patterns(op, sums, evidence, log, begins, lasts, K, longest, least, rows, of):
     """Which pattern (n,) each voxel has, and the first voxel (p,) of each.
 
     Voxels of one pattern agree in OP, sums (drift, ||s||^2 and entropy of the frames) and all observations, when each
@@ -39,10 +39,10 @@ def tell_patterns(op, sums, evidence, log, bounds, K, longest, least, rows, of):
             key = hashed_with(hashed_with(key, of_squares[i], 1), of_entropy[i], 2)
             if longest < T and (starts[i + 1] - starts[i] > 1 or total[starts[i]] != T or squares[i] != T):
                 key = hashed_with(key, np.uint64(i), 3)
-            for t in range(bounds[i], bounds[i + 1]):
-                key = hashed_with(key, np.uint64(ends[t + 1] - ends[t]), 4 + t - bounds[i])
-            before = ends[bounds[i]] - 1
-            for e in range(ends[bounds[i]], ends[bounds[i + 1]]):
+            for t in range(begins[i], lasts[i]):
+                key = hashed_with(key, np.uint64(ends[t + 1] - ends[t]), 4 + t - begins[i])
+            before = ends[begins[i]] - 1
+            for e in range(ends[begins[i]], ends[lasts[i]]):
                 key = hashed_with(key, bits[e] * FACTORS[2] + np.uint64(rank[classes[e]]), before - e)
                 named |= weights[e] < least
             if named:

@@ -24,11 +24,11 @@ def add_classes(of, evidence, op, voxels, by_look, by_place):
 
 
 @serial
-def add_class_sums(evidence, op, voxels, exact, bounds, log, sums):
+def add_class_sums(evidence, op, voxels, exact, first, last, log, sums):
     """Add to sums (5, K), over voxels with OP >= 2: evidence, that / OP, disagreement, that * OP, squares.
 
-    Where exact (n,) holds the evidence is the sum of its squares too, else the log tells, whose rows bounds (n + 1,)
-    are a voxel's. Classes that nobody saw in a voxel are no disagreement there.
+    Where exact (n,) holds the evidence is the sum of its squares too, else the log tells, in which a voxel has the rows
+    from first (n,) to before last (n,). Classes that nobody saw in a voxel are no disagreement there.
     """
     starts, label, weight = evidence
     squares = np.zeros(sums.shape[1])
@@ -37,7 +37,7 @@ def add_class_sums(evidence, op, voxels, exact, bounds, log, sums):
         if T < 2.0:
             continue
         if not exact[i]:
-            for e in range(log[0][bounds[i]], log[0][bounds[i + 1]]):
+            for e in range(log[0][first[i]], log[0][last[i]]):
                 squares[log[1][e]] += log[2][e] * log[2][e]
         for entry in range(starts[i], starts[i + 1]):
             k, own = label[entry], weight[entry]

@@ -16,23 +16,23 @@ AVERAGING, MAJORITY, PRODUCT, GEOMETRIC = range(4)
 
 
 @serial
-def count_classes(chunk, starts, log, K, count):
+def count_classes(chunk, starts, ends, log, K, count):
     """How many classes each voxel ever saw: count[1:] of (n + 1,)."""
     seen = np.full(K, -1)
-    for i in range(chunk, starts.shape[0] - 1, CHUNKS):
-        for e in range(log[0][starts[i]], log[0][starts[i + 1]]):
+    for i in range(chunk, starts.shape[0], CHUNKS):
+        for e in range(log[0][starts[i]], log[0][ends[i]]):
             k = log[1][e]
             count[i + 1] += 1 if seen[k] != i else 0
             seen[k] = i
 
 
 @serial
-def list_classes(chunk, starts, log, K, first, label):
+def list_classes(chunk, starts, ends, log, K, first, label):
     """The classes that each voxel ever saw, ascending: label[first[i] : first[i + 1]]."""
     seen = np.full(K, -1)
-    for i in range(chunk, starts.shape[0] - 1, CHUNKS):
+    for i in range(chunk, starts.shape[0], CHUNKS):
         used = first[i]
-        for e in range(log[0][starts[i]], log[0][starts[i + 1]]):
+        for e in range(log[0][starts[i]], log[0][ends[i]]):
             k = log[1][e]
             if seen[k] != i:
                 seen[k] = i

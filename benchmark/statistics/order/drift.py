@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from semstab.errors import ConfigError
 from semstab.model.measures import Quantity, sbd
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
@@ -95,7 +96,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
 def voxel_drift(
     table: VoxelTable,
-    events: Events,
+    events: Log,
     *,
     seed: int = 0,
     draws: int = NULL_DRAWS,
@@ -133,7 +134,7 @@ def voxel_drift(
     )
 
 
-def drift_p(table: VoxelTable, events: Events, *, seed: int = 0) -> Float64:
+def drift_p(table: VoxelTable, events: Log, *, seed: int = 0) -> Float64:
     """Of `voxel_drift` p_value (n,) alone."""
     orders = _Orders.of(table, events, seed)
     p, few = np.full(len(orders.T), np.nan), np.flatnonzero(~orders.many)
@@ -164,7 +165,7 @@ class _Orders:
     seed: np.uint64
 
     @classmethod
-    def of(cls, table: VoxelTable, events: Events, seed: int) -> _Orders:
+    def of(cls, table: VoxelTable, events: Log, seed: int) -> _Orders:
         spread = variation(table)
         vary = _vary(table, spread)
         T = table.op[vary].astype(np.int64)
@@ -264,14 +265,13 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]
     return rows, np.stack(parts, axis=1) * variation(table)[rows, None]
 
 
-def flips(events: Events) -> Flips:
+def flips(events: Log) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
     from semstab.statistics.loops import chunks, log_kernels
 
-    bounds = events.bounds
-    rate, null, since = (np.empty(len(events.ix)) for _ in range(3))
-    log = events.evidence
-    chunks.in_chunks(log_kernels.count_flips, bounds, events.frame, log.entries, log.K, rate, null, since)
+    rate, null, since = (np.empty(len(events.starts)) for _ in range(3))
+    log, rows = events.evidence, (events.starts, events.ends)
+    chunks.in_chunks(log_kernels.count_flips, *rows, events.frame, log.entries, log.K, rate, null, since)
     return Flips(rate, null, since)
 
 
@@ -281,7 +281,7 @@ def variation(table: VoxelTable) -> Float64:
     return np.maximum(squares, 0.0)
 
 
-def varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
+def varying(table: VoxelTable, events: Log) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
     """The voxels (n,) whose observations differ, with their first rows and OP; the others cannot drift."""
     vary = _vary(table, variation(table))
     return vary, events.starts[vary], table.op[vary].astype(np.int64)

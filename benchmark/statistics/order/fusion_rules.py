@@ -12,6 +12,7 @@ from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
@@ -79,7 +80,7 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
 
 
 def fuse_all(
-    events: Events,
+    events: Log,
     rules: Sequence[str],
     *,
     floor: float | None = None,
@@ -96,7 +97,7 @@ def fuse_all(
 
     K, log = events.evidence.K, events.evidence.entries
     first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
-    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.bounds[1:]))
+    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.ends))
     belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(starts), len(starts)))
     op, count = ends - starts, np.diff(first)
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
@@ -108,17 +109,17 @@ def fuse_all(
     ]
 
 
-def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
+def classes_seen(events: Log) -> tuple[Int64, npt.NDArray[np.uint16]]:
     """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
 
-    bounds, log = events.bounds, events.evidence.entries
-    count = np.zeros(len(bounds), np.int64)
-    chunks.in_chunks(loops.count_classes, bounds, log, events.evidence.K, count)
+    bounds, log = (events.starts, events.ends), events.evidence.entries
+    count = np.zeros(len(events.starts) + 1, np.int64)
+    chunks.in_chunks(loops.count_classes, *bounds, log, events.evidence.K, count)
     first: Int64 = np.cumsum(count)
     label = np.zeros(first[-1], np.uint16)
-    chunks.in_chunks(loops.list_classes, bounds, log, events.evidence.K, first, label)
+    chunks.in_chunks(loops.list_classes, *bounds, log, events.evidence.K, first, label)
     return first, label
 
 

@@ -13,6 +13,7 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import SPARSE, distinct, ranked
 from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
@@ -74,7 +75,7 @@ def of_table(
 
 
 def of_log(
-    events: Events,
+    events: Log,
     places: Places,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
@@ -84,8 +85,8 @@ def of_log(
     """The same by the frames of a log, so many in a group, `frame_step` of them if not given."""
     K = events.K
     step = frame_step(events) if step is None else step
-    frames, group = frame_groups(events.frame, step)
-    sums = _sums_of_log(events, places, group, len(frames), true_label, likely)
+    frames, numbered = frame_groups(events.frame, step)
+    sums = _sums_of_log(events, places, numbered, len(frames), true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
         places.cell[cell],
@@ -154,7 +155,7 @@ def with_places(
     )
 
 
-def frame_step(events: Events) -> int:
+def frame_step(events: Log) -> int:
     """How many frames of a log are taken together."""
     step, seen = 1, distinct(events.frame)
     while len(seen) > most_groups(events.K):
@@ -162,19 +163,24 @@ def frame_step(events: Events) -> int:
     return step
 
 
-def frame_groups(frame: npt.NDArray[np.int32], step: int) -> tuple[Int64, Int64]:
-    """The groups of so many frames, ascending, and which of them each frame (m,) is in."""
+def frame_groups(frame: npt.NDArray[np.int32], step: int) -> tuple[Int64, tuple[Int64, npt.NDArray[np.int32]]]:
+    """The groups of so many frames, ascending, and which of them frames are in: a table, and numbers (m,) in it."""
     seen = distinct(frame)
     groups, number = np.unique(seen // step, return_inverse=True)
     if not len(seen) or seen[0] < 0 or seen[-1] > SPARSE * len(frame):
-        return groups, np.searchsorted(groups, frame // step)
+        return groups, (np.arange(len(groups)), np.searchsorted(groups, frame // step).astype(np.int32))
     of = np.zeros(int(seen[-1]) + 1, np.int64)
     of[seen] = number
-    return groups, of[frame]
+    return groups, (of, frame)
 
 
 def _sums_of_log(
-    events: Events, places: Places, group: Int64, groups: int, true_label: Int64 | None, likely: Float64 | None
+    events: Log,
+    places: Places,
+    frames: tuple[Int64, npt.NDArray[np.int32]],
+    groups: int,
+    true_label: Int64 | None,
+    likely: Float64 | None,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
     from semstab.statistics.loops.chunks import in_chunks
@@ -191,11 +197,11 @@ def _sums_of_log(
         order,
         bounds,
         np.ones(len(places.at)) if places.voxels is None else places.voxels,
-        events.bounds,
-        int(np.diff(events.bounds).max(initial=0)),
+        (events.starts, events.ends),
+        int((events.ends - events.starts).max(initial=0)),
         events.evidence.entries,
         K,
-        group,
+        frames,
         np.zeros(0, np.int64) if true_label is None else true_label,
         np.zeros(0) if likely is None else likely,
         *options,

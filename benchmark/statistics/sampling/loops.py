@@ -77,7 +77,7 @@ def _label_without(total, x, look, A):
 
 
 @serial
-def _add_truth(sums, base, x, first, T, many, group, truth, likely, total, active, A, label, without, mean, column, K):
+def _add_truth(sums, base, x, first, T, many, frames, truth, likely, total, active, A, label, without, mean, column, K):
     """What is right of so many voxels: of the fused label by leaving a frame out, of each look by itself.
 
     mean (A,) is room.
@@ -94,9 +94,9 @@ def _add_truth(sums, base, x, first, T, many, group, truth, likely, total, activ
         for t in range(T):
             without[t] = _label_without(total, x, t * A, A)
             mean[without[t]] += part
-    share = part * many
+    share, (group, frame) = part * many, frames
     for t in range(T):
-        r = base + group[first + t]
+        r = base + group[frame[first + t]]
         own = right * share
         if not alike and true >= 0:
             own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
@@ -148,14 +148,14 @@ def _one_class(log, first, T):
 
 
 @serial
-def _add_agreed(sums, base, k, first, T, many, group, truth, likely, column, K, by_class):
+def _add_agreed(sums, base, k, first, T, many, frames, truth, likely, column, K, by_class):
     """Add so many voxels whose observations are all of class k: they agree, and leaving one out changes none.
 
     column is the first with ground truth, where that is known; K classes.
     """
-    share, right = many / T, 1.0 if k == truth else 0.0
+    share, right, (group, frame) = many / T, 1.0 if k == truth else 0.0, frames
     for t in range(first, first + T):
-        r = base + group[t]
+        r = base + group[frame[t]]
         sums[r, VOXELS] += share
         sums[r, PSA] += share
         sums[r, OBSERVATIONS] += many
@@ -186,36 +186,38 @@ def _add_agreed(sums, base, k, first, T, many, group, truth, likely, column, K, 
 
 @serial
 def add_influences(
-    chunk, order, bounds, voxels, starts, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
+    chunk, order, bounds, voxels, rows, longest, log, K, frames, truth, likely, by_class, with_truth, groups, sums
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
-    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,). starts
-    (n + 1,) bound a voxel's rows of the log, `longest` at most, and of group (m,), truth (n,) is its true class or -1,
-    likely (n,) how likely it is stable, which is left open where that is empty. A place's
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,). rows
+    (starts (n,) and ends) bound a voxel's rows of the log, `longest` at most, and of frames: see `frame_groups`. truth
+    (n,) is its true class or -1, likely (n,) how likely it is stable, which is left open where that is empty. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
     against, and the shares add up to T P.
     """
+    starts, ends = rows
     x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
     total, squares, own, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
     mean, surprise, apart, certain = np.empty(K), np.empty(K), np.empty(K), np.log(K)
     first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
+    group, frame = frames
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
-            first, T, steady = starts[i], starts[i + 1] - starts[i], likely[i] if likely.shape[0] else 0.0
+            first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
             k, many = _one_class(log, first, T), voxels[i]
             if k >= 0:
                 known = truth[i] if with_truth else -1
-                _add_agreed(sums, cell * groups, k, first, T, many, group, known, steady, first_truth, K, by_class)
+                _add_agreed(sums, cell * groups, k, first, T, many, frames, known, steady, first_truth, K, by_class)
                 continue
             A = _looks(log, first, T, number, active, x, total, squares, own)
             agreed, label = _agreement(total, squares, T, A, certain, surprise, apart), _label(total, A)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             part, of_others = many / T, 1.0 / (T - 1.0)
             for t in range(T):
-                r = cell * groups + group[first + t]
+                r = cell * groups + group[frame[first + t]]
                 with_others = surprised = 0.0
                 for j in range(A):
                     k, s = active[j], x[t * A + j]
@@ -242,20 +244,20 @@ def add_influences(
                     sums[r, VSS] += x[t * A + label] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, x, first, T, many, group, truth[i], steady, total, active, A, label, without,
+                    sums, cell * groups, x, first, T, many, frames, truth[i], steady, total, active, A, label, without,
                     mean, first_truth, K if by_class else 0,
                 )  # fmt: skip
 
 
 @serial
-def add_kinds(kind, voxels, first, bounds, group, groups, total):
+def add_kinds(kind, voxels, first, rows, frames, groups, total):
     """Add 1 / T for each of the T looks at voxels of kinds (n,) that there is room for, from the first on.
 
-    At (kind - first) * groups + group; each stands for voxels (n,), bounds (n + 1,) are of its rows of group (m,).
+    At (kind - first) * groups + group; each stands for voxels (n,); rows and frames as in `add_influences`.
     """
-    last = first + total.shape[0] // groups
+    last, (starts, ends), (group, frame) = first + total.shape[0] // groups, rows, frames
     for i in range(kind.shape[0]):
         if first <= kind[i] < last:
-            share, at = voxels[i] / (bounds[i + 1] - bounds[i]), (kind[i] - first) * groups
-            for row in range(bounds[i], bounds[i + 1]):
-                total[at + group[row]] += share
+            share, at = voxels[i] / (ends[i] - starts[i]), (kind[i] - first) * groups
+            for row in range(starts[i], ends[i]):
+                total[at + group[frame[row]]] += share

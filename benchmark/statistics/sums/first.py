@@ -118,15 +118,15 @@ def first_look(
     See `analyse` for what it takes.
     """
     kinds = kinds.measured()
-    table, events = kinds.one.table, kinds.one.events
-    drift = None if events is None else _drift_of(kinds.patterns, seed)
-    null = None if drift is None else drift.null
+    table, seen = kinds.one.table, kinds.one.log
+    drift = None if seen is None else _drift_of(kinds.patterns, seed)
+    null = None if drift is None else kinds.patterns.spread(drift.null)
     own = MapSums.of(kinds, edges, null=null)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
-    if events is not None and drift is not None:
-        changes = flips(events)
+    if seen is not None and drift is not None:
+        changes = flips(seen)
         log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(drift, changes) | more
+        more = log_maps(kinds.patterns, drift, changes) | more
     found = FirstSums(
         own,
         Votes.of(table),
@@ -138,7 +138,6 @@ def first_look(
 
 
 def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
-    """Of all voxels (n,), from one of each pattern; their SBD itself is not tested."""
-    assert patterns.events is not None
-    drift = voxel_drift(patterns.table, patterns.events, seed=seed, sample=0)
-    return VoxelDrift(*(patterns.spread(values) for values in vars(drift).values()))
+    """Of one voxel of each pattern (p,); their SBD itself is not tested."""
+    assert patterns.log is not None
+    return voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)

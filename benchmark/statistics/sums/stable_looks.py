@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.model.results import RECURRENT
-from semstab.model.voxels import Events
 from semstab.statistics.kinds import Kinds
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import distinct_rows, numbered
 from semstab.statistics.sampling.collect import frame_groups
 from semstab.statistics.sampling.influence import InfluenceSums
@@ -57,13 +57,13 @@ class StableLooks:
         pairs, is_wrong = np.divmod(votings, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
         keys = np.column_stack([cell[ofs], np.full(len(votings), -1), *np.divmod(votes, longest), is_wrong])
-        if one.events is None:
+        if one.log is None:
             count = np.bincount(voting, weights=one.table.voxels[counted], minlength=len(votings))
             return cls(keys.astype(np.int32), count.astype(np.float64), edge, 0)
-        groups, group = frame_groups(one.events.frame, step)
+        groups, frames = frame_groups(one.log.frame, step)
         of = np.full(len(one.table), -1)
         of[counted] = voting
-        key, weight = _by_frame(one.events, of, one.table.voxels, len(votings), group, len(groups))
+        key, weight = _by_frame(one.log, of, one.table.voxels, len(votings), frames, len(groups))
         own = keys[key // max(len(groups), 1)]
         own[:, 3] = groups[key % max(len(groups), 1)]
         return cls(own.astype(np.int32), weight, edge, step)
@@ -98,9 +98,9 @@ class StableLooks:
 
 
 def _by_frame(
-    events: Events, kind: Int64, voxels: Float64, kinds: int, group: Int64, groups: int
+    log: Log, kind: Int64, voxels: Float64, kinds: int, frames: tuple[Int64, npt.NDArray[np.int32]], groups: int
 ) -> tuple[Int64, Float64]:
-    """What kinds (n,) of voxels, -1 is none, which groups (m,) of frames saw: kind * groups + group, and how many.
+    """What kinds (n,) of voxels, -1 is none, which groups of frames saw: kind * groups + group, and how many.
 
     A row stands for voxels (n,), of which each counts 1 / T for each of its T frames.
     """
@@ -109,7 +109,7 @@ def _by_frame(
     step, found = max(1, AT_ONCE // max(groups, 1)), [(kind[:0], np.zeros(0))]
     for first in range(0, kinds, step):
         total = np.zeros(min(step, kinds - first) * groups)
-        add_kinds(kind, voxels, first, events.bounds, group, groups, total)
+        add_kinds(kind, voxels, first, (log.starts, log.ends), frames, groups, total)
         key = np.flatnonzero(total)
         found.append((key + first * groups, total[key]))
     keys, weights = zip(*found, strict=True)
