@@ -53,6 +53,9 @@ class Observer:
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """A frame went into the maps of all units of the task."""
 
+    def frame_ahead(self, task: Task, frame: Frame) -> None:
+        """A frame before those of a map in tiles that are looked at next; it is looked at elsewhere."""
+
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """A frame of a map in tiles was looked at; the tiles are fused by themselves."""
 

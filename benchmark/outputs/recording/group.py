@@ -46,6 +46,7 @@ class GroupLog:
         origin: npt.NDArray[np.int64],
         growing: GrowingMap | None = None,
         taken: Collection[int] = (),
+        previous: Frame | None = None,
     ) -> None:
         self.task = task
         self.origin = origin
@@ -56,7 +57,7 @@ class GroupLog:
         self._maps: dict[str, MapLog] = {}
         self.tables: dict[str, VoxelTable] = {}
         """By backend, as they are finished."""
-        self._previous: Frame | None = None
+        self._previous = previous
         self._entity = path(task.scene.name, "camera", task.backbone)
         self._overlay = Overlay()
         self.last: tuple[int, float | None] = (task.indices[-1], None)

@@ -64,6 +64,7 @@ class Recording(Observer):
         self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
         self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
         self._group: GroupLog | None = None  # the backbone on a scene that is being fused
+        self._ahead: Frame | None = None  # of those that are seen next
         self._background: Background | None = None
         self._parts: Parts | None = None
         self._drift = DriftParts(None if run is None else run / RECORDING_PARTS)
@@ -107,6 +108,10 @@ class Recording(Observer):
             show = functools.partial(self._scenes.show_chunks, stream, scene, group.grown)
             background.submit(frame.index, frame.timestamp, show)
 
+    def frame_ahead(self, task: Task, frame: Frame) -> None:
+        """Keep what the next frame is compared with."""
+        self._ahead = frame
+
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """Log what the camera shows; the map follows when its tiles are there, and the track where others look too."""
         (stream, background), scene = self._opened(), task.scene.name
@@ -117,7 +122,8 @@ class Recording(Observer):
             return
         if self._group is None or self._group.task is not task:
             taken = self._taken.get((scene, task.backbone), ())
-            self._group = GroupLog(task, self._plan.config.voxel_size, origin, taken=taken)
+            self._group = GroupLog(task, self._plan.config.voxel_size, origin, taken=taken, previous=self._ahead)
+            self._ahead = None
         self._group.see(stream, frame, background)
 
     def unit_begun_again(self, unit: Unit) -> None:
