@@ -25,6 +25,7 @@ import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
 from semstab.engine import InProcess
+from semstab.engine.tiling import stretches
 from semstab.engine.units import make_plan
 from semstab.engine.work.passes import run_job
 from semstab.metrics import compensated_flicker
@@ -531,15 +532,23 @@ class Interrupted(InProcess):
 
 
 @pytest.fixture(scope="module")
-def tiles(compared):
+def module_patch():
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def tiles(compared, module_patch):
     """The same run in tiles: recorded in this process, in parts that are merged, and after an interruption."""
+    module_patch.setattr(stretches, "LEAST", 1)
+    module_patch.setattr(stretches, "MOST", 2)
     config, out = compared
     config = config.model_copy(update={"backends": config.backends[:1], "tile_size": 8})
     for name, executor in (("one", InProcess()), ("merged", Elsewhere()), ("resumed", InProcess())):
         at = out.parent / name
         if name == "resumed":
             with pytest.raises(KeyboardInterrupt), contextlib.closing(Recording(at / "recording.rrd", run=at)) as first:
-                semstab.engine.run(config, out=at, executor=Interrupted(3), observers=[first])
+                semstab.engine.run(config, out=at, executor=Interrupted(4), observers=[first])
             assert len(list(at.glob("parts/*/tiles*.npz"))) > 0
         recording = Recording(at / "recording.rrd", run=at)
         semstab.engine.run(config, out=at, executor=executor, observers=[recording])
@@ -559,6 +568,25 @@ def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles
     expected = drawn(compared[1])
     assert len(expected) == tiny_scene.FRAMES
     assert all(drawn(folder) == expected for folder in tiles)
+
+
+def test_a_frame_is_compared_with_the_one_before_it_where_another_job_looks_at_that(compared, tiles) -> None:
+    entity = "/wall/series/compensated_flicker/a"
+    (expected, *others) = (series(read(folder / "recording.rrd"), entity) for folder in (compared[1], *tiles))
+    assert len(expected) == tiny_scene.FRAMES - 1
+    assert others == [expected] * 3
+
+
+def test_an_interrupted_run_in_tiles_is_recorded_as_one_in_one_go(tiles) -> None:
+    """Each entity has the same frames."""
+    once, _, resumed = (read(folder / "recording.rrd") for folder in tiles)
+    assert resumed.keys() == once.keys()
+    for entity, rows in once.items():
+        assert frames_in(resumed[entity]) == frames_in(rows), entity
+
+
+def frames_in(rows: list[dict[str, Any]]) -> list[int]:
+    return sorted(row["frame"] for row in rows if "frame" in row)
 
 
 def test_the_voxels_that_drifted_most_are_those_of_the_whole_map(compared, tiles) -> None:

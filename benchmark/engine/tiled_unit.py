@@ -71,9 +71,9 @@ class TiledUnit:
         return self._key
 
     @property
-    def parts(self) -> list[str]:
-        """Names of its parts that are finished."""
-        return [name for name, each in self._there.items() if each.about.kind == PART]
+    def finished(self) -> list[str]:
+        """Names of its portions that are."""
+        return [*self._there]
 
     def step(self) -> int:
         """The frames that the portion which is finished now stands for."""

@@ -142,16 +142,32 @@ class DriftParts:
             return None
         return worst_of([suspect for arrays in found for suspect in of_arrays(arrays)])
 
-    def keep(self, unit: Unit, key: str, parts: Collection[str]) -> None:
-        """Of what is there of a unit that of these parts, if it is of the same key; the rest is removed."""
+    def keep(self, unit: Unit, key: str, parts: Collection[str]) -> bool:
+        """Of what is there of a unit that of these parts, if it is of the same key; the rest is removed.
+
+        Whether it is of the same key.
+        """
         if self._folder is None:
-            return
+            return False
         known = self._folder / FLIPS / unit.slug / KEY
-        kept = {*parts} if known.is_file() and known.read_text() == key else set[str]()
+        same = known.is_file() and known.read_text() == key
+        kept = {*parts} if same else set[str]()
         for file in (*self._files(DRIFT, unit), *self._files(FLIPS, unit)):
             if file.name.removesuffix(ARRAYS) not in kept:
                 file.unlink()
         write_text(known, key)
+        return same
+
+    @property
+    def recording(self) -> str:
+        """The identity of the recording that has the other pictures of these units; '' where none is known."""
+        known = None if self._folder is None else self._folder / KEY
+        return known.read_text() if known is not None and known.is_file() else ""
+
+    def belong_to(self, recording: str | None) -> None:
+        """The recording of that identity has them."""
+        if self._folder is not None and recording is not None:
+            write_text(self._folder / KEY, recording)
 
     def remove(self, unit: Unit) -> None:
         """What is there of a unit."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -40,18 +40,24 @@ class GroupLog:
     """What is recorded of one backbone on a scene."""
 
     def __init__(
-        self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64], growing: GrowingMap | None = None
+        self,
+        task: Task,
+        voxel_size: float,
+        origin: npt.NDArray[np.int64],
+        growing: GrowingMap | None = None,
+        taken: Collection[int] = (),
+        previous: Frame | None = None,
     ) -> None:
         self.task = task
         self.origin = origin
-        self._classes = task.mapping.target
+        self._classes, self._taken = task.mapping.target, taken
         self._translation = origin * voxel_size
         self._tracker = Tracker(voxel_size, len(self._classes), growing)
         self._flips = FlipLog()
         self._maps: dict[str, MapLog] = {}
         self.tables: dict[str, VoxelTable] = {}
         """By backend, as they are finished."""
-        self._previous: Frame | None = None
+        self._previous = previous
         self._entity = path(task.scene.name, "camera", task.backbone)
         self._overlay = Overlay()
         self.last: tuple[int, float | None] = (task.indices[-1], None)
@@ -89,8 +95,10 @@ class GroupLog:
         background.submit(frame.index, frame.timestamp, job)
 
     def see(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """Log what a frame shows that goes into no map here."""
+        """Log what a frame shows that goes into no map here, and is not in the recording already."""
         previous, self._previous = self._previous, frame
+        if frame.index in self._taken:
+            return
 
         def job() -> None:
             self._log_labels(stream, frame)

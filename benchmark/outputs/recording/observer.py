@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import logging
 import threading
 from collections.abc import Collection, Sequence
@@ -23,7 +24,7 @@ from semstab.model.frames import Frame
 from semstab.model.records import RECORDING_PARTS, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import given_up, series
+from semstab.outputs.recording import earlier, series
 from semstab.outputs.recording.background import Background
 from semstab.outputs.recording.drift_parts import DriftParts
 from semstab.outputs.recording.entities import Clock, path
@@ -63,9 +64,12 @@ class Recording(Observer):
         self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
         self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
         self._group: GroupLog | None = None  # the backbone on a scene that is being fused
+        self._ahead: Frame | None = None  # of those that are seen next
         self._background: Background | None = None
         self._parts: Parts | None = None
         self._drift = DriftParts(None if run is None else run / RECORDING_PARTS)
+        self._tiled: dict[tuple[str, str], bool] = {}  # in tiles; whether an earlier start left something
+        self._taken: dict[tuple[str, str], set[int]] = {}  # frames of which an earlier recording had the pictures
         self._whole: set[tuple[str, str]] = set()  # of which all pictures are there
         self._cut = False  # whether there is no earlier recording that is whole
 
@@ -104,6 +108,10 @@ class Recording(Observer):
             show = functools.partial(self._scenes.show_chunks, stream, scene, group.grown)
             background.submit(frame.index, frame.timestamp, show)
 
+    def frame_ahead(self, task: Task, frame: Frame) -> None:
+        """Keep what the next frame is compared with."""
+        self._ahead = frame
+
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """Log what the camera shows; the map follows when its tiles are there, and the track where others look too."""
         (stream, background), scene = self._opened(), task.scene.name
@@ -113,7 +121,9 @@ class Recording(Observer):
         if (scene, task.backbone) in self._whole:
             return
         if self._group is None or self._group.task is not task:
-            self._group = GroupLog(task, self._plan.config.voxel_size, origin)
+            taken = self._taken.get((scene, task.backbone), ())
+            self._group = GroupLog(task, self._plan.config.voxel_size, origin, taken=taken, previous=self._ahead)
+            self._ahead = None
         self._group.see(stream, frame, background)
 
     def unit_begun_again(self, unit: Unit) -> None:
@@ -131,14 +141,16 @@ class Recording(Observer):
         with atomic_path(self.target.file) as file:
             target = dataclasses.replace(self.target, file=file, viewer=self.target.viewer_url)
             self._stream = stream = target.open()
-            given_up.copy(self.target.file, stream, given_up.entities_of(unit, task, pictures=pictures))
+            earlier.copy(self.target.file, stream, earlier.entities_of(unit, task, pictures=pictures))
         self._background, self._group = Background(stream, self._clock), None
         self._scenes.send_layout(stream)
         self.target.drop(before.get_recording_id())
 
-    def unit_in_tiles(self, unit: Unit, key: str, parts: Collection[str]) -> None:
-        """Keep what an earlier start left of its parts."""
-        self._drift.keep(unit, key, parts)
+    def unit_in_tiles(self, unit: Unit, key: str, portions: Collection[str]) -> None:
+        """Keep what an earlier start left of its parts, and the pictures of its frames."""
+        self._tiled[unit.scene, unit.backbone] = self._drift.keep(unit, key, portions)
+        if self._stream is not None:
+            self._drift.belong_to(self._stream.get_recording_id())
 
     def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
         """Follow the part's map: pictures of drift wait in the folder until the parts are all there."""
@@ -282,7 +294,7 @@ class Recording(Observer):
 
     def _opened(self) -> tuple[rr.RecordingStream, Background]:
         if self._stream is None or self._background is None:
-            self._stream = stream = self.target.open()
+            self._stream = stream = self._begun()
             self._background = Background(stream, self._clock)
             if self.pictures_only:
                 return stream, self._background
@@ -290,6 +302,24 @@ class Recording(Observer):
             self._scenes.send_layout(stream)
             self._log_kept(stream)
         return self._stream, self._background
+
+    def _begun(self) -> rr.RecordingStream:
+        """A new recording; with pictures of frames in an earlier one where maps in tiles are gone on with."""
+        again = [self._tasks[place] for place, same in self._tiled.items() if same and self._parts is None]
+        if not again or not self._drift.recording or self._drift.recording != earlier.identity_of(self.target.file):
+            stream = self.target.open()
+        else:
+            with atomic_path(self.target.file) as file:
+                stream = dataclasses.replace(self.target, file=file).open()
+                shown = [earlier.pictures_of(task) for task in again]
+                frames = earlier.take(self.target.file, stream, {*itertools.chain.from_iterable(shown)})
+            for task, (depth, *_, labels) in zip(again, shown, strict=True):
+                self._scenes.origin(stream, task, task.scene.T_wc(task.indices[0])[:3, 3])
+                self._scenes.cameras[task.scene.name].take(frames.pop(depth, ()))
+                self._taken[task.scene.name, task.backbone] = frames[labels]
+        if self._tiled and self._parts is None:
+            self._drift.belong_to(stream.get_recording_id())
+        return stream
 
     def _log_kept(self, stream: rr.RecordingStream) -> None:
         kept, self._kept = self._kept, []

@@ -17,7 +17,9 @@ from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
-from semstab.statistics.order.drift import flips, untested_drift
+from semstab.statistics.observed import Log
+from semstab.statistics.order.drift import Flips, changes, flips_of, untested_drift
+from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
@@ -124,9 +126,9 @@ def first_look(
     own = MapSums.of(kinds, edges, null=null)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if seen is not None and drift is not None:
-        changes = flips(seen)
-        log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(patterns, drift, changes) | more
+        changed = _flips_of(patterns, seen)
+        log = LogSums.of(kinds, drift, changed, seed)
+        more = log_maps(patterns, drift, changed) | more
     found = FirstSums(
         own,
         Votes.of(table),
@@ -135,3 +137,9 @@ def first_look(
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null
+
+
+def _flips_of(patterns: Patterns, seen: Log) -> Flips:
+    """Of all voxels (n,), whose log is `seen`."""
+    assert patterns.log is not None
+    return flips_of(seen, *(patterns.spread(values) for values in changes(patterns.log)))
