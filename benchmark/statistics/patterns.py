@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.concentration import Concentration
+from semstab.model.concentration import BLOCK, Concentration
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.correctness import Judged
+from semstab.statistics.correctness import BINS
 from semstab.statistics.observed import Observed
 from semstab.statistics.order.fusion_rules import FLOOR
 
-Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 LEAST = 2 * FLOOR
@@ -83,64 +83,26 @@ class Patterns:
         return values if self.of is None else values[self.of]
 
 
-@dataclass(frozen=True, eq=False)
-class Judging:
-    """Beliefs (p, K) beside each class that may be the true one.
+def judged_alike(
+    beliefs: Sequence[Evidence], at: Int64, table: VoxelTable, rows: Int64, truth: Int64
+) -> npt.NDArray[np.float64]:
+    """(R, C) `judged_sums` of some rows (n,) of a table with true classes (n,), where these are known.
 
-    label, largest  (p,) the dominant class, and the belief in it
-    top     (p,) which of the classes with an entry it is, -1 where it is another
-    errors  (m + p,) squared distance of a belief from certainty of each of these, and then of any other
+    Each of R beliefs (p, K) is that of patterns, all by the same classes; `at` (n,) is which of these voxels have.
     """
+    from semstab.statistics.loops.patterns import add_alike, errors_of
 
-    label: npt.NDArray[np.uint16]
-    largest: Float64
-    top: Int64
-    errors: Float64
-    K: int
-
-    @classmethod
-    def of(cls, belief: Evidence) -> Judging:
-        """Of beliefs as evidence, up to a factor."""
-        from semstab.statistics.loops.patterns import errors_of
-
-        found, rest = belief.concentration, np.zeros(0) if belief.unseen is None else belief.unseen
-        top, errors = np.empty(len(belief), np.int64), np.empty(len(belief.label) + len(belief))
-        errors_of(belief.entries, rest, found.label, belief.K, top, errors)
-        return cls(found.label, found.largest, top, errors, belief.K)
-
-
-@dataclass(frozen=True, eq=False)
-class Alike:
-    """Voxels (n,) with beliefs (p, K) that are those of their patterns, and their true classes.
-
-    at      (n,) which of the beliefs each has
-    begins  (n,) where its own classes begin in the labels of all
-    truth   (n,) the true class, -1 where it is not known
-    place   (n,) where that stands among the classes of its beliefs, see `place_of`
-    voxels  (n,) how many each stands for
-    """
-
-    at: Int64
-    begins: Int64
-    labels: npt.NDArray[np.uint16]
-    truth: Int64
-    place: Int64
-    voxels: Float64
-
-    @classmethod
-    def of(cls, belief: Evidence, at: Int64, table: VoxelTable, rows: Int64, truth: Int64) -> Alike:
-        """Some rows (n,) of a table with true classes (n,)."""
-        from semstab.statistics.loops.patterns import place_of
-
-        starts, labels, _ = table.evidence.entries
-        bounds, place = np.stack([starts[rows], starts[rows + 1]]), np.empty(len(rows), np.int64)
-        place_of(at, bounds, labels, truth, belief.starts, place)
-        return cls(at, bounds[0], labels, truth, place, table.voxels[rows])
-
-    def judged(self, own: Judging) -> Judged:
-        """These beliefs, or others about the same classes, beside the true classes."""
-        top = own.top[self.at]
-        predicted = self.labels[self.begins + top].astype(np.int64)
-        if (top < 0).any():  # a class that was never seen: no other voxel has the pattern
-            predicted = np.where(top < 0, own.label[self.at], predicted)
-        return Judged(self.truth, predicted, own.largest[self.at], own.errors[self.place], self.voxels, own.K)
+    K, size = table.K, (len(beliefs), len(beliefs[0]))
+    top, errors = np.empty(size, np.int64), np.empty((size[0], len(beliefs[0].label) + size[1]))
+    found = [belief.concentration for belief in beliefs]
+    for r, belief in enumerate(beliefs):
+        rest = np.zeros(0) if belief.unseen is None else belief.unseen
+        errors_of(belief.entries, rest, found[r].label, K, top[r], errors[r])
+    about = (top, np.stack([own.label for own in found]), np.stack([own.largest for own in found]), errors)
+    total, voxels = np.zeros((size[0], 3 + 3 * BINS + 3 * K)), table.voxels
+    for first in range(0, len(rows), BLOCK):
+        some, sums = slice(first, first + BLOCK), np.zeros_like(total)
+        own = (at[some], rows[some], truth[some], voxels)
+        add_alike(*own, *table.evidence.entries[:2], beliefs[0].starts, *about, BINS, sums)
+        total += sums
+    return total

@@ -71,20 +71,6 @@ def spread_labels(evidence, dominant, of, starts, label, found):
 
 
 @serial
-def place_of(at, starts, label, truth, first, place):
-    """Where a voxel's true class (n,) stands among the classes of its beliefs (p,) and one that it never saw.
-
-    at (n,) is which of the beliefs, whose entries begin at first (p + 1,), a voxel has; starts (2, n) bound its own
-    classes in label.
-    """
-    for i in range(at.shape[0]):
-        e, end = starts[0, i], starts[1, i]
-        while e < end and label[e] != truth[i]:
-            e += 1
-        place[i] = first[at[i]] + at[i] + e - starts[0, i]
-
-
-@serial
 def errors_of(beliefs, rest, dominant, K, top, errors):
     """How far beliefs (p,) are from certainty of each of their classes, and then of another, squared: errors (m + p,).
 
@@ -107,3 +93,37 @@ def errors_of(beliefs, rest, dominant, K, top, errors):
             if others > 0:
                 error += (others - 1) * other * other + (other - (true == end)) * (other - (true == end))
             errors[true + i] = error
+
+
+@serial
+def add_alike(at, rows, truth, voxels, starts, labels, first, top, dominant, largest, errors, bins, sums):
+    """Add voxels with R beliefs to sums (R, C), see `judged_sums`; nothing where the true class (n,) is -1.
+
+    at (n,) is which of the beliefs, whose entries begin at first (p + 1,), a voxel has, rows (n,) where its own classes
+    stand in starts and labels, and its number of voxels. top and errors are those of `errors_of`, dominant and largest
+    (R, p) the most likely class and the belief in it.
+    """
+    K = (sums.shape[1] - 3 - 3 * bins) // 3
+    kind = 3 + 3 * bins
+    for i in range(at.shape[0]):
+        true, p, many = truth[i], at[i], voxels[rows[i]]
+        if true < 0:
+            continue
+        begin, end = starts[rows[i]], starts[rows[i] + 1]
+        place = begin
+        while place < end and labels[place] != true:
+            place += 1
+        place += first[p] + p - begin
+        for r in range(sums.shape[0]):
+            predicted = np.int64(labels[begin + top[r, p]] if top[r, p] >= 0 else dominant[r, p])
+            right = many if predicted == true else 0.0
+            at_bin = 3 + min(max(np.int64(np.ceil(largest[r, p] * bins - 1e-9)) - 1, 0), bins - 1)
+            sums[r, 0] += many
+            sums[r, 1] += right
+            sums[r, 2] += many * errors[r, place]
+            sums[r, at_bin] += many
+            sums[r, at_bin + bins] += many * largest[r, p]
+            sums[r, at_bin + 2 * bins] += right
+            sums[r, kind + true] += right
+            sums[r, kind + K + true] += many
+            sums[r, kind + 2 * K + predicted] += many

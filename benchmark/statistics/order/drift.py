@@ -267,12 +267,26 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]
 
 def flips(events: Log) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
+    return flips_of(events, *changes(events))
+
+
+def changes(events: Log) -> tuple[Float64, Float64, npt.NDArray[np.int32]]:
+    """Of `flips` what does not hang on frames: rate and null (n,), and how many looks (n,) follow the last change."""
     from semstab.statistics.loops import chunks, log_kernels
 
-    rate, null, since = (np.empty(len(events.starts)) for _ in range(3))
+    (rate, null), since = np.empty((2, len(events.starts))), np.empty(len(events.starts), np.int32)
     log, rows = events.evidence, (events.starts, events.ends)
-    chunks.in_chunks(log_kernels.count_flips, *rows, events.frame, log.entries, log.K, rate, null, since)
-    return Flips(rate, null, since)
+    chunks.in_chunks(log_kernels.count_flips, *rows, log.entries, log.K, rate, null, since)
+    return rate, null, since
+
+
+def flips_of(events: Log, rate: Float64, null: Float64, since: npt.NDArray[np.int32]) -> Flips:
+    """Those of a log, from its `changes`."""
+    from semstab.statistics.loops import log_kernels
+
+    frames = np.empty(len(rate))
+    log_kernels.count_frames(events.ends, events.frame, since, frames)
+    return Flips(rate, null, frames)
 
 
 def variation(table: VoxelTable) -> Float64:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import STRETCH, Evidence, stretches
+from semstab.model.evidence import STRETCH, stretches
 from semstab.model.measures import Voxels
-from semstab.statistics.correctness import judged_where, rule_sums
-from semstab.statistics.kinds import Kinds, Known
+from semstab.statistics.correctness import rule_sums
+from semstab.statistics.kinds import Kinds
 from semstab.statistics.order import fusion_rules
-from semstab.statistics.patterns import Alike, Judging
+from semstab.statistics.patterns import judged_alike
 from semstab.statistics.ranks import ordered
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-
-AT_ONCE = 1 << 15
-"""Voxels whose beliefs are held against their true classes together: what stays in a core's cache costs no memory."""
 
 
 def sums_by_rule(kinds: Kinds) -> Float64:
@@ -37,7 +34,8 @@ def sums_by_rule(kinds: Kinds) -> Float64:
         counts = np.stack([relabelled, np.full(len(beliefs), table.voxels.sum())], axis=1)
         measured = zip(beliefs, drifts, strict=True)
         means = [rule_sums(Voxels(table.op, belief, drift), table.voxels) for belief, drift in measured]
-        judged = [] if kinds.one.label is None else [_judged(beliefs, kinds.one, rows, at)]
+        true, one = kinds.one.label, kinds.one.table
+        judged = [] if true is None else [judged_alike(beliefs, at, one, rows, true[rows])]
         total = total + np.concatenate([counts, np.stack(means), *judged], axis=1)
     return total
 
@@ -54,15 +52,3 @@ def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, Int64]]:
     for some in stretches(len(seen)):
         own = slice(*np.searchsorted(at, [some.start, some.stop]))
         yield seen[some], rows[order[own]], at[own] - some.start
-
-
-def _judged(beliefs: Sequence[Evidence], one: Known, rows: Int64, at: Int64) -> Float64:
-    """(R, C) `judged_sums` of the voxels in rows (n,), which have these of the beliefs (p, K), at (n,), each time."""
-    assert one.label is not None
-    judging = [Judging.of(belief) for belief in beliefs]
-    total = np.zeros(())
-    for first in range(0, max(len(rows), 1), AT_ONCE):
-        some = slice(first, first + AT_ONCE)
-        alike = Alike.of(beliefs[0], at[some], one.table, rows[some], one.label[rows[some]])
-        total = total + np.stack([judged_where(alike.judged(own), alike.truth >= 0) for own in judging])
-    return total

@@ -17,9 +17,11 @@ from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
-from semstab.statistics.order.drift import VoxelDrift, flips, voxel_drift
+from semstab.statistics.observed import Log
+from semstab.statistics.order.drift import Flips, VoxelDrift, changes, flips_of, voxel_drift
 from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
+from semstab.statistics.sampling.collect import FrameGroups
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
 from semstab.statistics.sums.stable_looks import StableLooks
@@ -43,8 +45,8 @@ class TruthSums:
     stable: StableLooks
 
     @classmethod
-    def of(cls, kinds: Kinds, edges: Sequence[int], step: int) -> TruthSums:
-        """Of a map with true classes, whose frames are taken in groups of so many."""
+    def of(cls, kinds: Kinds, edges: Sequence[int], groups: FrameGroups | None) -> TruthSums:
+        """Of a map with true classes, whose log has these groups of frames."""
         table, truth, places = kinds.one.table, kinds.one.truth, kinds.one.places
         assert truth is not None
         judged = Judged.of(table.evidence, truth.label, table.voxels)
@@ -53,7 +55,7 @@ class TruthSums:
             PlaceSums(places.cell, places.edge, places.means(right)),
             judged_strata(judged, table.op, truth.known, edges),
             judged_where(judged, truth.known & (table.op >= 2)),
-            StableLooks.of(kinds, step),
+            StableLooks.of(kinds, groups),
         )
 
     @classmethod
@@ -121,17 +123,18 @@ def first_look(
     table, seen = kinds.one.table, kinds.one.log
     drift = None if seen is None else _drift_of(kinds.patterns, seed)
     null = None if drift is None else kinds.patterns.spread(drift.null)
-    own = MapSums.of(kinds, edges, null=null)
+    groups = None if kinds.every.log is None else FrameGroups.of_log(kinds.every.log)
+    own = MapSums.of(kinds, edges, null=null, groups=groups)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if seen is not None and drift is not None:
-        changes = flips(seen)
-        log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(kinds.patterns, drift, changes) | more
+        changed = _flips_of(kinds.patterns, seen)
+        log = LogSums.of(kinds, drift, changed, seed)
+        more = log_maps(kinds.patterns, drift, changed) | more
     found = FirstSums(
         own,
         Votes.of(table),
         log,
-        None if kinds.one.truth is None else TruthSums.of(kinds, edges, own.influence.step),
+        None if kinds.one.truth is None else TruthSums.of(kinds, edges, groups),
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null
@@ -141,3 +144,9 @@ def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
     """Of one voxel of each pattern (p,); their SBD itself is not tested."""
     assert patterns.log is not None
     return voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)
+
+
+def _flips_of(patterns: Patterns, seen: Log) -> Flips:
+    """Of all voxels (n,), whose log is `seen`."""
+    assert patterns.log is not None
+    return flips_of(seen, *(patterns.spread(values) for values in changes(patterns.log)))
