@@ -20,7 +20,7 @@ from semstab.statistics.agreement import class_sums, disagreement, psa
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, merged
-from semstab.statistics.sampling.collect import frame_step, of_log, of_table, with_places
+from semstab.statistics.sampling.collect import FrameGroups, of_log, of_table, with_places
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]
@@ -54,10 +54,12 @@ class MapSums:
         edges: Sequence[int] = STRATA,
         *,
         null: Float64 | None = None,
+        groups: FrameGroups | None = None,
     ) -> MapSums:
         """Those of a map, some voxels after the others.
 
-        null (n,) is the SBD of one voxel of each kind in random order, which comes with a log. How likely places are
+        null (n,) is the SBD of one voxel of each kind in random order, which comes with a log, and groups
+        of its frames. How likely places are
         stable only the whole map tells: `StableLooks`.
         """
         one, log = kinds.one, kinds.every.log
@@ -73,7 +75,7 @@ class MapSums:
         influence = with_places(
             of_table(one.table, one.places, one.label)
             if log is None or one.log is None
-            else of_log(one.log, one.places, one.label, step=frame_step(log)),
+            else of_log(one.log, one.places, one.label, groups=groups),
             one.table,
             one.places,
             one.label,

@@ -115,6 +115,7 @@ class Recording(Observer):
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """Log what the camera shows; the map follows when its tiles are there, and the track where others look too."""
         (stream, background), scene = self._opened(), task.scene.name
+        previous, self._ahead = self._ahead, None
         self._clock.set(stream, frame.index, frame.timestamp)
         origin = self._scenes.origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
         self._scenes.cameras[scene].log(stream, frame, background, track=not self.pictures_only)
@@ -122,8 +123,7 @@ class Recording(Observer):
             return
         if self._group is None or self._group.task is not task:
             taken = self._taken.get((scene, task.backbone), ())
-            self._group = GroupLog(task, self._plan.config.voxel_size, origin, taken=taken, previous=self._ahead)
-            self._ahead = None
+            self._group = GroupLog(task, self._plan.config.voxel_size, origin, taken=taken, previous=previous)
         self._group.see(stream, frame, background)
 
     def unit_begun_again(self, unit: Unit) -> None:
@@ -148,7 +148,8 @@ class Recording(Observer):
 
     def unit_in_tiles(self, unit: Unit, key: str, portions: Collection[str]) -> None:
         """Keep what an earlier start left of its parts, and the pictures of its frames."""
-        self._tiled[unit.scene, unit.backbone] = self._drift.keep(unit, key, portions)
+        place = unit.scene, unit.backbone
+        self._tiled[place] = self._drift.keep(unit, key, portions) or self._tiled.get(place, False)
         if self._stream is not None:
             self._drift.belong_to(self._stream.get_recording_id())
 
