@@ -33,6 +33,7 @@ from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.files import write_json
+from semstab.runtime.process import settle
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.fusion_rules import fuse_all
 
@@ -188,6 +189,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table."""
+    settle()  # as the command line does
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="also write the figures there")
     parser.add_argument("--frames", type=int, default=200)

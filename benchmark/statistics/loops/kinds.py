@@ -17,6 +17,9 @@ AT_ONCE = 256
 FIRST_ROOM = 1 << 12
 """Places of a table of kinds at first, a power of 2."""
 
+TRIAL = 1 << 14
+"""Where so many voxels have hardly fewer kinds, looking for more is given up."""
+
 
 @serial
 def hashed_with(key, value, place):
@@ -41,7 +44,8 @@ def number_block(some, first, last, keys, kinds, rows, of, found):
     """Number the kinds of the voxels from the first to before the last, whose keys are in `some` (AT_ONCE, 2).
 
     keys (k, 2) and rows (k,) take the keys of the `found` ones and their first voxels, of (n,) each voxel's kind.
-    Returns the table of kinds, larger where that was needed, and how many there are, -1 where there is no room.
+    Returns the table of kinds, larger where that was needed, and how many there are, -1 where there is no room or there
+    are hardly fewer than voxels.
     """
     for i in range(first, last):
         touch(keys, max(kinds[np.int64(some[i - first, 0]) & (kinds.shape[0] - 1)], 0))
@@ -54,6 +58,8 @@ def number_block(some, first, last, keys, kinds, rows, of, found):
             keys[found], kinds[slot], rows[found] = key, found, i
             found += 1
         of[i] = kinds[slot]
+    if last >= TRIAL and 16 * found > 15 * last:
+        return kinds, -1
     if 2 * (found + AT_ONCE) > kinds.shape[0]:
         kinds = np.full(4 * kinds.shape[0], np.int32(-1))
         for kind in range(found):
@@ -68,7 +74,8 @@ def tell_apart(op, sums, at, truth, evidence, log, bounds, frame, longest, pixel
     Voxels of one kind agree in OP, sums (drift, ||s||^2 and entropy of the frames), cube `at` (n,), true class (n,) and
     evidence; with a log in all observations instead, and in the frames of these where they are two or more. Without a
     log bounds (n + 1,) are empty, truth where it is not known. Where the OP is above `longest` and there was more than
-    one class, a voxel is of a kind of its own. Returns how many kinds there are, -1 where there is no room for them.
+    one class, a voxel is of a kind of its own. Returns how many kinds there are, -1 where there is no room for them, or
+    hardly fewer than voxels.
     """
     starts, _, weight = evidence
     drift, squares, entropy = sums

@@ -9,9 +9,6 @@ from semstab.backends.shared.prefetch import touch
 from semstab.runtime.compiled import serial
 from semstab.statistics.loops.kinds import AT_ONCE, FACTORS, FIRST_ROOM, hashed_with, number_block
 
-TRIAL = 1 << 14
-"""Where so many voxels have hardly fewer patterns, looking for them is given up."""
-
 
 @serial
 def tell_patterns(op, sums, evidence, log, begins, lasts, K, longest, least, rows, of):
@@ -51,7 +48,7 @@ def tell_patterns(op, sums, evidence, log, begins, lasts, K, longest, least, row
             some[i - first, 0], some[i - first, 1] = mix(key[0]), key[1]
             touch(kinds, np.int64(some[i - first, 0]) & (kinds.shape[0] - 1))
         kinds, found = number_block(some, first, last, keys, kinds, rows, of, found)
-        if found < 0 or (last >= TRIAL and 16 * found > 15 * last):
+        if found < 0:
             return -1
     return found
 
@@ -84,15 +81,17 @@ def errors_of(beliefs, rest, dominant, K, top, errors):
         for e in range(begin, end):
             total += weight[e] if weight[e] != 0.0 else unseen
             top[i] = e - begin if label[e] == dominant[i] else top[i]
-        other = unseen / total
-        for true in range(begin, end + 1):
-            error = 0.0
-            for e in range(begin, end):
-                p = (weight[e] if weight[e] != 0.0 else unseen) / total - (e == true)
-                error += p * p
-            if others > 0:
-                error += (others - 1) * other * other + (other - (true == end)) * (other - (true == end))
-            errors[true + i] = error
+        part = 1.0 / total
+        other = unseen * part
+        squares = others * other * other
+        for e in range(begin, end):
+            p = (weight[e] if weight[e] != 0.0 else unseen) * part
+            errors[e + i] = p
+            squares += p * p
+        for e in range(begin, end):
+            p = errors[e + i]
+            errors[e + i] = max(squares - p * p, 0.0) + (p - 1.0) * (p - 1.0)
+        errors[end + i] = max(squares - other * other, 0.0) + (other - 1.0) * (other - 1.0)
 
 
 @serial

@@ -18,7 +18,7 @@ from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.observed import Log
-from semstab.statistics.order.drift import Flips, VoxelDrift, changes, flips_of, voxel_drift
+from semstab.statistics.order.drift import Flips, changes, flips_of, untested_drift
 from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.sampling.collect import FrameGroups
@@ -121,15 +121,16 @@ def first_look(
     """
     kinds = kinds.measured()
     table, seen = kinds.one.table, kinds.one.log
-    drift = None if seen is None else _drift_of(kinds.patterns, seed)
-    null = None if drift is None else kinds.patterns.spread(drift.null)
+    patterns = kinds.patterns
+    drift = None if patterns.log is None else untested_drift(patterns.table, patterns.log, seed=seed)
+    null = None if drift is None else patterns.spread(drift.null)
     groups = None if kinds.every.log is None else FrameGroups.of_log(kinds.every.log)
     own = MapSums.of(kinds, edges, null=null, groups=groups)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
     if seen is not None and drift is not None:
-        changed = _flips_of(kinds.patterns, seen)
+        changed = _flips_of(patterns, seen)
         log = LogSums.of(kinds, drift, changed, seed)
-        more = log_maps(kinds.patterns, drift, changed) | more
+        more = log_maps(patterns, drift, changed) | more
     found = FirstSums(
         own,
         Votes.of(table),
@@ -138,12 +139,6 @@ def first_look(
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null
-
-
-def _drift_of(patterns: Patterns, seed: int) -> VoxelDrift:
-    """Of one voxel of each pattern (p,); their SBD itself is not tested."""
-    assert patterns.log is not None
-    return voxel_drift(patterns.table, patterns.log, seed=seed, sample=0)
 
 
 def _flips_of(patterns: Patterns, seen: Log) -> Flips:
