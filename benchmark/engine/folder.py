@@ -96,8 +96,9 @@ class Folder:
 
     def close(self) -> None:
         """Let another process have it; what observers keep of maps in tiles goes with the last of these."""
-        if not (self.path / PORTIONS).exists():
-            shutil.rmtree(self.path / RECORDING_PARTS, ignore_errors=True)
+        recording = self.path / RECORDING_PARTS
+        if not (self.path / PORTIONS).exists() and not any(recording.glob("*.rrd")):  # those could not be merged
+            shutil.rmtree(recording, ignore_errors=True)
         self._lock.release()
 
     def kept(self, planned: Planned) -> UnitContent | None:
