@@ -35,6 +35,12 @@ INITIAL_BYTES = 32 * 2**20
 LEAST_BLOCKS = 4
 """Of a new map, however many classes there are."""
 
+FILLED, OFTEN = 0.2, 1.2
+"""Share of the voxels of a block that a frame sees, and how many times as many all frames do."""
+
+SPARE, GROWING = 1.3, 1.0
+"""Blocks that a grid has room for, and those of the one that it grew from, to each that is seen, on average."""
+
 COPIED_BLOCKS = 1024
 """Blocks that move at a time when a map grows, so that the copy needs no second map's worth of memory."""
 
@@ -81,9 +87,16 @@ class Open3DBlocks(FusionBackend):
         self.grid = self._new_grid(max(LEAST_BLOCKS, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
     @staticmethod
-    def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
-        """The attributes of a voxel; a quarter of a block is seen, the grid doubles, an empty one has blocks."""
-        return max(11 * voxels, LEAST_BLOCKS * 4**3) * (8 * num_classes + 48)
+    def expected_bytes(
+        voxels: int, observations: int, num_classes: int, soft: bool = False, filled: float = FILLED
+    ) -> int:
+        """The attributes of all voxels of a block, of which frames see that share, the more the more frames there are.
+
+        A grid has room for more; it grows into another one, but of two maps, of scores and of labels, one after the
+        other. An empty one has blocks.
+        """
+        room = SPARE if soft else SPARE + GROWING
+        return int(max(room * voxels / (OFTEN * filled), LEAST_BLOCKS * 4**3) * (8 * num_classes + 48))
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
@@ -131,7 +144,7 @@ class Open3DBlocks(FusionBackend):
         needed = old.size() + int(np.count_nonzero(~present.cpu().numpy()))
         if needed <= old.capacity():
             return
-        grid = self._new_grid(2 * needed)
+        grid = self._new_grid(needed + needed // 2)
         if old.size():
             _copy_blocks(self.grid, grid, tuple(self.attributes))
         self.grid = grid

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -14,7 +14,7 @@ from semstab.model.frames import Frame
 def write_posed(
     folder: Path,
     names: Sequence[str],
-    sources: Mapping[str, Sequence[Frame]],
+    sources: Mapping[str, Iterable[Frame]],
     *,
     scale: float | None = 1000.0,
     **settings: object,

@@ -111,6 +111,21 @@ def test_maps_take_what_their_backend_expects(name) -> None:
     assert held / 3 < expected_bytes(name, voxels, voxels, 7) < 3 * held
 
 
+def test_blocks_of_which_frames_see_little_take_as_much_as_full_ones() -> None:
+    """Pixels further apart than voxels; the map had to grow."""
+    side = 100
+    frame = Frame(
+        0, np.full((side, side), 30.0), Intrinsics(30, 30, 50, 50), np.eye(4), np.zeros((side, side), "uint8")
+    )
+    backend = create("open3d", voxel_size=0.2, num_classes=7)
+    seen = backend.integrate(frame).map_voxels
+    held = sum(backend.grid.attribute(column).numpy().nbytes for column in backend.attributes)
+    full, filled = 1 / 4, memory.filled_of(frame, 0.2, 7)
+    assert filled < full / 3
+    assert held / 1.5 < expected_bytes("open3d", seen, seen, 7, soft=True, filled=filled) < 1.5 * held
+    assert held / 1.5 > expected_bytes("open3d", seen, seen, 7, soft=True, filled=full)
+
+
 def test_a_backend_that_does_not_say_counts_as_nothing(monkeypatch) -> None:
     from semstab.backends import REGISTRY
 

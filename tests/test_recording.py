@@ -32,7 +32,7 @@ from semstab.model.measures import SBD_MAX, measures
 from semstab.model.records import Record, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import SERIES, Recording, background, looks, observer
+from semstab.outputs.recording import SERIES, Recording, Target, background, looks, scenes
 from semstab.outputs.recording.entities import Clock
 from semstab.outputs.recording.eye import Scenery, direction, fit
 from semstab.outputs.recording.maps import tracker, voxel_maps
@@ -259,7 +259,7 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
 
 
 def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(observer, "FIRST_CHUNKS", 1)
+    monkeypatch.setattr(scenes, "FIRST_CHUNKS", 1)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 1000)
     path = tmp_path / "outgrown.rrd"
     _, table = record(path, [frame(i, i % 3, (0.25 * i + 0.01, 0.01, 2.01)) for i in range(6)])
@@ -427,7 +427,7 @@ def summary_of(table: VoxelTable) -> UnitSummary:
     return UnitSummary(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0)
 
 
-def record(path: Path, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
+def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
     """Drive a recording as the pipeline does."""
     watching = Recording(path)
     task = Task(Scene(), "net/x", [f.index for f in frames], CLASSES.mapping_to(CLASSES), ("numpy",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import re
@@ -24,6 +25,7 @@ import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
 from semstab.engine import InProcess
+from semstab.engine.tiling import stretches
 from semstab.engine.units import make_plan
 from semstab.engine.work.passes import run_job
 from semstab.metrics import compensated_flicker
@@ -515,18 +517,44 @@ class Elsewhere(InProcess):
             yield job, run_job(job)
 
 
+class Interrupted(InProcess):
+    """In this process, until so many jobs are done."""
+
+    def __init__(self, jobs: int) -> None:
+        self.left = jobs
+
+    def run(self, jobs: Any, observers: Any) -> Generator:
+        for done in super().run(jobs, observers):
+            yield done
+            self.left -= 1
+            if not self.left:
+                raise KeyboardInterrupt
+
+
 @pytest.fixture(scope="module")
-def tiles(compared):
-    """The same run in tiles: recorded in this process, and in parts that are merged."""
+def module_patch():
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def tiles(compared, module_patch):
+    """The same run in tiles: recorded in this process, in parts that are merged, and after an interruption."""
+    module_patch.setattr(stretches, "LEAST", 1)
+    module_patch.setattr(stretches, "MOST", 2)
     config, out = compared
     config = config.model_copy(update={"backends": config.backends[:1], "tile_size": 8})
-    for name, executor in (("one", InProcess()), ("merged", Elsewhere())):
+    for name, executor in (("one", InProcess()), ("merged", Elsewhere()), ("resumed", InProcess())):
         at = out.parent / name
+        if name == "resumed":
+            with pytest.raises(KeyboardInterrupt), contextlib.closing(Recording(at / "recording.rrd", run=at)) as first:
+                semstab.engine.run(config, out=at, executor=Interrupted(4), observers=[first])
+            assert len(list(at.glob("parts/*/tiles*.npz"))) > 0
         recording = Recording(at / "recording.rrd", run=at)
         semstab.engine.run(config, out=at, executor=executor, observers=[recording])
         assert len(list((at / "voxels").glob("*/*.parquet"))) > 1
         assert not (at / RECORDING_PARTS).exists()
-    return out.parent / "one", out.parent / "merged"
+    return [out.parent / name for name in ("one", "merged", "resumed")]
 
 
 def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles) -> None:
@@ -539,7 +567,26 @@ def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles
 
     expected = drawn(compared[1])
     assert len(expected) == tiny_scene.FRAMES
-    assert drawn(tiles[0]) == drawn(tiles[1]) == expected
+    assert all(drawn(folder) == expected for folder in tiles)
+
+
+def test_a_frame_is_compared_with_the_one_before_it_where_another_job_looks_at_that(compared, tiles) -> None:
+    entity = "/wall/series/compensated_flicker/a"
+    (expected, *others) = (series(read(folder / "recording.rrd"), entity) for folder in (compared[1], *tiles))
+    assert len(expected) == tiny_scene.FRAMES - 1
+    assert others == [expected] * 3
+
+
+def test_an_interrupted_run_in_tiles_is_recorded_as_one_in_one_go(tiles) -> None:
+    """Each entity has the same frames."""
+    once, _, resumed = (read(folder / "recording.rrd") for folder in tiles)
+    assert resumed.keys() == once.keys()
+    for entity, rows in once.items():
+        assert frames_in(resumed[entity]) == frames_in(rows), entity
+
+
+def frames_in(rows: list[dict[str, Any]]) -> list[int]:
+    return sorted(row["frame"] for row in rows if "frame" in row)
 
 
 def test_the_voxels_that_drifted_most_are_those_of_the_whole_map(compared, tiles) -> None:
@@ -554,7 +601,7 @@ def test_the_voxels_that_drifted_most_are_those_of_the_whole_map(compared, tiles
 
     expected = flips_of(compared[1])
     assert len(expected) == flips.SHOWN + 3
-    assert flips_of(tiles[0]) == flips_of(tiles[1]) == expected
+    assert all(flips_of(folder) == expected for folder in tiles)
 
 
 def without_ids(row: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from simulated_events import grid, log_of_evidence
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.json_form import to_json
-from semstab.statistics import analyse, join_truth, kinds
+from semstab.statistics import analyse, join_truth, kinds, patterns
 from semstab.statistics.kinds import Kinds
 
 SIDE, F, K = 120, 6, 3
@@ -29,19 +29,24 @@ def flight(wrong):
     return log_of_evidence(evidence, seen=seen, index=grid(SIDE))
 
 
-def looked_at(log, true, monkeypatch, few):
+def looked_at(log, true, monkeypatch, few, most):
     monkeypatch.setattr(kinds, "FEW", few)
+    monkeypatch.setattr(patterns, "MOST", most)
     table, limit = log.table(), true
     return analyse(table, log, true, limit=limit), analyse(table), analyse(table, truth=true)
 
 
-def test_one_voxel_of_each_kind_tells_what_all_of_them_do(monkeypatch):
-    log, true = flight(0.02), flight(0.1).table()
+@pytest.mark.parametrize(("wrong", "kinds_found"), [(0.02, True), (0.5, False)])
+def test_one_voxel_of_each_kind_tells_what_all_of_them_do(monkeypatch, wrong, kinds_found):
+    log, true = flight(wrong), flight(0.1).table()
     found = Kinds.found(log.table(), log, join_truth(log.table(), true))
-    assert len(found.one.table) < SIDE**2 / 2
-    assert found.one.table.copies.sum() == SIDE**2
+    assert (len(found.one.table) < SIDE**2 / 2) == kinds_found
+    assert len(found.patterns.table) < patterns.MOST * len(found.one.table)
+    assert found.one.table.voxels.sum() == found.patterns.table.copies.sum() == SIDE**2
     for few, every in zip(
-        looked_at(log, true, monkeypatch, kinds.FEW), looked_at(log, true, monkeypatch, SIDE**3), strict=True
+        looked_at(log, true, monkeypatch, kinds.FEW, patterns.MOST),
+        looked_at(log, true, monkeypatch, SIDE**3, 0.0),
+        strict=True,
     ):
         assert not differences(to_json(few.summary), to_json(every.summary), tolerance=1e-11)
         assert not differences(to_json(few.table), to_json(every.table), tolerance=1e-12)
@@ -111,3 +116,24 @@ def test_voxels_that_differ_in_anything_that_is_summed_are_of_two_kinds(column):
     table = VoxelTable(**columns, evidence=evidence, voxel_size=1.0)
     truth = kinds.Truth(np.ones(n, np.bool_), true)
     assert Kinds.found(table, truth=truth).one.table.copies.tolist()[-1] == 1
+
+
+TWO = [[0.75, 0.25, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
+"""Two looks at two classes."""
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "count"),
+    [
+        (TWO, [[0.75, 0.0, 0.0, 0.25], [0.0, 0.0, 0.0, 1.0]], 1),
+        (TWO, TWO[::-1], 2),
+        (TWO, [[0.25, 0.75, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]], 2),
+        (TWO, [[0.5, 0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]], 2),
+        ([[0.99, 0.01, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]], [[0.99, 0.0, 0.0, 0.01], [0.0, 0.0, 0.0, 1.0]], 2),
+        (TWO * 3, TWO * 3, 64),
+    ],
+    ids=["other classes", "order", "ranks", "weights", "hardly seen", "many looks"],
+)
+def test_voxels_have_one_pattern_where_looks_differ_in_the_names_of_classes_only(one, other, count):
+    log = log_of_evidence([one, other] * 32, index=grid(8))
+    assert len(Kinds.found(log.table(), log).patterns.table) == count

@@ -136,6 +136,18 @@ def test_a_clip_in_which_no_pixel_counts_is_left_out():
     assert measured.value == 1
 
 
+def test_a_frame_without_ground_truth_is_in_no_clip():
+    """Neither is the one after it a neighbour of the one before it."""
+    measured = VideoConsistency(2)
+    (same, other) = frames([0, 1, 2, 3], [0, 1, 2, 9])
+    values = [
+        measured.skip() if labels is None else measured.add(labels, EVERYWHERE, same)
+        for labels in (None, same, same, None, other, same, same)
+    ]
+    assert values == close([math.nan, math.nan, 1, math.nan, math.nan, 3 / 4, 1])
+    assert measured.value == pytest.approx(2.75 / 3)
+
+
 def test_a_change_of_size_begins_anew():
     measured = SelfConsistency(2)
     small, large = np.zeros((2, 2), np.uint8), np.zeros((3, 3), np.uint8)

@@ -95,7 +95,10 @@ class Folder:
         self._files = {file.stem: file for file in (self.path / UNITS).glob("*.json")}
 
     def close(self) -> None:
-        """Let another process have it."""
+        """Let another process have it; what observers keep of maps in tiles goes with the last of these."""
+        recording = self.path / RECORDING_PARTS
+        if not (self.path / PORTIONS).exists() and not any(recording.glob("*.rrd")):  # those could not be merged
+            shutil.rmtree(recording, ignore_errors=True)
         self._lock.release()
 
     def kept(self, planned: Planned) -> UnitContent | None:
@@ -194,7 +197,8 @@ class Folder:
         for name in WRITTEN:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
                 remove_leftovers(folder)
-        shutil.rmtree(self.path / RECORDING_PARTS, ignore_errors=True)
+        for recording in (self.path / RECORDING_PARTS).glob("*.rrd"):
+            recording.unlink()
         (self.path / FAILURES).unlink(missing_ok=True)
         marker = shared_marker(self.path, start)
         marker.touch()

@@ -29,6 +29,8 @@ class InTiles:
         """A unit; its own outcome where it has failed already."""
         tiled = TiledUnit(planned, tiling, self._survey.folder, self._survey.executor.width, self._beside)
         self._units[planned.identity] = tiled
+        if planned.kept:
+            self._told.tell(lambda observer: observer.unit_in_tiles(planned.unit, tiled.key, tiled.finished))
         self._waiting.add_tiled(tiled)
         return tiled.take(None)
 

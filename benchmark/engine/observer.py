@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,8 +53,17 @@ class Observer:
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """A frame went into the maps of all units of the task."""
 
+    def frame_ahead(self, task: Task, frame: Frame) -> None:
+        """A frame before those of a map in tiles that are looked at next; it is looked at elsewhere."""
+
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """A frame of a map in tiles was looked at; the tiles are fused by themselves."""
+
+    def unit_in_tiles(self, unit: Unit, key: str, portions: Collection[str]) -> None:
+        """It is fused in tiles from now on; parts and stretches of these names were finished by an earlier start.
+
+        key  of its settings and its input
+        """
 
     def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
         """The frames that see this part of the map in tiles of the task's unit go into it from now on."""

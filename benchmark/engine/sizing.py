@@ -8,13 +8,13 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from semstab.backends import frame_bytes, restrictable
+from semstab.backends import frame_bytes, restrictable, takes_blocks
 from semstab.config import Config
 from semstab.engine.survey import Survey
 from semstab.engine.tiling.partition import ROOM, Tiling, tile_size, tiled
 from semstab.engine.tiling.sights import CELL, Sights
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.memory import GB, Kind, Load, most_voxels, room, takes, too_large, voxels_of
+from semstab.engine.work.memory import GB, Kind, Load, filled_of, most_voxels, room, takes, too_large, voxels_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.task import Task, read
@@ -142,9 +142,9 @@ def _first(task: Task, settings: Config) -> Frame:
 
 
 def _kinds(group: Sequence[PlannedUnit], first: Frame, *, soft: bool) -> list[Kind]:
-    touched = 0
-    if any(frame_bytes(each.unit.backend, 1, 2) for each in group):
-        touched = voxels_of(first, group[0].config.voxel_size, len(group[0].task.mapping.target))
+    about = (first, group[0].config.voxel_size, len(group[0].task.mapping.target))
+    touched = voxels_of(*about) if any(frame_bytes(each.unit.backend, 1, 2) for each in group) else 0
+    filled = filled_of(*about) if any(takes_blocks(each.unit.backend) for each in group) else 0.0
     return [
         Kind(
             each.unit.backend,
@@ -153,6 +153,7 @@ def _kinds(group: Sequence[PlannedUnit], first: Frame, *, soft: bool) -> list[Ki
             logged=each.config.statistics or each.config.events,
             sampled=each.sampled,
             touched=touched,
+            filled=filled,
         )
         for each in group
     ]

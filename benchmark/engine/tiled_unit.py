@@ -65,6 +65,16 @@ class TiledUnit:
         """What the progress calls it."""
         return f"{self.planned.unit.scene} · {self.planned.unit.backbone}"
 
+    @property
+    def key(self) -> str:
+        """Under which it is kept."""
+        return self._key
+
+    @property
+    def finished(self) -> list[str]:
+        """Names of its portions that are."""
+        return [*self._there]
+
     def step(self) -> int:
         """The frames that the portion which is finished now stands for."""
         return next(self._steps, 0)

@@ -42,6 +42,12 @@ class VideoConsistency:
         """
         return self._clips.add(self._prediction.add(labels, valid), self._truth.add(truth, valid))
 
+    def skip(self) -> float:
+        """The next frame has no ground truth, and is in no clip: where its truth stays the same is not known. NaN."""
+        self._prediction.end()
+        self._truth.end()
+        return math.nan
+
     @property
     def value(self) -> float:
         """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
@@ -79,6 +85,10 @@ class _Run:
         if not 2 <= n <= np.iinfo(np.int16).max:
             raise ConfigError(f"a clip of {n} frames: use 2 to {np.iinfo(np.int16).max}")
         self.n = n
+        self.end()
+
+    def end(self) -> None:
+        """The next frame does not follow those before it."""
         self._length: npt.NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._labels: Labels = np.zeros((0, 0), dtype=np.uint8)
 

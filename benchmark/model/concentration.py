@@ -17,6 +17,13 @@ UInt16 = npt.NDArray[np.uint16]
 BLOCK = 1 << 13
 """Rows that are added one after the other."""
 
+TOGETHER = 4
+"""Columns that are added side by side, as sums wait for what they were before."""
+
+
+APART = 8
+"""Columns of a block begin as many numbers further: a power of 2 apart, a core's cache has no room for many of them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Concentration:
@@ -36,16 +43,27 @@ class Concentration:
     squares: Float64
 
     @classmethod
-    def of(cls, starts: Int64, label: UInt16, weight: Float64, K: int, rest: Float64 | None = None) -> Concentration:
-        """Of entries as `Evidence` has them; rest (n,) is what each class without one has, 0 where it is not given."""
+    def of(
+        cls,
+        starts: Int64,
+        label: UInt16,
+        weight: Float64,
+        K: int,
+        rest: Float64 | None = None,
+        bits: Float64 | None = None,
+    ) -> Concentration:
+        """Of entries as `Evidence` has them; rest (n,) is what each class without one has, 0 where it is not given.
+
+        bits (n,) is the entropy, where that is known.
+        """
         from semstab.model.row_kernel import concentrate
 
         n = len(starts) - 1
-        largest, lead, bits, squares = (np.empty(n) for _ in range(4))
-        found = np.empty(n, np.uint16)
+        largest, lead, squares = (np.empty(n) for _ in range(3))
+        found, own = np.empty(n, np.uint16), np.empty(n) if bits is None else bits
         others = np.zeros(0) if rest is None else rest
-        concentrate(starts, label, weight, others, K, largest, lead, bits, found, squares)
-        return cls(largest, lead, bits, found, squares)
+        concentrate(starts, label, weight, others, K, bits is not None, largest, lead, own, found, squares)
+        return cls(largest, lead, own, found, squares)
 
     def take(self, rows: Any) -> Concentration:
         """Of some rows: a slice, their numbers, or a mask (n,)."""
@@ -64,17 +82,14 @@ def by_group(
     """
     from semstab.model.row_kernel import add_by_group
 
-    ones = np.ones(max(BLOCK, groups))
-
-    def of(some: slice) -> Float64:
-        part = np.zeros((2, groups, len(values)))
-        own = np.stack([column[some] for column in values], dtype=np.float64)
-        many = ones[: own.shape[1]] if voxels is None else voxels[some]
-        add_by_group(group[some].astype(np.int64, copy=False), own, many, *part)
-        return part
-
-    sums, defined = blockwise(of, len(group), groups)
-    return sums, defined
+    wide = -(-len(values) // TOGETHER) * TOGETHER
+    sums, defined = np.zeros((2, wide, groups))
+    of, many = group.astype(np.int64, copy=False), np.zeros(0) if voxels is None else voxels
+    for first in range(0, wide, TOGETHER):
+        own = [np.ascontiguousarray(column, dtype=np.float64) for column in values[first : first + TOGETHER]]
+        some = slice(first, first + TOGETHER)
+        add_by_group(of, *own, *(TOGETHER - len(own)) * own[:1], many, max(BLOCK, groups), sums[some], defined[some])
+    return tuple(np.ascontiguousarray(found[: len(values)].T) for found in (sums, defined))  # type: ignore[return-value]
 
 
 def blockwise(sums: Callable[[slice], Float64], rows: int, groups: int) -> Float64:

@@ -178,7 +178,9 @@ def sbd(table: Beliefs) -> Float64:
 
 def mean_drift(drift_sum: Float64, op: Int32) -> Float64:
     """SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
-    return np.where(op >= 2, drift_sum / np.maximum(op - 1, 1), np.nan)
+    mean = np.full(len(op), np.nan)
+    np.divide(drift_sum, op - 1, out=mean, where=op >= 2)
+    return mean
 
 
 def op(table: Beliefs) -> Int32:

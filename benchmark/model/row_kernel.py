@@ -16,6 +16,7 @@ def concentrate(
     weight: Any,
     rest: Any,
     K: int,
+    known: bool,
     largest: Any,
     lead: Any,
     bits: Any,
@@ -24,7 +25,8 @@ def concentrate(
 ) -> None:
     """Fill largest, lead, bits, dominant and squares (n,), see `Concentration`.
 
-    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty.
+    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty. Where bits are
+    known they are left as they are.
     """
     for i in range(starts.shape[0] - 1):
         first, end = starts[i], starts[i + 1]
@@ -47,7 +49,10 @@ def concentrate(
             elif unseen > second:
                 second = unseen
         squares[i], dominant[i] = square, best
-        largest[i], lead[i], bits[i] = top / total, top / total - second / total, 0.0
+        largest[i], lead[i] = top / total, top / total - second / total
+        if known:
+            continue
+        bits[i] = 0.0
         if end - first > 1 or unseen > 0.0:
             spread = 0.0
             for e in range(first, end):
@@ -69,20 +74,29 @@ def copy_rows(first: Any, label: Any, weight: Any, starts: Any, to_label: Any, t
 
 
 @serial
-def add_by_group(group: Any, values: Any, voxels: Any, sums: Any, defined: Any) -> None:
-    """Add values (C, n) that are not NaN to the row of sums (G, C) of each group (n,), and count them; -1 is none.
+def add_by_group(
+    group: Any, one: Any, two: Any, three: Any, four: Any, voxels: Any, block: int, sums: Any, defined: Any
+) -> None:
+    """Add four columns (n,), of what is not NaN, to the sums (4, G) of each group (n,), and count it; -1 is no group.
 
-    A row counts as so many voxels (n,).
+    A row counts as so many voxels (n,), as one where that is empty; rounding adds up within a block of rows only.
     """
-    for i in range(group.shape[0]):
-        g = group[i]
-        if g < 0:
-            continue
-        for c in range(values.shape[0]):
-            value = values[c, i]
-            known = value == value  # noqa: PLR0124 - NaN is not
-            sums[g, c] += voxels[i] * value if known else 0.0
-            defined[g, c] += voxels[i] if known else 0.0
+    part, count = np.zeros((sums.shape[1], 4)), np.zeros((sums.shape[1], 4))
+    weighted = voxels.shape[0] > 0
+    for first in range(0, group.shape[0], block):
+        for i in range(first, min(first + block, group.shape[0])):
+            g, many = group[i], voxels[i] if weighted else 1.0
+            if g < 0:
+                continue
+            for c, value in enumerate((one[i], two[i], three[i], four[i])):
+                known = value == value  # noqa: PLR0124 - NaN is not
+                part[g, c] += many * value if known else 0.0
+                count[g, c] += many if known else 0.0
+        for g in range(sums.shape[1]):
+            for c in range(4):
+                sums[c, g] += part[g, c]
+                defined[c, g] += count[g, c]
+                part[g, c] = count[g, c] = 0.0
 
 
 @serial

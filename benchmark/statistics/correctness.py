@@ -13,7 +13,7 @@ from semstab.metrics import strata
 from semstab.metrics.matching import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.model.concentration import blockwise, by_group
-from semstab.model.evidence import Evidence, stretches
+from semstab.model.evidence import Evidence
 from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
@@ -55,11 +55,11 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
     Raises DataError where the maps differ in K or voxel size.
     """
+    from semstab.statistics.loops.rows import majorities
+
     require_same_grid(table, truth)
     label = np.empty(len(truth), np.int64)
-    for some in stretches(len(truth)):
-        found = truth.evidence.take(some).concentration
-        label[some] = np.where(found.largest > PURE, found.label.astype(np.int64), -1)
+    majorities(truth.evidence.entries, PURE, label)
     if not same_voxels(table, truth):
         (rows, true_rows), true = shared_rows(table, truth), label
         label = np.full(len(table), -1)
@@ -171,7 +171,7 @@ def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     return rule_means_of(rule_sums(fused, where.astype(np.float64), truth))
 
 
-def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None) -> Float64:
+def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None = None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
 
     Each of what was fused stands for so many voxels (n,), 0 leaves it out.

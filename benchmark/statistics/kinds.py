@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.correctness import Truth
+from semstab.statistics.observed import Observed
+from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling.places import Places
 
 FEW = 2
@@ -21,12 +23,12 @@ FEW = 2
 class Known:
     """Voxels with what is known of them.
 
-    events  their log, truth their true classes
+    log  of their observations, truth their true classes
     places  the cubes of those with OP >= 2
     """
 
     table: VoxelTable
-    events: Events | None
+    log: Observed | None
     truth: Truth | None
     places: Places
 
@@ -43,22 +45,24 @@ class Kinds:
     All that is summed over voxels is the same for those of a kind.
 
     every, one  all of the voxels, and one of each kind
+    patterns    of the looks at the latter
     of          (n,) which of the latter stands for each of the former; None where they are the same
     """
 
     every: Known
     one: Known
+    patterns: Patterns
     of: npt.NDArray[np.int32] | None = None
 
     @classmethod
     def found(cls, table: VoxelTable, events: Events | None = None, truth: Truth | None = None) -> Kinds:
         """Those of a table, of its log, and of its true classes."""
+        from semstab.statistics.loops.few_looks import ENUMERATED
         from semstab.statistics.loops.kinds import tell_apart
-        from semstab.statistics.loops.orders import ENUMERATED
 
-        every = Known(table, events, truth, Places.of(table))
+        every = Known(table, None if events is None else Observed.of(events), truth, Places.of(table))
         most, of, none = len(table) // FEW, np.empty(len(table), np.int32), np.zeros(0, np.int64)
-        rows, voxels, pixels = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64)
+        rows, voxels, pixels = np.empty(most, np.int64), np.zeros(most), np.zeros(most, np.int64)
         count = tell_apart(
             table.op,
             (table.drift_sum, table.self_sum, table.frame_entropy_sum),
@@ -76,19 +80,20 @@ class Kinds:
             of,
         )
         if count < 0:
-            return cls(every, every)
-        rows, voxels = rows[:count].copy(), voxels[:count].copy()
+            return cls(every, every, Patterns.found(table, every.log))
+        rows, voxels, pixels = rows[:count], voxels[:count], pixels[:count]  # what is not written takes no memory
         one = Known(
-            replace(table.rows(rows), copies=voxels, pixels=pixels[:count].copy()),
-            None if events is None else events.rows(rows),
+            replace(table.rows(rows), copies=voxels, pixels=pixels),
+            None if every.log is None else every.log.rows(rows),
             None if truth is None else Truth(truth.known[rows], truth.label[rows]),
             replace(every.places, at=every.places.at[rows], voxels=voxels),
         )
-        return cls(every, one, of)
+        return cls(every, one, Patterns.found(one.table, one.log), of)
 
     def measured(self) -> Kinds:
         """The same with what measures of one of each kind are functions of: see `VoxelTable.measured`."""
-        return replace(self, one=replace(self.one, table=self.one.table.measured()))
+        patterns, table = self.patterns.measured(self.one.table)
+        return replace(self, one=replace(self.one, table=table), patterns=patterns)
 
 
 def spread(maps: Mapping[str, npt.NDArray[Any]], of: npt.NDArray[np.int32] | None) -> dict[str, npt.NDArray[Any]]:

@@ -20,7 +20,7 @@ from semstab.statistics.agreement import class_sums, disagreement, psa
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, merged
-from semstab.statistics.sampling.collect import frame_step, of_log, of_table, with_places
+from semstab.statistics.sampling.collect import FrameGroups, of_log, of_table, with_places
 from semstab.statistics.uncertainty import decompose
 
 Float64 = npt.NDArray[np.float64]
@@ -54,13 +54,15 @@ class MapSums:
         edges: Sequence[int] = STRATA,
         *,
         null: Float64 | None = None,
+        groups: FrameGroups | None = None,
     ) -> MapSums:
         """Those of a map, some voxels after the others.
 
-        null (n,) is the SBD of one voxel of each kind in random order, which comes with a log. How likely places are
+        null (n,) is the SBD of one voxel of each kind in random order, which comes with a log, and groups
+        of its frames. How likely places are
         stable only the whole map tells: `StableLooks`.
         """
-        one, log = kinds.one, kinds.every.events
+        one, log = kinds.one, kinds.every.log
         alone = log is None and one.truth is None
         parts = (
             cls._of_few(one.table.rows(some), one.places.rows(some), None if null is None else null[some], edges, alone)
@@ -72,14 +74,14 @@ class MapSums:
         excess = sbd(one.table) - (expected_sbd(one.table) if null is None else null)
         influence = with_places(
             of_table(one.table, one.places, one.label)
-            if log is None or one.events is None
-            else of_log(one.events, one.places, one.label, step=frame_step(log)),
+            if log is None or one.log is None
+            else of_log(one.log, one.places, one.label, groups=groups),
             one.table,
             one.places,
             one.label,
             excess,
         )
-        return replace(found, classes=class_sums(one.table, one.events), influence=influence)
+        return replace(found, classes=class_sums(one.table, one.log), influence=influence)
 
     @classmethod
     def _of_few(

@@ -7,8 +7,9 @@ often than those that thirty saw. So a place borrows from what all places of its
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -49,7 +50,7 @@ class Votes:
     @classmethod
     def of(cls, table: VoxelTable) -> Votes:
         """Those of a table."""
-        return cls.merged([_votes(table.rows(some))[0] for some in stretches(len(table))])
+        return cls.merged([_votes(*part)[0] for _, part in _parts(table)])
 
     @classmethod
     def merged(cls, parts: Sequence[Votes]) -> Votes:
@@ -90,14 +91,20 @@ def _likelihood(seen: Int64, most: Int64) -> Float64:
     return likelihood
 
 
-def _votes(table: VoxelTable) -> tuple[Votes, Int64]:
+def _parts(table: VoxelTable) -> Iterator[tuple[slice, tuple[npt.NDArray[Any], Float64, Float64]]]:
+    """OP, share of the dominant class, and how many voxels a row stands for, some rows after the others."""
+    share, voxels = vss(table), table.voxels
+    return ((some, (table.op[some], share[some], voxels[some])) for some in stretches(len(table)))
+
+
+def _votes(op: npt.NDArray[np.int32], share: Float64, voxels: Float64) -> tuple[Votes, Int64]:
     """Those of a table, and which each of its places with OP >= 2 has."""
-    again = table.op >= 2
-    T = table.op[again].astype(np.int64)
+    again = op >= 2
+    T = op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1
-    votes = np.rint(vss(table)[again] * T).astype(np.int64)
+    votes = np.rint(share[again] * T).astype(np.int64)
     pairs, of = numbered(votes + T * longest)
-    count = np.bincount(of, weights=table.voxels[again], minlength=len(pairs)).astype(np.int64)
+    count = np.bincount(of, weights=voxels[again], minlength=len(pairs)).astype(np.int64)
     return Votes(*np.divmod(pairs, longest), count), of
 
 
@@ -111,7 +118,7 @@ def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = 
     """
     shares = Votes.of(table).shares() if shares is None else shares
     found = np.full(len(table), np.nan)
-    for some in stretches(len(table)):
-        votes, of = _votes(table.rows(some))
-        found[some][table.op[some] >= 2] = votes.stable(shares, stable=stable)[of]
+    for some, part in _parts(table):
+        votes, of = _votes(*part)
+        found[some][part[0] >= 2] = votes.stable(shares, stable=stable)[of]
     return found

@@ -26,7 +26,7 @@ import semstab
 from semstab.engine.sizing import SHARE
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights
-from semstab.engine.work.memory import GB, Kind, Load, voxels_of
+from semstab.engine.work.memory import GB, Kind, Load, filled_of, voxels_of
 from semstab.runtime.files import write_json
 
 HERE = Path(__file__).resolve().parent
@@ -85,7 +85,8 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
     """At once, then in tiles."""
     soft, (width, height) = kind == "scores", SIZE[kind]
     first = flight.frame(0, width, height, K)
-    of = Kind(backend, K, soft=soft, sampled=backend == "numba", touched=voxels_of(first, VOXEL_SIZE, K))
+    seen = {"touched": voxels_of(first, VOXEL_SIZE, K), "filled": filled_of(first, VOXEL_SIZE, K)}
+    of = Kind(backend, K, soft=soft, sampled=backend == "numba", **seen)
     load = Load(first, FRAMES[kind], K, soft, None)
     if of.bytes(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
         print(f"{backend:>8} {K:4} {kind:>7} left out: {of.bytes(most, most) / GB:.2g} GB")

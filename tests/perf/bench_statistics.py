@@ -1,14 +1,14 @@
 """CPU time of the statistics beside that of the loop whose log they read, and the memory that both take.
 
     python tests/perf/bench_statistics.py [--frames 200] [--size 640x480] [--voxel-size 0.05] [--classes 7] [--rooms 1]
-    python tests/perf/bench_statistics.py --flight --frames 50 --voxel-size 0.2 [--flipped 0.05]
+    python tests/perf/bench_statistics.py --flight --frames 50 --voxel-size 0.2 [--flipped 0.05] [--scores 3]
 
 A camera walks round a furnished room and sees each place again and again (room.py); with --rooms it goes on to the next
 one; with --flight it flies over a field and sees most places twice (flight.py); --flipped is a share of pixels whose
-label is any. The frames are read from PNG, as the
-loop of a run does, whose other parts are flicker and fusion. Time is user and system time of all threads; compiled code
-is loaded before. Memory is the most that the process took since the step before, above what it took with its modules
-loaded.
+label is any. With --scores each pixel has probabilities instead, of the label and of classes at random, of which the so
+many largest are kept. The frames are read from PNG, scores from NPZ, as the loop of a run does, whose other parts are
+flicker and fusion. Time is user and system time of all threads; compiled code is loaded before.
+Memory is the most that the process took since the step before, above what it took with its modules loaded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import resource
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
 from semstab.model.voxels import Events, VoxelTable
 from semstab.runtime.files import write_json
+from semstab.runtime.process import settle
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.fusion_rules import fuse_all
 
@@ -84,33 +85,50 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def walked(frames: int, size: tuple[int, int], K: int, rooms: int) -> list[Frame]:
+def walked(frames: int, size: tuple[int, int], K: int, rooms: int) -> Iterator[Frame]:
     """Frames of the walk."""
-    return [room.frame(index, *size, K=K, step=frames // rooms) for index in range(frames)]
+    for index in range(frames):
+        yield room.frame(index, *size, K=K, step=frames // rooms)
 
 
-def flown(frames: int, size: tuple[int, int], K: int) -> list[Frame]:
+def flown(frames: int, size: tuple[int, int], K: int) -> Iterator[Frame]:
     """Frames of the flight, to and fro."""
-    legs = [divmod(index, LEG) for index in range(frames)]
-    places = [(BESIDE * leg, STEP * (LEG - 1 - along if leg % 2 else along)) for leg, along in legs]
-    return [flight.frame(index, *size, K, place) for index, place in enumerate(places)]
+    for index in range(frames):
+        leg, along = divmod(index, LEG)
+        yield flight.frame(index, *size, K, (BESIDE * leg, STEP * (LEG - 1 - along if leg % 2 else along)))
 
 
-def flipped(frames: list[Frame], share: float, K: int) -> list[Frame]:
+def flipped(frames: Iterable[Frame], share: float, K: int) -> Iterator[Frame]:
     """The frames with any label in a share of their pixels."""
-    rng, found = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
     for frame in frames:
         assert frame.labels is not None
         labels, where = frame.labels.copy(), rng.random(frame.shape) < share
         labels[where] = rng.integers(K, size=np.count_nonzero(where))
-        found.append(replace(frame, labels=labels))
-    return found
+        yield replace(frame, labels=labels)
 
 
-def written(folder: Path, frames: list[Frame], K: int) -> Path:
-    """The frames as PNGs in a folder."""
-    frames = [replace(frame, depth=(np.round(frame.depth * UNITS) / UNITS).astype(np.float32)) for frame in frames]
-    names, classes = [f"{frame.index:05d}" for frame in frames], [f"class{k}" for k in range(K)]
+def soft(frames: Iterable[Frame], kept: int, K: int) -> Iterator[Frame]:
+    """The frames with probabilities in place of labels: 0.4 to 1 for the label, the rest for classes at random.
+
+    Of each pixel those of `kept` classes, the label among them.
+    """
+    for frame in frames:
+        assert frame.labels is not None
+        rng, n, labels = np.random.default_rng(frame.index), frame.labels.size, frame.labels.reshape(-1, 1)
+        others = (rng.integers(1, K, n)[:, None] + np.arange(kept - 1)) % (K - 1) + 1
+        share = rng.random((n, kept - 1), dtype=np.float32)
+        share *= rng.uniform(0.0, 0.6, (n, 1)).astype(np.float32) / share.sum(axis=1, keepdims=True)
+        scores = np.zeros((n, K), dtype=np.float16)
+        np.put_along_axis(scores, (labels + others) % K, share.astype(np.float16), axis=1)
+        np.put_along_axis(scores, labels.astype(np.int64), 1 - share.sum(axis=1, keepdims=True), axis=1)
+        yield replace(frame, labels=None, scores=scores.reshape(*frame.shape, K))
+
+
+def written(folder: Path, count: int, frames: Iterable[Frame], K: int) -> Path:
+    """So many frames as PNGs in a folder, scores as NPZ."""
+    frames = (replace(frame, depth=(np.round(frame.depth * UNITS) / UNITS).astype(np.float32)) for frame in frames)
+    names, classes = [f"{index:05d}" for index in range(count)], [f"class{k}" for k in range(K)]
     write_posed(folder / "scene", names, {"a": frames}, scale=UNITS, classes=classes)
     return folder
 
@@ -119,9 +137,9 @@ def fused(watch: Watch, folder: Path, voxel_size: float, K: int) -> Any:
     """The map of the frames of a folder, with its history."""
     fusion = create("numba", voxel_size=voxel_size, num_classes=K, history=True)
     scene = open_dataset("posed_folder", {"root": str(folder)}).scene("scene")
-    before = None
+    (name,), before = scene.backbones, None
     for index in range(len(scene)):
-        frame = watch("reading", lambda index=index: scene.frame(index, "a"))
+        frame = watch("reading", lambda index=index: scene.frame(index, name))
         if before is not None:
             watch("flicker", lambda one=before, other=frame: flicker_percent(one, other))
         watch("fusion", lambda frame=frame: fusion.integrate(frame))
@@ -145,13 +163,17 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Seconds and bytes of each step, with the number of voxels and observations."""
     width, height = (int(side) for side in arguments.size.split("x"))
     K, size = arguments.classes, (width, height)
-    with tempfile.TemporaryDirectory() as there:
-        few = flown(8, (96, 72), K) if arguments.flight else walked(8, (96, 72), K, 1)
-        warm = fused(Watch(), written(Path(there) / "few", few, K), 4 * arguments.voxel_size, K)
-        statistics.describe(warm.table(), warm.events(), warm.table())
-        count, rooms = arguments.frames, arguments.rooms
+
+    def taken(count: int, size: tuple[int, int], rooms: int = 1) -> Iterator[Frame]:
         frames = flown(count, size, K) if arguments.flight else walked(count, size, K, rooms)
-        folder = written(Path(there), flipped(frames, arguments.flipped, K) if arguments.flipped else frames, K)
+        frames = flipped(frames, arguments.flipped, K) if arguments.flipped else frames
+        return soft(frames, arguments.scores, K) if arguments.scores else frames
+
+    with tempfile.TemporaryDirectory() as there:
+        warm = fused(Watch(), written(Path(there) / "few", 8, taken(8, (96, 72)), K), 4 * arguments.voxel_size, K)
+        statistics.describe(warm.table(), warm.events(), warm.table())
+        count = arguments.frames
+        folder = written(Path(there), count, taken(count, size, arguments.rooms), K)
         watch = Watch()
         fusion = fused(watch, folder, arguments.voxel_size, K)
     table = watch("table", fusion.table)
@@ -167,6 +189,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table."""
+    settle()  # as the command line does
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="also write the figures there")
     parser.add_argument("--frames", type=int, default=200)
@@ -176,6 +199,9 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=1)
     parser.add_argument("--flight", action="store_true")
     parser.add_argument("--flipped", type=float, default=0.0, help="share of pixels with any label")
+    parser.add_argument(
+        "--scores", type=int, default=0, help="classes of which a pixel has a probability; else a label"
+    )
     arguments = parser.parse_args()
     found = measure(arguments)
     n, m, fusion = found["voxels"], found["observations"], found["seconds"]["fusion"]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from semstab.metrics import SelfConsistency, VideoConsistency, compensated_flicker
 from semstab.model.frames import Frame
 from semstab.model.measures import mean
@@ -40,10 +38,10 @@ class ImageSpaceMeter:
             pair = compensated_flicker(self._previous, sample)
             flicker, share = pair.flicker_percent, pair.share
         by_itself = [each.add(sample.predicted, sample.valid) for each in self._by_itself]
-        # without ground truth no pixel counts, and the clips that the frame is part of do not either
-        known = np.zeros_like(sample.valid) if true is None else sample.valid & true.valid
-        labels = sample.predicted if true is None else true.predicted
-        by_truth = [each.add(sample.predicted, known, labels) for each in self._by_truth]
+        by_truth = [
+            each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
+            for each in self._by_truth
+        ]
         self.rows.append((flicker, share, *by_truth, *by_itself))
         self._previous = frame
 

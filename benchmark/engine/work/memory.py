@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from semstab.backends import expected_bytes, frame_bytes
 from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
@@ -13,6 +16,7 @@ from semstab.model.evidence import STRETCH
 from semstab.model.frames import Frame
 from semstab.runtime.memory import available_bytes
 from semstab.runtime.prefetch import default_threads
+from semstab.statistics.ranks import distinct_rows
 from semstab.task import Task
 
 GB = 1e9
@@ -22,6 +26,9 @@ DOUBT = 10
 LOADED, LOADED_FOR_SCORES, LOADED_FOR_TILES = 170e6, 30e6, 50e6
 """Bytes of what a run loads once it is planned (compiled loops, formats of files), of the sample of looks, and of what
 is left between parts."""
+BLOCK = 4
+"""Voxels along an edge of a block of space."""
+
 FRAMES_AT_WORK = 3
 """Frames that are in memory beside those which are read ahead."""
 
@@ -36,6 +43,7 @@ class Kind:
     logged   whether every observation is kept, and the ground truth fused too
     sampled  whether the reference follows a sample of its voxels
     touched  voxels that a frame touches
+    filled   share of the voxels of blocks of space that it touches, 0 where that is not known
     """
 
     backend: str
@@ -44,16 +52,18 @@ class Kind:
     logged: bool = False
     sampled: bool = False
     touched: int = 0
+    filled: float = 0.0
 
     def bytes(self, voxels: float, observations: float) -> float:
         """Of a map of so many voxels and observations, with what comes of it."""
         n, looks = int(voxels), int(observations)
-        fused = expected_bytes(self.backend, n, looks, self.K, soft=self.soft)
-        truth = expected_bytes(self.backend, n, looks, self.K) if self.logged else 0
+        fused = expected_bytes(self.backend, n, looks, self.K, soft=self.soft, filled=self.filled)
+        of_labels = expected_bytes(self.backend, n, looks, self.K, filled=self.filled)
+        truth = of_labels if self.logged else 0
         logs = log_bytes(looks, self.K, soft=self.soft) if self.logged else 0
         followed = expected_bytes("numpy", n // ONE_IN, 0, self.K) if self.sampled else 0  # looks: when the map is gone
         compared = 8 * self.K * min(n // ONE_IN, STRETCH) if self.sampled else 0
-        reduced = expected_bytes(self.backend, n, looks, self.K) if self.soft else 0
+        reduced = of_labels if self.soft else 0
         now = frame_bytes(self.backend, min(n, self.touched), self.K)
         return (
             fused
@@ -116,9 +126,21 @@ def most_voxels(task: Task, config: Config, first: Frame) -> int:
 
 def voxels_of(frame: Frame, voxel_size: float, num_classes: int) -> int:
     """How many a frame touches."""
+    return len(_touched(frame, voxel_size, num_classes))
+
+
+def filled_of(frame: Frame, voxel_size: float, num_classes: int) -> float:
+    """Which share of the voxels of those blocks, of 4 x 4 x 4, a frame touches of which it touches any."""
+    index = _touched(frame, voxel_size, num_classes)
+    return len(index) / (BLOCK**3 * max(len(distinct_rows(index // BLOCK)[0]), 1))
+
+
+def _touched(frame: Frame, voxel_size: float, num_classes: int) -> npt.NDArray[np.int64]:
+    """Indices (n, 3) of the voxels."""
     from semstab.backends.shared.aggregator import Aggregator
 
-    return len(Aggregator(voxel_size, num_classes).observe(frame).key)
+    pixels = Aggregator(voxel_size, num_classes)
+    return pixels.index_of(pixels.observe(frame).key)
 
 
 def too_large(

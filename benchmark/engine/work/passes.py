@@ -8,14 +8,14 @@ import functools
 import json
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from semstab.backends import FusionBackend, create, takes_option
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.evaluation import truth_task
-from semstab.engine.observer import Observers
+from semstab.engine.observer import Observer, Observers
 from semstab.engine.series import FrameRow
 from semstab.engine.work.finish import finish, finish_portion
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
@@ -188,6 +188,7 @@ class Pass:
         with self._failing([one.request for one in stream.maps]):
             now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
             if now.frame.index in stream.ahead:
+                self._tell_shown(stream, lambda observer, one: observer.frame_ahead(one.task, now.frame))
                 return
             for one in stream.maps:
                 with self._failing([one.request]):
@@ -199,10 +200,14 @@ class Pass:
                 self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
             for _ in (one for one in stream.maps if one.request.part is not None):
                 self.observers.tell(lambda observer: observer.part_fused(now.frame))
-            for one in (one for one in stream.maps if one.request.shown):
-                self.observers.tell(lambda observer, one=one: observer.frame_seen(one.task, now.frame))  # type: ignore[misc]
+            self._tell_shown(stream, lambda observer, one: observer.frame_seen(one.task, now.frame))
         lost = {outcome.identity for outcome in self._outcomes}
         stream.maps = [one for one in stream.maps if one.request.identity not in lost]
+
+    def _tell_shown(self, stream: Stream, what: Callable[[Observer, UnitMap], None]) -> None:
+        """Tell the observers something of each map whose frames they are shown without it."""
+        for one in (one for one in stream.maps if one.request.shown):
+            self.observers.tell(lambda observer, one=one: what(observer, one))  # type: ignore[misc]
 
     def _integrate(self, one: UnitMap, now: Prepared, fetched: Fetched[Decoded]) -> FrameRow:
         frame = now.frame

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +104,8 @@ class CameraLog:
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, track: bool = True) -> None:
         """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
-        self._logged.extend(bytes(max(0, frame.index + 1 - len(self._logged))))
-        if self._logged[frame.index]:
+        if not self._is_new(frame.index):
             return
-        self._logged[frame.index] = True
         self._log_camera(stream, frame, self._follow(frame.T_wc))
         if track:
             self.log_track(stream)
@@ -119,12 +117,24 @@ class CameraLog:
             self._follow(self.scene.T_wc(index))
             yield index
 
+    def take(self, indices: Iterable[int]) -> None:
+        """These frames are in the recording already."""
+        for index in sorted(indices):
+            self._follow(self.scene.T_wc(index))
+            self._is_new(index)
+
     def log_track(self, stream: rr.RecordingStream) -> None:
         """Log where it has been so far, unless the frames are so many that this one is left out."""
         n = len(self._poses)
         if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
             track = self.poses[:, :3, 3]
             stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
+
+    def _is_new(self, index: int) -> bool:
+        """Whether a frame is not logged yet; from now on it is."""
+        self._logged.extend(bytes(max(0, index + 1 - len(self._logged))))
+        new, self._logged[index] = not self._logged[index], True
+        return new
 
     def _follow(self, T_wc: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The next pose, relative to the map's origin."""

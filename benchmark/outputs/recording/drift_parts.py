@@ -12,7 +12,7 @@ import math
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -30,13 +30,20 @@ from semstab.outputs.recording.maps.drift_colors import levels_of
 from semstab.outputs.recording.maps.flips import VIEW, FlipLog, Suspect, of_arrays, to_arrays, view_of, worst_of
 from semstab.outputs.recording.maps.tracker import Tracker
 from semstab.runtime.array_files import read_arrays, write_arrays
+from semstab.runtime.files import write_text
 from semstab.task import Task
 
 HEAD = struct.Struct(f"<{VIEW}diI")
 """Before each picture: the fields of `Picture` but its levels, and how many bytes these are."""
 
-DRIFT, FLIPS, STARTED = "drift", "flips", ".started"
-"""Folders in which parts leave their files, unit by unit; and how one ends that is still being written."""
+DRIFT, FLIPS = "drift", "flips"
+"""Folders in which parts leave their files, unit by unit."""
+
+STARTED, ARRAYS = ".started", ".npz"
+"""How a file in the first ends that is still being written, and one in the second."""
+
+KEY = "key"
+"""Beside these, whose parts they are."""
 
 MOST_MOVES = 1 << 19
 """Moves of voxels that a part keeps."""
@@ -107,7 +114,7 @@ class DriftParts:
             self._stream.close()
             self._file.with_suffix(STARTED).replace(self._file)
             found = to_arrays([*self._flips.suspects(self._tracker)]) | {"voxels": np.int64(len(self._tracker.map))}
-            write_arrays(self._folder / FLIPS / self._file.parent.name / f"{self._file.name}.npz", found)
+            write_arrays(self._folder / FLIPS / self._file.parent.name / f"{self._file.name}{ARRAYS}", found)
         self._stream = self._tracker = None
 
     def end(self) -> None:
@@ -119,8 +126,8 @@ class DriftParts:
 
     def pictures(self, unit: Unit) -> Iterator[Picture]:
         """Frame after frame, what all parts of a unit's map say of each."""
-        files = [] if self._folder is None else sorted((self._folder / DRIFT / unit.slug).glob("*"))
-        found = heapq.merge(*(_read(file) for file in files if file.suffix != STARTED), key=attrgetter("frame"))
+        files = [file for file in self._files(DRIFT, unit) if file.suffix != STARTED]
+        found = heapq.merge(*(_read(file) for file in files), key=attrgetter("frame"))
         for _, parts in itertools.groupby(found, key=attrgetter("frame")):
             first, *others = parts
             for other in others:
@@ -129,16 +136,48 @@ class DriftParts:
 
     def suspects(self, unit: Unit, voxels: int) -> list[Suspect] | None:
         """The voxels of its map, of so many, that drifted most; None where not all parts have said which those are."""
-        left = [] if self._folder is None else sorted((self._folder / FLIPS / unit.slug).glob("*.npz"))
+        left = [file for file in self._files(FLIPS, unit) if file.suffix == ARRAYS]
         found = [arrays for file in left if (arrays := read_arrays(file)) is not None]
         if sum(int(arrays["voxels"]) for arrays in found) != voxels:
             return None
         return worst_of([suspect for arrays in found for suspect in of_arrays(arrays)])
 
-    def remove(self) -> None:
-        """The folder, with all that is in it."""
+    def keep(self, unit: Unit, key: str, parts: Collection[str]) -> bool:
+        """Of what is there of a unit that of these parts, if it is of the same key; the rest is removed.
+
+        Whether it is of the same key.
+        """
+        if self._folder is None:
+            return False
+        known = self._folder / FLIPS / unit.slug / KEY
+        same = known.is_file() and known.read_text() == key
+        kept = {*parts} if same else set[str]()
+        for file in (*self._files(DRIFT, unit), *self._files(FLIPS, unit)):
+            if file.name.removesuffix(ARRAYS) not in kept:
+                file.unlink()
+        write_text(known, key)
+        return same
+
+    @property
+    def recording(self) -> str:
+        """The identity of the recording that has the other pictures of these units; '' where none is known."""
+        known = None if self._folder is None else self._folder / KEY
+        return known.read_text() if known is not None and known.is_file() else ""
+
+    def belong_to(self, recording: str | None) -> None:
+        """The recording of that identity has them."""
+        if self._folder is not None and recording is not None:
+            write_text(self._folder / KEY, recording)
+
+    def remove(self, unit: Unit) -> None:
+        """What is there of a unit."""
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            for kind in (DRIFT, FLIPS):
+                shutil.rmtree(self._folder / kind / unit.slug, ignore_errors=True)
+
+    def _files(self, kind: str, unit: Unit) -> list[Path]:
+        """Of the parts of a unit; none where there is no folder."""
+        return [] if self._folder is None else sorted((self._folder / kind / unit.slug).glob("*"))
 
 
 def _read(file: Path) -> Iterator[Picture]:

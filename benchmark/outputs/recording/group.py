@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ import rerun as rr
 from semstab.backends import GrowingMap
 from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame
-from semstab.model.results import Unit
+from semstab.model.measures import measures
+from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.outputs.recording import series
 from semstab.outputs.recording.background import Background
@@ -27,6 +28,7 @@ from semstab.outputs.recording.drift_parts import Picture
 from semstab.outputs.recording.entities import Clock, path
 from semstab.outputs.recording.layout import drawn, is_pointwise
 from semstab.outputs.recording.maps import drift_colors
+from semstab.outputs.recording.maps.agreement import looks_report
 from semstab.outputs.recording.maps.difference import log_difference
 from semstab.outputs.recording.maps.flips import FlipLog, Suspect
 from semstab.outputs.recording.maps.tracker import FrameDrift, Tracker
@@ -38,18 +40,24 @@ class GroupLog:
     """What is recorded of one backbone on a scene."""
 
     def __init__(
-        self, task: Task, voxel_size: float, origin: npt.NDArray[np.int64], growing: GrowingMap | None = None
+        self,
+        task: Task,
+        voxel_size: float,
+        origin: npt.NDArray[np.int64],
+        growing: GrowingMap | None = None,
+        taken: Collection[int] = (),
+        previous: Frame | None = None,
     ) -> None:
         self.task = task
         self.origin = origin
-        self._classes = task.mapping.target
+        self._classes, self._taken = task.mapping.target, taken
         self._translation = origin * voxel_size
         self._tracker = Tracker(voxel_size, len(self._classes), growing)
         self._flips = FlipLog()
         self._maps: dict[str, MapLog] = {}
         self.tables: dict[str, VoxelTable] = {}
         """By backend, as they are finished."""
-        self._previous: Frame | None = None
+        self._previous = previous
         self._entity = path(task.scene.name, "camera", task.backbone)
         self._overlay = Overlay()
         self.last: tuple[int, float | None] = (task.indices[-1], None)
@@ -87,8 +95,10 @@ class GroupLog:
         background.submit(frame.index, frame.timestamp, job)
 
     def see(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """Log what a frame shows that goes into no map here."""
+        """Log what a frame shows that goes into no map here, and is not in the recording already."""
         previous, self._previous = self._previous, frame
+        if frame.index in self._taken:
+            return
 
         def job() -> None:
             self._log_labels(stream, frame)
@@ -120,6 +130,14 @@ class GroupLog:
             for backend in self.tables if unit.backend == first else [unit.backend]:
                 self._compare(stream, first, backend, tolerance)
         self.remarks[unit.backend] = self._map(unit.backend).finish(stream, table)
+
+    def log_numbers(self, stream: rr.RecordingStream, summary: UnitSummary) -> None:
+        """Log the final numbers of a unit, and what its frames agree on."""
+        text = final(summary) + self.remarks.get(summary.unit.backend, "")
+        stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
+        if summary.statistics is not None:
+            document = rr.TextDocument(looks_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
+            stream.log(path(summary.unit.scene, "agreement", summary.unit.backbone), document, static=True)
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock, suspects: list[Suspect] | None = None) -> None:
         """Log which frames changed the voxels that drifted most: those that are said to, of a map in tiles."""
@@ -174,3 +192,13 @@ class GroupLog:
             entity = path(self.task.scene.name, "map", self.task.backbone, backend)
             self._maps[backend] = MapLog(entity, self._classes, self.origin, len(self.task.indices))
         return self._maps[backend]
+
+
+def final(summary: UnitSummary) -> str:
+    """Its numbers, in a line."""
+    unit, table = summary.unit, summary.table
+    means = (f"{m.symbol} {table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
+    return (
+        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, {', '.join(means)}"
+        f" (K = {table.K})"
+    )

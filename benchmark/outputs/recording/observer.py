@@ -5,15 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import logging
-import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
 from semstab.backends import FusionBackend, GrowingMap
@@ -23,40 +20,22 @@ from semstab.engine.series import FrameRow
 from semstab.engine.tiling.partition import Part
 from semstab.engine.units import Plan, Planned, PlannedUnit
 from semstab.errors import ConfigError, one_line
-from semstab.metrics import dominant
 from semstab.model.frames import Frame
-from semstab.model.measures import measures
-from semstab.model.records import RECORDING_PARTS, Result, Variation, voxels_of
+from semstab.model.records import RECORDING_PARTS, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import given_up, series
+from semstab.outputs.recording import earlier, series
 from semstab.outputs.recording.background import Background
-from semstab.outputs.recording.camera import (
-    CameraLog,
-    label_context,
-)
 from semstab.outputs.recording.drift_parts import DriftParts
 from semstab.outputs.recording.entities import Clock, path
-from semstab.outputs.recording.eye import Scenery
-from semstab.outputs.recording.group import GroupLog
-from semstab.outputs.recording.layout import Known, blueprint
-from semstab.outputs.recording.maps import drift_colors
-from semstab.outputs.recording.maps.agreement import looks_report
-from semstab.outputs.recording.maps.legend import Legend
-from semstab.outputs.recording.maps.voxel_maps import CHUNKS, chunks_of, thinned_map
+from semstab.outputs.recording.finished import log_finished
+from semstab.outputs.recording.group import GroupLog, final
+from semstab.outputs.recording.maps.voxel_maps import chunks_of
 from semstab.outputs.recording.parts import Parts
+from semstab.outputs.recording.scenes import Scenes
 from semstab.outputs.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.runtime.files import atomic_path
 from semstab.task import Task
-
-FIRST_CHUNKS = 8
-"""Chunks of each map that the first layout knows; it is sent again where a map outgrows them."""
-
-SAMPLE = 20_000
-"""Voxels of a scene from which it follows where its maps are seen from."""
-
-ORIGIN_STEP = 1000.0
-"""Metres; map origins are multiples of it: a scene near its world's origin keeps its coordinates."""
 
 
 class Recording(Observer):
@@ -77,33 +56,28 @@ class Recording(Observer):
         self.target = target if isinstance(target, Target) else Target(Path(target))
         self._run = run
         self._plan: Plan
+        self._scenes: Scenes
         self._tasks: dict[tuple[str, str], Task] = {}
         self._stream: rr.RecordingStream | None = None
+        self._server: rr.RecordingStream | None = None  # an earlier one, that serves what this one sends
         self._clock = Clock()
         self._kept: list[tuple[Task, Sequence[UnitSummary]]] = []  # not logged yet
-        self._origins: dict[str, npt.NDArray[np.int64]] = {}
-        self._cameras: dict[str, CameraLog] = {}
-        self._known = Known()
-        self._sent = 0  # layouts
         self._growing: dict[tuple[str, str], GrowingMap] = {}  # of the units that started
         self._group: GroupLog | None = None  # the backbone on a scene that is being fused
+        self._ahead: Frame | None = None  # of those that are seen next
         self._background: Background | None = None
         self._parts: Parts | None = None
         self._drift = DriftParts(None if run is None else run / RECORDING_PARTS)
+        self._tiled: dict[tuple[str, str], bool] = {}  # in tiles; whether an earlier start left something
+        self._taken: dict[tuple[str, str], set[int]] = {}  # frames of which an earlier recording had the pictures
         self._whole: set[tuple[str, str]] = set()  # of which all pictures are there
         self._cut = False  # whether there is no earlier recording that is whole
 
     def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
         """Keep the plan: layout, names and colours follow from it."""
-        self._plan = plan
+        self._plan, self._scenes = plan, Scenes(plan, live=self.target.live)
         self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
-        first = CHUNKS if self.target.live else FIRST_CHUNKS  # a live viewer keeps the layout that it got first
-        self._known.chunks = {task.scene.name: first for task in plan.tasks}
-        self._known.legends = {
-            scene: Legend(task.mapping.target for task in plan.tasks if task.scene.name == scene)
-            for scene in self._known.chunks
-        }
-        unmerged = self._run is not None and (self._run / RECORDING_PARTS).exists()
+        unmerged = self._run is not None and any((self._run / RECORDING_PARTS).glob("*.rrd"))
         self._cut = unmerged or not is_whole(self.target.file)
 
     def unit_started(self, unit: Unit, backend: FusionBackend) -> None:
@@ -116,7 +90,7 @@ class Recording(Observer):
         stream, _ = self._opened()
         task = self._tasks[unit.scene, unit.backbone]
         self._clock.set(stream, frame.index, frame.timestamp)
-        origin = self._origin(stream, task, frame.T_wc[:3, 3])
+        origin = self._scenes.origin(stream, task, frame.T_wc[:3, 3])
         if self._group is None or self._group.task is not task:
             growing = self._growing.pop((unit.scene, unit.backbone), None)
             self._group = GroupLog(task, self._plan.config.voxel_size, origin, growing)
@@ -128,36 +102,56 @@ class Recording(Observer):
     def frame_finished(self, task: Task, frame: Frame) -> None:
         """Log what the camera and the map show."""
         (stream, background), group, scene = self._opened(), self._fused, task.scene.name
-        self._cameras[scene].log(stream, frame, background)
+        self._scenes.cameras[scene].log(stream, frame, background)
         group.log(stream, frame, background, maps=not self.pictures_only)
-        if not self.pictures_only and chunks_of(group.grown) > self._known.chunks[scene]:
-            show = functools.partial(self._show_chunks, stream, scene, group.grown)
+        if not self.pictures_only and chunks_of(group.grown) > self._scenes.known.chunks[scene]:
+            show = functools.partial(self._scenes.show_chunks, stream, scene, group.grown)
             background.submit(frame.index, frame.timestamp, show)
+
+    def frame_ahead(self, task: Task, frame: Frame) -> None:
+        """Keep what the next frame is compared with."""
+        self._ahead = frame
 
     def frame_seen(self, task: Task, frame: Frame) -> None:
         """Log what the camera shows; the map follows when its tiles are there, and the track where others look too."""
         (stream, background), scene = self._opened(), task.scene.name
+        previous, self._ahead = self._ahead, None
         self._clock.set(stream, frame.index, frame.timestamp)
-        origin = self._origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
-        self._cameras[scene].log(stream, frame, background, track=not self.pictures_only)
+        origin = self._scenes.origin(stream, self._tasks[scene, task.backbone], frame.T_wc[:3, 3])
+        self._scenes.cameras[scene].log(stream, frame, background, track=not self.pictures_only)
         if (scene, task.backbone) in self._whole:
             return
         if self._group is None or self._group.task is not task:
-            self._group = GroupLog(task, self._plan.config.voxel_size, origin)
+            taken = self._taken.get((scene, task.backbone), ())
+            self._group = GroupLog(task, self._plan.config.voxel_size, origin, taken=taken, previous=previous)
         self._group.see(stream, frame, background)
 
     def unit_begun_again(self, unit: Unit) -> None:
-        """Take what was logged of its map out of the file; a viewer that follows the run has seen it."""
-        if self._stream is None or self._background is None or self._parts is not None or self.target.live:
+        """Go on in a recording that has nothing of its map, in place of this one: in the file and in a viewer."""
+        if self._stream is None or self._background is None or self._parts is not None:
             return
         task, pictures = self._tasks[unit.scene, unit.backbone], (unit.scene, unit.backbone) not in self._whole
+        before = self._stream
         self._background.close()
-        self._finish(self._stream)
+        if self.target.viewer == "serve":
+            self._server = self._server or before
+        if self.target.live:
+            before.send_recording_name("given up, and begun again in tiles")
+        self._finish(before)
         with atomic_path(self.target.file) as file:
-            self._stream = stream = dataclasses.replace(self.target, file=file).open()
-            given_up.copy(self.target.file, stream, given_up.entities_of(unit, task, pictures=pictures))
+            target = dataclasses.replace(self.target, file=file, viewer=self.target.viewer_url)
+            self._stream = stream = target.open()
+            earlier.copy(self.target.file, stream, earlier.entities_of(unit, task, pictures=pictures))
         self._background, self._group = Background(stream, self._clock), None
-        self._send_blueprint(stream)
+        self._scenes.send_layout(stream)
+        self.target.drop(before.get_recording_id())
+
+    def unit_in_tiles(self, unit: Unit, key: str, portions: Collection[str]) -> None:
+        """Keep what an earlier start left of its parts, and the pictures of its frames."""
+        place = unit.scene, unit.backbone
+        self._tiled[place] = self._drift.keep(unit, key, portions) or self._tiled.get(place, False)
+        if self._stream is not None:
+            self._drift.belong_to(self._stream.get_recording_id())
 
     def part_started(self, task: Task, config: Config, part: Part, backend: FusionBackend) -> None:
         """Follow the part's map: pictures of drift wait in the folder until the parts are all there."""
@@ -196,7 +190,7 @@ class Recording(Observer):
         (stream, background), group = self._opened(), self._fused
         background.drain()
         self._clock.set(stream, *group.last)
-        self._log_numbers(stream, group, summary)
+        group.log_numbers(stream, summary)
 
     def group_finished(self, task: Task) -> None:
         """Log what flipped, and lay out what there is now."""
@@ -206,7 +200,7 @@ class Recording(Observer):
             return
         if group.tables:
             (*_, table) = group.tables.values()
-            background.submit(*group.last, functools.partial(self._lay_out, stream, group, table))
+            background.submit(*group.last, functools.partial(self._scenes.lay_out, stream, group, table))
         background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
         background.drain()
 
@@ -223,7 +217,7 @@ class Recording(Observer):
         """
         if self.target.live:
             raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
-        self._parts = Parts.of(folder)
+        self._parts, self._scenes.waits = Parts.of(folder), True
         self.target = self._parts.of_the_whole(self.target)
         return functools.partial(PictureRecording, self._parts)
 
@@ -248,7 +242,8 @@ class Recording(Observer):
         for run in result.runs:
             if (run.unit.scene, run.unit.backbone) in self._tasks:
                 self._log_drift(stream, self._tasks[run.unit.scene, run.unit.backbone], run)
-        self._send_blueprint(stream, last=True)
+        self._scenes.waits = False
+        self._scenes.send_layout(stream)
         self.close()
         self.target = parts.merged(self.target)
 
@@ -267,16 +262,16 @@ class Recording(Observer):
         stream, self._stream = self._stream, None
         if stream is None:
             return
-        if self._parts is None and not self.pictures_only:
-            self._drift.remove()
         try:
             if self._background is not None:
                 self._background.close()
-            for camera in self._cameras.values():
+            for camera in self._scenes.cameras.values():
                 if camera.unread is not None:
                     stream.log(path(camera.scene.name, "log"), rr.TextLog(f"without colour: {camera.unread}"))
         finally:
             self._finish(stream)
+            if self._server is not None:
+                self._server.disconnect()
 
     def _finish(self, stream: rr.RecordingStream) -> None:
         """Write the file's end. Raises ConfigError where that fails: the disk is full, for example."""
@@ -289,7 +284,8 @@ class Recording(Observer):
                 " same command makes it again"
             ) from error
         finally:
-            stream.disconnect()
+            if stream is not self._server:
+                stream.disconnect()
 
     @property
     def _fused(self) -> GroupLog:
@@ -299,89 +295,50 @@ class Recording(Observer):
 
     def _opened(self) -> tuple[rr.RecordingStream, Background]:
         if self._stream is None or self._background is None:
-            self._stream = stream = self.target.open()
+            self._stream = stream = self._begun()
             self._background = Background(stream, self._clock)
             if self.pictures_only:
                 return stream, self._background
-            _log_static(stream, self._plan, self._known)
-            self._send_blueprint(stream)
+            self._scenes.log_static(stream)
+            self._scenes.send_layout(stream)
             self._log_kept(stream)
         return self._stream, self._background
 
-    def _lay_out(self, stream: rr.RecordingStream, group: GroupLog, table: VoxelTable) -> None:
-        """All of a group is fused: send the layout again where there is more to it now. The table is one of its own."""
-        known, scene = self._known, group.task.scene.name
-        compared = len(group.task.backends) > 1
-        if compared:
-            known.spans[scene, group.task.backbone] = group.spans
-        legend = known.legends[scene]
-        used = legend.used
-        legend.see(group.task.mapping.target, dominant(table))
-        _log_legend(stream, scene, legend)
-        first = scene not in known.sceneries and len(table) > 0
-        if first:
-            some = table.index[:: math.ceil(len(table) / SAMPLE)]
-            points = ((some - group.origin + 0.5) * table.voxel_size).astype(np.float64)
-            known.sceneries[scene] = Scenery(points, self._cameras[scene].poses, group.task.scene.up)
-        self._show_chunks(stream, scene, group.voxels, anyway=first or compared or used != legend.used)
-
-    def _log_numbers(self, stream: rr.RecordingStream, group: GroupLog, summary: UnitSummary) -> None:
-        text = _final(summary) + group.remarks.get(summary.unit.backend, "")
-        stream.log(path(summary.unit.scene, "log"), rr.TextLog(text))
-        if summary.statistics is not None:
-            document = rr.TextDocument(looks_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
-            stream.log(path(summary.unit.scene, "agreement", summary.unit.backbone), document, static=True)
-
-    def _send_blueprint(self, stream: rr.RecordingStream, *, last: bool = False) -> None:
-        """Send the layout; into a part once: a merged file has layouts in no order, and the last one there is shown."""
-        if self._parts is not None and not last:
-            return
-        layout = blueprint(self._plan, self._known)
-        stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
-        self._sent += 1
-
-    def _show_chunks(self, stream: rr.RecordingStream, scene: str, voxels: int, *, anyway: bool = False) -> None:
-        """Send the layout again where a scene's map of that size has more chunks than it knows, or anyway."""
-        outgrown = chunks_of(voxels) > self._known.chunks[scene]
-        if outgrown:
-            self._known.chunks[scene] = CHUNKS
-        if outgrown or anyway:
-            self._send_blueprint(stream)
+    def _begun(self) -> rr.RecordingStream:
+        """A new recording; with pictures of frames in an earlier one where maps in tiles are gone on with."""
+        again = [self._tasks[place] for place, same in self._tiled.items() if same and self._parts is None]
+        if not again or not self._drift.recording or self._drift.recording != earlier.identity_of(self.target.file):
+            stream = self.target.open()
+        else:
+            with atomic_path(self.target.file) as file:
+                stream = dataclasses.replace(self.target, file=file).open()
+                shown = [earlier.pictures_of(task) for task in again]
+                frames = earlier.take(self.target.file, stream, {*itertools.chain.from_iterable(shown)})
+            for task, (depth, *_, labels) in zip(again, shown, strict=True):
+                self._scenes.origin(stream, task, task.scene.T_wc(task.indices[0])[:3, 3])
+                self._scenes.cameras[task.scene.name].take(frames.pop(depth, ()))
+                self._taken[task.scene.name, task.backbone] = frames[labels]
+        if self._tiled and self._parts is None:
+            self._drift.belong_to(stream.get_recording_id())
+        return stream
 
     def _log_kept(self, stream: rr.RecordingStream) -> None:
         kept, self._kept = self._kept, []
         for task, summaries in kept:
-            group: GroupLog | None = None
+            self._clock.set(stream, task.indices[-1])
+            if self._run is not None:
+                together = self._parts is not None
+                log_finished(stream, task, summaries, self._run, self._scenes, self._clock, track=together)
+                continue
             for summary in summaries:
-                self._clock.set(stream, task.indices[-1])
-                if self._run is None:
-                    text = (
-                        f"{_final(summary)}; finished by an earlier start, series and voxels are not in this recording"
-                    )
-                    stream.log(path(task.scene.name, "log"), rr.TextLog(text))
-                    continue
-                unit = summary.unit
-                if group is None:
-                    at = task.scene.T_wc(task.indices[0])[:3, 3]  # where the first frame was taken, as in a whole run
-                    group = GroupLog(task, summary.table.voxel_size, self._origin(stream, task, at))
-                    self._follow(stream, task, log=self._parts is not None and voxels_of(self._run, unit).is_dir())
-                    self._clock.set(stream, task.indices[-1])
-                factor, table = thinned_map(voxels_of(self._run, unit), group.origin)
-                for values in series.send_rows(
-                    stream, unit, task, self._run / "frames" / f"{unit.slug}.csv", self._clock
-                ):
-                    group.span(values)
-                self._clock.set(stream, task.indices[-1])
-                group.log_map(stream, unit, table, self._plan.config.tolerance, factor)
-                self._log_numbers(stream, group, summary)
-            if group is not None:
-                self._lay_out(stream, group, table)
+                text = f"{final(summary)}; finished by an earlier start, series and voxels are not in this recording"
+                stream.log(path(task.scene.name, "log"), rr.TextLog(text))
 
     def _log_drift(self, stream: rr.RecordingStream, task: Task, summary: UnitSummary) -> None:
         """Log what parts of a map in tiles have left: pictures of drift, and the voxels that drifted most."""
         group, place = None, (task.scene.name, task.backbone)
         for picture in self._drift.pictures(summary.unit) if place not in self._whole else ():
-            group = group or GroupLog(task, self._plan.config.voxel_size, self._origins[task.scene.name])
+            group = group or GroupLog(task, self._plan.config.voxel_size, self._scenes.origins[task.scene.name])
             self._clock.set(stream, picture.frame, picture.timestamp)
             group.log_drift(stream, picture)
         suspects = self._drift.suspects(summary.unit, summary.table.voxels)
@@ -389,27 +346,7 @@ class Recording(Observer):
             group.log_flips(stream, self._clock, suspects)
         if group is not None:
             self._whole.add(place)
-
-    def _follow(self, stream: rr.RecordingStream, task: Task, *, log: bool) -> None:
-        """Know where the camera was in frames that are not logged here, and log the track where nobody else does."""
-        times, camera = task.scene.timestamps, self._cameras[task.scene.name]
-        for index in camera.follow(task.indices):
-            if log:
-                self._clock.set(stream, index, None if times is None else float(times[index]))
-                camera.log_track(stream)
-
-    def _origin(self, stream: rr.RecordingStream, task: Task, position: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        """The scene's map origin, in voxels: settled near the first position that is known, and said."""
-        scene, voxel_size = task.scene.name, self._plan.config.voxel_size
-        if scene in self._origins:
-            return self._origins[scene]
-        steps = np.round(position / ORIGIN_STEP).astype(np.int64)
-        self._origins[scene] = origin = steps * round(ORIGIN_STEP / voxel_size)
-        self._cameras[scene] = CameraLog(task.scene, origin * voxel_size, len(task.indices))
-        if steps.any():
-            where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", origin * voxel_size, strict=True))
-            stream.log(path(scene, "log"), rr.TextLog(f"map coordinates are relative to {where} of the scene's world"))
-        return origin
+        self._drift.remove(summary.unit)
 
 
 class PictureRecording(Recording):
@@ -429,31 +366,3 @@ class PictureRecording(Recording):
             for backend in task.backends
         )
         self.run_started(Plan(config, {}, tuple(units), ()), [])
-
-
-def _log_legend(stream: rr.RecordingStream, scene: str, legend: Legend) -> None:
-    legend.log(stream, path(scene, "legend"), path(scene, "all_classes"))
-
-
-def _log_static(stream: rr.RecordingStream, plan: Plan, known: Known) -> None:
-    for scene, task in {task.scene.name: task for task in plan.tasks}.items():
-        if (up := task.scene.up) is not None:  # the axis of the world that is nearest to it
-            axis = int(np.abs(up).argmax())
-            name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
-            stream.log(path(scene), getattr(rr.ViewCoordinates, name), static=True)
-        _log_legend(stream, scene, known.legends[scene])
-        drift_colors.log_legend(stream, path(scene, "drift_legend"), task.mapping.target)
-    for task in plan.tasks:
-        entity = path(task.scene.name, "camera", task.backbone)
-        stream.log(f"{entity}/labels", label_context(task.mapping.target), static=True)
-        stream.log(f"{entity}/drift", drift_colors.context(task.mapping.target), static=True)
-    series.log_styles(stream, plan)
-
-
-def _final(summary: UnitSummary) -> str:
-    unit, table = summary.unit, summary.table
-    means = (f"{m.symbol} {table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
-    return (
-        f"{unit.backbone}, {unit.backend}: {table.voxels:,} voxels, mean OP {table.mean_op:.2f}, {', '.join(means)}"
-        f" (K = {table.K})"
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import uuid
 from dataclasses import dataclass, replace
@@ -52,5 +51,6 @@ class Parts:
                 raise ConfigError(
                     f"{whole.final}: the parts in {self.folder} cannot be merged ({done.stderr.strip()[:200]})"
                 )
-        shutil.rmtree(self.folder)
+        for part in parts:
+            part.unlink()
         return Target(whole.final)

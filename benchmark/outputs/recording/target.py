@@ -20,6 +20,7 @@ import rerun as rr
 from semstab.errors import ConfigError
 from semstab.runtime.files import open_file
 
+APPLICATION = "semstab"
 DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 CHOICES = "FILE.rrd, spawn, connect, rerun+http://HOST:PORT/proxy, serve, or off"
 
@@ -69,7 +70,7 @@ class Target:
 
     def open(self) -> rr.RecordingStream:
         """A stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
-        stream = rr.RecordingStream("semstab", recording_id=self.name)
+        stream = rr.RecordingStream(APPLICATION, recording_id=self.name)
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             # In place, not renamed when it is whole: a viewer can follow the run, and a killed run leaves a recording.
@@ -84,18 +85,28 @@ class Target:
         stream.set_log_time_enabled(False)
         return stream
 
+    @property
+    def viewer_url(self) -> str | None:
+        """Where the viewer listens, or what serves it does; None where there is none."""
+        return DEFAULT_URL if self.viewer in ("spawn", "serve") else self.viewer
+
+    def drop(self, recording: str | None) -> None:
+        """Take a recording out of the viewer. Who is served cannot be told to, and keeps it beside others."""
+        from rerun.experimental import ViewerClient
+
+        if self.viewer_url is not None and self.viewer != "serve":
+            with contextlib.suppress(OSError):  # what listens there need not be a viewer
+                ViewerClient(self.viewer_url).close(store_ids=[f"Recording:{APPLICATION}:{recording}"])
+
     def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
         if self.viewer == "serve":
             address = _address(DEFAULT_URL)
             if not _is_free(address):
                 raise ConfigError(f"--rerun serve: port {address[1]} is taken; end what listens there, or use connect")
             return rr.GrpcServerSink(*address)
-        if self.viewer == "spawn":
-            if _is_free(_address(DEFAULT_URL)):
-                _spawn(DEFAULT_URL)
-            url = DEFAULT_URL
-        else:
-            url = str(self.viewer)
+        url = str(self.viewer_url)
+        if self.viewer == "spawn" and _is_free(_address(url)):
+            _spawn(url)
         if (reason := _why_no_viewer(url)) is not None:
             raise ConfigError(f"{url}: no rerun viewer listens there ({reason}); start one with: rerun")
         return rr.GrpcSink(url)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import stretches
 from semstab.model.statistics import Flipping, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.sampling import Places, PlaceSums
@@ -38,15 +37,10 @@ class FlippingSums:
     together: Float64
 
     @classmethod
-    def of(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
-        """Of a table, by the probability (n,) of `steady`, over cubes of that edge in metres."""
-        return cls.merged([cls._of_few(table.rows(some), stable[some], edge) for some in stretches(len(table))])
-
-    @classmethod
-    def _of_few(cls, table: VoxelTable, stable: Float64, edge: float) -> FlippingSums:
+    def of(cls, table: VoxelTable, stable: Float64, places: Places) -> FlippingSums:
+        """Of a table, by the probability (n,) of `steady`, over the cubes of its voxels with OP >= 2."""
         unsteady = np.round((1 - stable) / UNIT) * UNIT
-        places = Places.of(table, edge)
-        share = PlaceSums(places.cell, edge, places.means({"": unsteady}))
+        share = PlaceSums(places.cell, places.edge, places.means({"": unsteady}))
         return cls(share, int(table.voxels.sum(where=table.op >= ENOUGH)), _together(table, table.voxels * unsteady))
 
     @classmethod

@@ -91,14 +91,14 @@ class _Cells:
     @classmethod
     def over(cls, seen: Events) -> _Cells:
         index = seen.ix, seen.iy, seen.iz
-        at, of, edge = cubes(index, seen.voxel_size)
+        at, cube_of, edge = cubes(index, seen.voxel_size)
         while len(at) > MOST_CUBES:
-            at, of, edge = cubes(index, seen.voxel_size, 2 * edge)
+            at, cube_of, edge = cubes(index, seen.voxel_size, 2 * edge)
         step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(at), 1) * (3 + seen.K))))
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2
         group = np.searchsorted(frames, seen.frame // step)
-        there, of = numbered(of[seen.voxel] * len(frames) + group)
+        there, of = numbered(cube_of[seen.voxel].astype(np.int64) * len(frames) + group)
         cube, group = np.divmod(there, max(len(frames), 1))
         return cls(at, cube, frames[group], of, edge, step)
 

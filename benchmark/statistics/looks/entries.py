@@ -189,8 +189,9 @@ class Looks:
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
         content = pa.table({name: arrow.column(values) for name, values in columns.items()})
         text = f'{json.dumps({"schema": SCHEMA, "kind": "Looks", **about})[:-1]}, "views": {self.views.text()}}}'
-        with atomic_path(path) as temporary:
-            pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
+        with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
+            file.write_table(content)
+            file.add_key_value_metadata({"semstab": text})  # a schema's own is written twice, and copied more often
 
     @classmethod
     def load(cls, path: str | Path) -> Looks:

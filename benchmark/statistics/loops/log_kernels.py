@@ -20,33 +20,39 @@ def argmax(log, row):
 
 
 @serial
-def count_flips(chunk, starts, frame, log, K, rate, null, since):
-    """By voxel (n,): the share of steps at which the predicted class changes, of pairs that differ, and frames since.
+def count_flips(chunk, starts, ends, log, K, rate, null, since):
+    """By voxel (n,): the share of steps at which the predicted class changes, of pairs that differ, and looks since.
 
-    starts (n + 1,) bounds its observations. NaN where there is no pair, and no change to count from.
+    starts and ends (n,) bound its observations. NaN where there is no pair, -1 where there is no change to count from.
     """
     begin, end = chunk * rate.shape[0] // CHUNKS, (chunk + 1) * rate.shape[0] // CHUNKS
     votes, longest = np.zeros(K, np.int64), 0
     for i in range(begin, end):
-        longest = max(longest, starts[i + 1] - starts[i])
+        longest = max(longest, ends[i] - starts[i])
     voted = np.empty(longest, np.int64)
     for i in range(begin, end):
-        rate[i] = null[i] = since[i] = np.nan
-        T = starts[i + 1] - starts[i]
+        rate[i] = null[i] = np.nan
+        since[i], T = -1, ends[i] - starts[i]
         if T < 2:
             continue
-        before, last, same, changes = np.int64(-1), np.int64(-1), np.int64(0), 0
-        for row in range(starts[i], starts[i + 1]):
+        before, same, changes = np.int64(-1), np.int64(0), 0
+        for row in range(starts[i], ends[i]):
             k = argmax(log, row)
             if before >= 0 and k != before:
                 changes += 1
-                last = row
+                since[i] = ends[i] - 1 - row
             same += votes[k]
             votes[k] += 1
             before = voted[row - starts[i]] = k
         pairs = T * (T - 1) // 2
         rate[i], null[i] = changes / (T - 1), (pairs - same) / pairs
-        if last >= 0:
-            since[i] = frame[starts[i + 1] - 1] - frame[last]
         for t in range(T):
             votes[voted[t]] = 0
+
+
+@serial
+def count_frames(ends, frame, since, frames):
+    """By voxel (n,): the frames from so many looks before its last one on until that, NaN for -1."""
+    for i in range(ends.shape[0]):
+        last = ends[i] - 1
+        frames[i] = frame[last] - frame[last - since[i]] if since[i] >= 0 else np.nan

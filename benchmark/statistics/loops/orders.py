@@ -13,10 +13,8 @@ from semstab.backends.shared.hashing import mix
 from semstab.runtime.compiled import compiled, serial
 from semstab.statistics.loops.asking import SOON, ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
+from semstab.statistics.loops.few_looks import ROUNDING
 from semstab.statistics.loops.logarithm import EIGHT, add_step
-
-ENUMERATED = 5
-"""Up to this OP all T! orders are gone through; 5! = 120."""
 
 LANES = 128
 """Orders that go side by side, at most."""
@@ -26,9 +24,6 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 TURNS = 8
 """A random order begins at so many places, as far apart as can be, and goes round: what comes first differs."""
-
-ROUNDING = 1e-9
-"""Sums of the same terms in another order differ by less."""
 
 
 # --- Orders, side by side ---------------------------------------------------------------------------------------------
@@ -160,27 +155,6 @@ def _draw_orders(order, age, T, seed, other):
             age[t, lane] = order[t, lane] - 0.5 * (T - 1)
 
 
-@serial
-def _all_orders(order, age, T):
-    """All T! orders, which are those of their inverses as well; returns how many."""
-    count = 1
-    order[0, 0] = 0
-    for t in range(1, T):  # the next observation at each place of each order
-        for place in range(t, -1, -1):
-            for lane in range(count):
-                to = place * count + lane
-                for earlier in range(t, place, -1):
-                    order[earlier, to] = order[earlier - 1, lane]
-                for earlier in range(place - 1, -1, -1):
-                    order[earlier, to] = order[earlier, lane]
-                order[place, to] = t
-        count *= t + 1
-    for t in range(T):
-        for lane in range(count):
-            age[t, lane] = order[t, lane] - 0.5 * (T - 1)
-    return count
-
-
 # --- Orders of one voxel ----------------------------------------------------------------------------------------------
 
 
@@ -199,11 +173,8 @@ def _groups(chunk, rank, T):
 @serial
 def _own_order(at, T, seed, state):
     """The order in which a voxel's observations go through the orders that all voxels of this OP go through."""
-    if T > ENUMERATED:
-        state[0] = seed
-        _shuffle(at, T, state)
-    else:
-        at[:T] = np.arange(T)
+    state[0] = seed
+    _shuffle(at, T, state)
 
 
 @serial
@@ -216,15 +187,6 @@ def _trend(x, A, T, at):
             moment += (t - 0.5 * (T - 1)) * x[a, at[t]]
         trend += moment * moment
     return trend
-
-
-@serial
-def _share(value, lanes, sign, least):
-    """The share of the lanes whose value times a sign is as high."""
-    hits = 0
-    for lane in range(lanes):
-        hits += sign * value[lane] >= least
-    return hits / lanes
 
 
 @serial
@@ -265,31 +227,15 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
     """What each voxel's order gives, and what orders of its observations give.
 
     rank (n,) sorts the voxels by OP; first, T (n,) are their rows of the log, seeds (n,) their random streams, and
-    `entries` is the most that one has. Where T <= ENUMERATED all orders are gone through: null (n,) takes their mean
-    sum of drifts, p (n, 3) the share of those with a sum as low, one as high, a trend as high. Else null is the mean
-    of `draws` random orders, TURNS of which are turns of one, unless it is `known` (n,), and p[:, 2] comes from random
-    orders until `enough` of them have a trend as high, or from the `most` that there are. trend (n,) takes what was
-    seen.
+    `entries` is the most that one has. null (n,) takes the mean sum of drifts of `draws` random orders, TURNS of which
+    are turns of one, unless it is `known` (n,), and p[:, 2] of (n, 3) comes from random orders until `enough` of them
+    have a trend as high, or from the `most` that there are. trend (n,) takes what was seen.
     """
     x, work, number, order, age, value = room(T, entries, K)
     at, own, other = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(LANES, np.int64)
     turned = np.empty((x.shape[1], TURNS), np.int64)
     for voxels in _groups(chunk, rank, T):
         steps = T[voxels[0]]
-        if steps <= ENUMERATED:
-            lanes = _all_orders(order, age, steps)
-            for i in voxels:
-                _own_order(at, steps, seeds[i], own)
-                A = dense(log, first[i], steps, number, at, x)
-                drifts(x, A, steps, order, lanes, work, value)
-                seen = value[lanes - 1]  # the last order is the one that was seen
-                null[i] = value[:lanes].mean()
-                p[i, 0] = _share(value, lanes, -1.0, -seen - ROUNDING)
-                p[i, 1] = _share(value, lanes, 1.0, seen - ROUNDING)
-                trends(x, A, steps, age, lanes, work, value)
-                trend[i] = _trend(x, A, steps, at)
-                p[i, 2] = _share(value, lanes, 1.0, trend[i] - ROUNDING * (1.0 + trend[i]))
-            continue
         base, left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
         hits = np.zeros(left, np.int64)
         for t in range(steps):

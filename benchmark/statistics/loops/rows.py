@@ -24,11 +24,11 @@ def add_classes(of, evidence, op, voxels, by_look, by_place):
 
 
 @serial
-def add_class_sums(evidence, op, voxels, exact, bounds, log, sums):
+def add_class_sums(evidence, op, voxels, exact, first, last, log, sums):
     """Add to sums (5, K), over voxels with OP >= 2: evidence, that / OP, disagreement, that * OP, squares.
 
-    Where exact (n,) holds the evidence is the sum of its squares too, else the log tells, whose rows bounds (n + 1,)
-    are a voxel's. Classes that nobody saw in a voxel are no disagreement there.
+    Where exact (n,) holds the evidence is the sum of its squares too, else the log tells, in which a voxel has the rows
+    from first (n,) to before last (n,). Classes that nobody saw in a voxel are no disagreement there.
     """
     starts, label, weight = evidence
     squares = np.zeros(sums.shape[1])
@@ -37,7 +37,7 @@ def add_class_sums(evidence, op, voxels, exact, bounds, log, sums):
         if T < 2.0:
             continue
         if not exact[i]:
-            for e in range(log[0][bounds[i]], log[0][bounds[i + 1]]):
+            for e in range(log[0][first[i]], log[0][last[i]]):
                 squares[log[1][e]] += log[2][e] * log[2][e]
         for entry in range(starts[i], starts[i + 1]):
             k, own = label[entry], weight[entry]
@@ -49,6 +49,19 @@ def add_class_sums(evidence, op, voxels, exact, bounds, log, sums):
             sums[3, k] += many * T * apart
             sums[4, k] += many * square
             squares[k] = 0.0
+
+
+@serial
+def majorities(evidence, share, found):
+    """The class (n,) that has more than this share of a row's evidence, at least a half; -1 where none has."""
+    starts, label, weight = evidence
+    for i in range(found.shape[0]):
+        first, end = starts[i], starts[i + 1]
+        total, best = 0.0, first
+        for e in range(first, end):
+            total += weight[e]
+            best = e if weight[e] > weight[best] else best
+        found[i] = label[best] if first < end and weight[best] / total > share else -1
 
 
 @serial

@@ -16,23 +16,23 @@ AVERAGING, MAJORITY, PRODUCT, GEOMETRIC = range(4)
 
 
 @serial
-def count_classes(chunk, starts, log, K, count):
+def count_classes(chunk, starts, ends, log, K, count):
     """How many classes each voxel ever saw: count[1:] of (n + 1,)."""
     seen = np.full(K, -1)
-    for i in range(chunk, starts.shape[0] - 1, CHUNKS):
-        for e in range(log[0][starts[i]], log[0][starts[i + 1]]):
+    for i in range(chunk, starts.shape[0], CHUNKS):
+        for e in range(log[0][starts[i]], log[0][ends[i]]):
             k = log[1][e]
             count[i + 1] += 1 if seen[k] != i else 0
             seen[k] = i
 
 
 @serial
-def list_classes(chunk, starts, log, K, first, label):
+def list_classes(chunk, starts, ends, log, K, first, label):
     """The classes that each voxel ever saw, ascending: label[first[i] : first[i + 1]]."""
     seen = np.full(K, -1)
-    for i in range(chunk, starts.shape[0] - 1, CHUNKS):
+    for i in range(chunk, starts.shape[0], CHUNKS):
         used = first[i]
-        for e in range(log[0][starts[i]], log[0][starts[i + 1]]):
+        for e in range(log[0][starts[i]], log[0][ends[i]]):
             k = log[1][e]
             if seen[k] != i:
                 seen[k] = i
@@ -124,13 +124,13 @@ def _observe(e, end, label, weight, classes, a, floor, certain, totals, lane):
 
 
 @serial
-def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules, floor, belief, rest, drift_sum):
+def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules, floor, belief, rest, drift_sum, bits):
     """Fuse each voxel's observations by each of the rules (R,).
 
     starts, ends (n,) bound their rows of the log. rank (n,) sorts them by OP and how many classes they saw, at most
     `most`: classes[first[i] : first[i + 1]]. belief (R, m) takes the beliefs in these after the last observation, rest
     (R, n) that in each of the others, which are all alike, drift_sum (R, n) the sum of the Jensen-Shannon divergences
-    of successive beliefs, bits.
+    of successive beliefs, bits (R, n) the entropy of the last one, in bits both.
     """
     at, label, weight = log
     certain = -np.log2(floor) if rules.max() >= PRODUCT else 0.0
@@ -174,6 +174,7 @@ def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules
             for lane in range(lanes):
                 i = voxels[lane]
                 drift_sum[r, i], rest[r, i] = drift[r, lane], before[r, A, lane]
+                bits[r, i] = max(-logs_before[r, lane], 0.0)
                 for a in range(first[i + 1] - first[i]):
                     belief[r, first[i] + a] = before[r, a, lane]
         begin += lanes

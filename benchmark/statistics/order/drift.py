@@ -6,6 +6,7 @@ less. So it is compared with what a random order of the very same observations g
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
+from semstab.model.evidence import stretches
 from semstab.model.measures import Quantity, sbd
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.observed import Log, Observed
 from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
@@ -42,21 +45,29 @@ class VoxelDrift:
     """The order of observations of each voxel (n,); NaN where undefined.
 
     null         SBD expected when the same observations come in random order, bits; OP >= 2
-    excess       SBD - null, bits: below 0 where the belief moves late or only once, above 0 where it moves early
     p_value      of an SBD this far from what random orders give, either way; where observations disagree, above
                  OP 5 of a random sample of these voxels
     trend        share of the disagreement that goes one way in time: R^2 of the evidence on the number of the
                  observation; OP >= 3, where observations disagree
-    trend_null   its expectation in random order, 1 / (OP - 1)
     trend_p      of a trend this large in random order
+    table        of the voxels
     """
 
     null: Float64
-    excess: Float64
     p_value: Float64
     trend: Float64
-    trend_null: Float64
     trend_p: Float64
+    table: VoxelTable
+
+    @property
+    def excess(self) -> Float64:
+        """SBD - null, bits: below 0 where the belief moves late or only once, above 0 where it moves early."""
+        return sbd(self.table) - self.null
+
+    @property
+    def trend_null(self) -> Float64:
+        """The trend's expectation in random order, 1 / (OP - 1)."""
+        return np.where(np.isnan(self.trend), np.nan, 1 / np.maximum(self.table.op - 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +105,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
 def voxel_drift(
     table: VoxelTable,
-    events: Events,
+    events: Log,
     *,
     seed: int = 0,
     draws: int = NULL_DRAWS,
@@ -124,15 +135,23 @@ def voxel_drift(
     expected = np.where(np.isnan(exact), expected, exact)
     return VoxelDrift(
         null=expected,
-        excess=sbd(table) - expected,
         p_value=_spread_out(p_value, vary),
         trend=_spread_out(trend, vary),
-        trend_null=_spread_out(np.where(T > 2, 1 / np.maximum(T - 1, 1), np.nan), vary),
         trend_p=_spread_out(np.where(T > 2, p[:, 2], np.nan), vary),
+        table=table,
     )
 
 
-def drift_p(table: VoxelTable, events: Events, *, seed: int = 0) -> Float64:
+def untested_drift(table: VoxelTable, log: Observed, *, seed: int = 0) -> VoxelDrift:
+    """The same, some voxels after the others; no SBD of a voxel with more orders than can be gone through is tested."""
+    null, p_value, trend, trend_p = (np.empty(len(table)) for _ in range(4))
+    for some in stretches(len(table)):
+        own = voxel_drift(table.rows(some), log.rows(some), seed=seed, sample=0)
+        null[some], p_value[some], trend[some], trend_p[some] = own.null, own.p_value, own.trend, own.trend_p
+    return VoxelDrift(null, p_value, trend, trend_p, table)
+
+
+def drift_p(table: VoxelTable, events: Log, *, seed: int = 0) -> Float64:
     """Of `voxel_drift` p_value (n,) alone."""
     orders = _Orders.of(table, events, seed)
     p, few = np.full(len(orders.T), np.nan), np.flatnonzero(~orders.many)
@@ -163,7 +182,7 @@ class _Orders:
     seed: np.uint64
 
     @classmethod
-    def of(cls, table: VoxelTable, events: Events, seed: int) -> _Orders:
+    def of(cls, table: VoxelTable, events: Log, seed: int) -> _Orders:
         spread = variation(table)
         vary = _vary(table, spread)
         T = table.op[vary].astype(np.int64)
@@ -174,9 +193,9 @@ class _Orders:
     @property
     def many(self) -> npt.NDArray[np.bool_]:
         """(n,) whether there are too many orders to go through all of them."""
-        from semstab.statistics.loops import orders
+        from semstab.statistics.loops.few_looks import ENUMERATED
 
-        above: npt.NDArray[np.bool_] = self.T > orders.ENUMERATED
+        above: npt.NDArray[np.bool_] = self.T > ENUMERATED
         return above
 
     def part(self, which: Int64) -> _Orders:
@@ -192,12 +211,20 @@ class _Orders:
         self, known: npt.NDArray[np.bool_], draws: int, most: int, enough: int
     ) -> tuple[Float64, Float64, Float64]:
         """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
-        from semstab.statistics.loops import chunks, orders
+        from semstab.statistics.loops import chunks, few_looks, orders
 
         n = len(self.T)
-        trend, null, p = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
-        chunks.in_chunks(orders.measure_voxels, *self._shared(), known, draws, most, enough, trend, null, p)
-        return trend, null, p
+        found = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
+        rank, *shared = self._shared()
+        bounds = np.searchsorted(self.T, np.arange(2, few_looks.ENUMERATED + 2), sorter=rank)
+        for T, (begin, end) in enumerate(itertools.pairwise(bounds), 2):
+            orders_of = few_looks.orders_and_steps(T)
+            log, K, entries = shared[2:5]
+            chunks.in_chunks(few_looks.measure_few, rank[begin:end], self.first, T, log, K, entries, *orders_of, *found)
+        if bounds[-1] < n:
+            rank = rank[bounds[-1] :]
+            chunks.in_chunks(orders.measure_voxels, rank, *shared, known, draws, most, enough, *found)
+        return found
 
     def test(self, which: Int64, most: int, enough: int) -> Float64:
         """P-values (r,) of the drifts of the voxels of these numbers."""
@@ -227,14 +254,14 @@ def drawn(table: VoxelTable, vary: npt.NDArray[np.bool_], observations: int, see
     They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
     what is drawn of a map is drawn of any part of it that holds it.
     """
-    from semstab.statistics.loops import orders
+    from semstab.statistics.loops.few_looks import ENUMERATED
 
     rows = np.flatnonzero(vary)
     own, T = streams(table, rows, seed), table.op[rows].astype(np.int64)
     order = lowest(own, observations // 2 + 1)  # each has two or more
     enough, many = (
         order[: np.searchsorted(np.cumsum(T[order]), observations) + 1],
-        np.flatnonzero(T > orders.ENUMERATED),
+        np.flatnonzero(T > ENUMERATED),
     )
     return rows[np.union1d(enough, many[lowest(own[many], DRIFT_SAMPLE)])]
 
@@ -251,28 +278,42 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]
     By its sum: the disagreement that goes one way in time, that in random order, and all of it.
     """
     rows = np.flatnonzero(~np.isnan(drift.trend))
-    parts = (drift.trend[rows], drift.trend_null[rows], np.ones(len(rows)))
+    parts = (drift.trend[rows], 1 / (table.op[rows] - 1.0), np.ones(len(rows)))
     return rows, np.stack(parts, axis=1) * variation(table)[rows, None]
 
 
-def flips(events: Events) -> Flips:
+def flips(events: Log) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
+    return flips_of(events, *changes(events))
+
+
+def changes(events: Log) -> tuple[Float64, Float64, npt.NDArray[np.int32]]:
+    """Of `flips` what does not hang on frames: rate and null (n,), and how many looks (n,) follow the last change."""
     from semstab.statistics.loops import chunks, log_kernels
 
-    bounds = events.bounds
-    rate, null, since = (np.empty(len(events.ix)) for _ in range(3))
-    log = events.evidence
-    chunks.in_chunks(log_kernels.count_flips, bounds, events.frame, log.entries, log.K, rate, null, since)
-    return Flips(rate, null, since)
+    (rate, null), since = np.empty((2, len(events.starts))), np.empty(len(events.starts), np.int32)
+    log, rows = events.evidence, (events.starts, events.ends)
+    chunks.in_chunks(log_kernels.count_flips, *rows, log.entries, log.K, rate, null, since)
+    return rate, null, since
+
+
+def flips_of(events: Log, rate: Float64, null: Float64, since: npt.NDArray[np.int32]) -> Flips:
+    """Those of a log, from its `changes`."""
+    from semstab.statistics.loops import log_kernels
+
+    frames = np.empty(len(rate))
+    log_kernels.count_frames(events.ends, events.frame, since, frames)
+    return Flips(rate, null, frames)
 
 
 def variation(table: VoxelTable) -> Float64:
     """(n,) how far a voxel's observations are from their mean: sum over frames of ||s_t - mean||^2."""
-    squares: Float64 = table.self_sum - table.evidence.concentration.squares / table.op
-    return np.maximum(squares, 0.0)
+    spread: Float64 = table.evidence.concentration.squares / table.op
+    np.subtract(table.self_sum, spread, out=spread)
+    return np.maximum(spread, 0.0, out=spread)
 
 
-def varying(table: VoxelTable, events: Events) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
+def varying(table: VoxelTable, events: Log) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
     """The voxels (n,) whose observations differ, with their first rows and OP; the others cannot drift."""
     vary = _vary(table, variation(table))
     return vary, events.starts[vary], table.op[vary].astype(np.int64)

@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.errors import ConfigError
+from semstab.model.concentration import Concentration
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import Events
 from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import ranked
 
 Float64 = npt.NDArray[np.float64]
@@ -30,6 +32,14 @@ class Belief(Evidence):
     """Beliefs (n, K) by the classes that each voxel saw; `rest` (n,) is that in each of the others."""
 
     rest: Float64
+
+    @classmethod
+    def with_bits(
+        cls, first: Int64, label: npt.NDArray[np.uint16], weight: Float64, K: int, rest: Float64, bits: Float64
+    ) -> Belief:
+        """Where the entropy (n,) of each is known."""
+        known = Concentration.of(first, label, weight, K, rest, bits)
+        return cls(first, label, weight, K, rest, known=known)
 
     @property
     def unseen(self) -> Float64:
@@ -79,7 +89,7 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
 
 
 def fuse_all(
-    events: Events,
+    events: Log,
     rules: Sequence[str],
     *,
     floor: float | None = None,
@@ -96,29 +106,30 @@ def fuse_all(
 
     K, log = events.evidence.K, events.evidence.entries
     first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
-    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.bounds[1:]))
-    belief, rest, drift_sum = (np.zeros((len(rules), size)) for size in (len(label), len(starts), len(starts)))
+    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.ends))
+    belief, *sums = (np.zeros((len(rules), size)) for size in (len(label), *3 * [len(starts)]))
     op, count = ends - starts, np.diff(first)
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
     rank = ranked(op * (most + 1) + count)
-    chunks.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, rest, drift_sum)
+    chunks.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, *sums)
     return [
-        Fused(Belief(first, label, belief[r], K, rest[r]), op.astype(np.int32), drift_sum[r]) for r in range(len(rules))
+        Fused(Belief.with_bits(first, label, own, K, rest, bits), op.astype(np.int32), drift_sum)
+        for own, rest, drift_sum, bits in zip(belief, *sums, strict=True)
     ]
 
 
-def classes_seen(events: Events) -> tuple[Int64, npt.NDArray[np.uint16]]:
+def classes_seen(events: Log) -> tuple[Int64, npt.NDArray[np.uint16]]:
     """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
 
-    bounds, log = events.bounds, events.evidence.entries
-    count = np.zeros(len(bounds), np.int64)
-    chunks.in_chunks(loops.count_classes, bounds, log, events.evidence.K, count)
+    bounds, log = (events.starts, events.ends), events.evidence.entries
+    count = np.zeros(len(events.starts) + 1, np.int64)
+    chunks.in_chunks(loops.count_classes, *bounds, log, events.evidence.K, count)
     first: Int64 = np.cumsum(count)
     label = np.zeros(first[-1], np.uint16)
-    chunks.in_chunks(loops.list_classes, bounds, log, events.evidence.K, first, label)
+    chunks.in_chunks(loops.list_classes, *bounds, log, events.evidence.K, first, label)
     return first, label
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import SPARSE, distinct, ranked
 from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
@@ -74,25 +76,24 @@ def of_table(
 
 
 def of_log(
-    events: Events,
+    events: Log,
     places: Places,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
     *,
-    step: int | None = None,
+    groups: FrameGroups | None = None,
 ) -> InfluenceSums:
-    """The same by the frames of a log, so many in a group, `frame_step` of them if not given."""
+    """The same by the frames of a log, whose groups are found if they are not given."""
     K = events.K
-    step = frame_step(events) if step is None else step
-    frames, group = frame_groups(events.frame, step)
-    sums = _sums_of_log(events, places, group, len(frames), true_label, likely)
+    groups = FrameGroups.of_log(events) if groups is None else groups
+    sums = _sums_of_log(events, places, groups, true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
     return InfluenceSums(
         places.cell[cell],
-        frames[frame].astype(np.int32),
+        groups.groups[frame].astype(np.int32),
         sums[cell, frame],
         places.edge,
-        step,
+        groups.step,
         events.voxel_size,
         K,
         events.classes,
@@ -154,35 +155,49 @@ def with_places(
     )
 
 
-def frame_step(events: Events) -> int:
-    """How many frames of a log are taken together."""
-    step, seen = 1, distinct(events.frame)
-    while len(seen) > most_groups(events.K):
-        step, seen = 2 * step, np.unique(seen // 2)
-    return step
+@dataclass(frozen=True, eq=False)
+class FrameGroups:
+    """The frames of a log, some of which are taken together.
 
+    step    how many
+    groups  (G,) their frames // step, ascending
+    of      (F,) and (m,): a table of groups, and the number in it of each observation
+    """
 
-def frame_groups(frame: npt.NDArray[np.int32], step: int) -> tuple[Int64, Int64]:
-    """The groups of so many frames, ascending, and which of them each frame (m,) is in."""
-    seen = distinct(frame)
-    groups, number = np.unique(seen // step, return_inverse=True)
-    if not len(seen) or seen[0] < 0 or seen[-1] > SPARSE * len(frame):
-        return groups, np.searchsorted(groups, frame // step)
-    of = np.zeros(int(seen[-1]) + 1, np.int64)
-    of[seen] = number
-    return groups, of[frame]
+    step: int
+    groups: Int64
+    of: tuple[Int64, npt.NDArray[np.int32]]
+
+    @classmethod
+    def of_log(cls, events: Log) -> FrameGroups:
+        """So many together that there are not too many groups."""
+        frame, seen = events.frame, distinct(events.frame)
+        step, left = 1, seen
+        while len(left) > most_groups(events.K):
+            step, left = 2 * step, np.unique(left // 2)
+        groups, number = np.unique(seen // step, return_inverse=True)
+        if not len(seen) or seen[0] < 0 or seen[-1] > SPARSE * len(frame):
+            return cls(step, groups, (np.arange(len(groups)), np.searchsorted(groups, frame // step).astype(np.int32)))
+        of = np.zeros(int(seen[-1]) + 1, np.int64)
+        of[seen] = number
+        return cls(step, groups, (of, frame))
 
 
 def _sums_of_log(
-    events: Events, places: Places, group: Int64, groups: int, true_label: Int64 | None, likely: Float64 | None
+    events: Log,
+    places: Places,
+    groups: FrameGroups,
+    true_label: Int64 | None,
+    likely: Float64 | None,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
     from semstab.statistics.loops.chunks import in_chunks
     from semstab.statistics.sampling import loops
 
     K, cells, again = events.K, places.count, np.flatnonzero(places.at >= 0)
-    sums = np.zeros((cells, groups, width(K, truth=true_label is not None)))
-    of = places.at[again]
+    count = len(groups.groups)
+    sums = np.zeros((cells, count, width(K, truth=true_label is not None)))
+    of = places.at[again].astype(np.int64)
     order = again[ranked(of)]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
     options = (K <= MOST_CLASSES, true_label is not None)
@@ -191,16 +206,16 @@ def _sums_of_log(
         order,
         bounds,
         np.ones(len(places.at)) if places.voxels is None else places.voxels,
-        events.bounds,
-        int(np.diff(events.bounds).max(initial=0)),
+        (events.starts, events.ends),
+        int((events.ends - events.starts).max(initial=0)),
         events.evidence.entries,
         K,
-        group,
+        groups.of,
         np.zeros(0, np.int64) if true_label is None else true_label,
         np.zeros(0) if likely is None else likely,
         *options,
-        groups,
-        sums.reshape(cells * groups, sums.shape[2]),
+        count,
+        sums.reshape(cells * count, sums.shape[2]),
     )
     return sums
 

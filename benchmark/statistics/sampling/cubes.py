@@ -11,7 +11,6 @@ from semstab.metrics.matching import voxel_keys
 from semstab.statistics.sampling.influence import MOST_CELLS
 
 Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
 FEW_RUNS = 1 << 12
@@ -20,7 +19,7 @@ FEW_RUNS = 1 << 12
 
 def cubes(
     index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, some: Mask | None = None
-) -> tuple[Int32, Int64, float]:
+) -> tuple[Int32, Int32, float]:
     """The cubes (G, 3) that hold voxels of index columns (n,), which of them each is in (n,), and their edge.
 
     A cube is floor(voxel centre / edge). Only `some` (n,) of the voxels count, the others are in -1. The edge, unless
@@ -32,7 +31,7 @@ def cubes(
     if edge is None:
         smallest = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
         edge = float(smallest * 2.0 ** loops.occupied(*index, some, voxel_size / smallest, MOST_CELLS))
-    cells, of, scale = np.empty((FEW_RUNS, 3), np.int64), np.empty(len(some), np.int64), voxel_size / edge
+    cells, of, scale = np.empty((FEW_RUNS, 3), np.int64), np.empty(len(some), np.int32), voxel_size / edge
     if (count := loops.runs(*index, some, scale, cells, of)) > len(cells):
         cells = np.empty((count, 3), np.int64)
         loops.runs(*index, some, scale, cells, of)

@@ -21,116 +21,116 @@ TIE = 1e-12
 
 
 @serial
-def _classes_of(log, first, T, rows, total, squares, own, active):
-    """A voxel's observations as dense rows (T, K), which are 0 before, their sums by class and those of squares.
+def _looks(log, first, T, number, active, x, total, squares, own):
+    """A voxel's observations by the classes that it ever saw, which are returned as how many they are.
 
-    log is (starts, label, weight) of all observations. Returns how many classes the voxel ever saw: those in `active`,
-    ascending; total and squares are of these only.
+    log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by look and class, active (A,) the
+    classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each look's
+    squares; number (K,) is work space, all -1.
     """
     at, label, weight = log
     A = 0
+    for e in range(at[first], at[first + T]):
+        k = np.int64(label[e])
+        if number[k] < 0:
+            number[k], j = 0, A
+            while j > 0 and active[j - 1] > k:
+                active[j] = active[j - 1]
+                j -= 1
+            active[j] = k
+            A += 1
+    for j in range(A):
+        number[active[j]], total[j], squares[j] = j, 0.0, 0.0
+    x[: T * A] = 0.0
     for t in range(T):
         own[t] = 0.0
         for e in range(at[first + t], at[first + t + 1]):
-            k = np.int64(label[e])
-            rows[t, k] = weight[e]
-            own[t] += weight[e] ** 2
-            j = A - 1
-            while j >= 0 and active[j] > k:
-                j -= 1
-            if j < 0 or active[j] != k:
-                for later in range(A, j + 1, -1):
-                    active[later] = active[later - 1]
-                active[j + 1] = k
-                total[k] = squares[k] = 0.0
-                A += 1
-            total[k] += weight[e]
-            squares[k] += weight[e] ** 2
+            j, square = number[label[e]], weight[e] ** 2
+            x[t * A + j] = weight[e]
+            total[j] += weight[e]
+            squares[j] += square
+            own[t] += square
+    for j in range(A):
+        number[active[j]] = -1
     return A
 
 
 @serial
-def _cleared(log, first, T, rows):
-    """Leave 0 where a voxel's observations were."""
-    for t in range(T):
-        for e in range(log[0][first + t], log[0][first + t + 1]):
-            rows[t, log[1][e]] = 0.0
-
-
-@serial
-def _label(total, active, A):
-    """The dominant class, the lowest of equals."""
-    best = active[0]
+def _label(total, A):
+    """Which class is the dominant one, the lowest of equals."""
+    best, top = 0, total[0]
     for j in range(1, A):
-        if total[active[j]] > total[best]:
-            best = active[j]
+        more = total[j] > top
+        best, top = (j if more else best), (total[j] if more else top)
     return best
 
 
 @serial
-def _label_without(total, row, active, A):
-    """The dominant class of the other observations."""
-    best, most = active[0], total[active[0]] - row[active[0]]
+def _label_without(total, x, look, A):
+    """Which is the dominant class of the other observations."""
+    best, top = 0, total[0] - x[look]
     for j in range(1, A):
-        rest = total[active[j]] - row[active[j]]
-        if rest > most + TIE:
-            best, most = active[j], rest
+        rest = total[j] - x[look + j]
+        more = rest > top + TIE
+        best, top = (j if more else best), (rest if more else top)
     return best
 
 
 @serial
-def _add_truth(sums, base, rows, first, T, many, group, truth, likely, total, active, A, without, mean, column, K):
+def _add_truth(sums, base, x, first, T, many, frames, truth, likely, total, active, A, label, without, mean, column, K):
     """What is right of so many voxels: of the fused label by leaving a frame out, of each look by itself.
 
-    mean (K,) is room.
+    mean (A,) is room.
     """
-    label = _label(total, active, A)
-    right = 1.0 if label == truth else 0.0
+    true, lead, most = -1, total[label], 0.0
     for j in range(A):
-        mean[active[j]] = 0.0
-    mean[truth] = 0.0
-    part = 1.0 / T
-    lead, most = total[label], 0.0
-    for j in range(A):
-        lead = min(lead, total[label] - total[active[j]]) if active[j] != label else lead
+        true = j if active[j] == truth else true
+        lead = min(lead, total[label] - total[j]) if j != label else lead
     for t in range(T):
-        most = max(most, rows[t, label])
-    if lead > most + TIE:  # whichever is left out
-        without[:T] = label
-        mean[label] = 1.0
-    else:
+        most = max(most, x[t * A + label])
+    right, part, alike = (1.0 if label == true else 0.0), 1.0 / T, lead > most + TIE  # whichever is left out
+    if not alike:
+        mean[:A] = 0.0
         for t in range(T):
-            without[t] = _label_without(total, rows[t], active, A)
+            without[t] = _label_without(total, x, t * A, A)
             mean[without[t]] += part
+    share, (group, frame) = part * many, frames
     for t in range(T):
-        r = base + group[first + t]
-        share = part * many
-        own = (right + (T - 1) * (mean[truth] - (without[t] == truth))) * share
+        r = base + group[frame[first + t]]
+        own = right * share
+        if not alike and true >= 0:
+            own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
         sums[r, column + KNOWN] += share
         sums[r, column + RIGHT] += own
         sums[r, column + LOOKS] += many
-        sums[r, column + LOOKS_RIGHT] += rows[t, truth] * many
+        if true >= 0:
+            sums[r, column + LOOKS_RIGHT] += x[t * A + true] * many
         if T > 2:
             sums[r, column + STABLE] += likely * share
             sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * share
         if K:
             sums[r, column + 6 + truth] += share
             sums[r, column + 6 + K + truth] += own
+            if alike:
+                sums[r, column + 6 + 2 * K + active[label]] += share
+                continue
             for j in range(A):
-                k = active[j]
-                sums[r, column + 6 + 2 * K + k] += ((label == k) + (T - 1) * (mean[k] - (without[t] == k))) * share
+                predicted = (label == j) + (T - 1) * (mean[j] - (without[t] == j))
+                sums[r, column + 6 + 2 * K + active[j]] += predicted * share
 
 
 @serial
-def _agreement(total, squares, T, active, A, surprise, apart):
-    """The agreement of two observations; of each class how surprising it is, and how far apart two of them are."""
+def _agreement(total, squares, T, A, certain, surprise, apart):
+    """The agreement of two observations; of each class how surprising it is, and how far apart two of them are.
+
+    certain is what a class is to be sure of, log K.
+    """
     agreed = 0.0
     for j in range(A):
-        k = active[j]
-        pairs = total[k] ** 2 - squares[k]
+        pairs = total[j] ** 2 - squares[j]
         agreed += pairs
-        surprise[k] = -np.log(total[k] / T) / np.log(surprise.shape[0]) / T if total[k] > 0.0 else 0.0
-        apart[k] = 2.0 * (total[k] / T - pairs / (T * (T - 1.0)))
+        surprise[j] = -np.log(total[j] / T) / certain / T if total[j] > 0.0 else 0.0
+        apart[j] = 2.0 * (total[j] / T - pairs / (T * (T - 1.0)))
     return agreed / (T * (T - 1.0))
 
 
@@ -148,14 +148,14 @@ def _one_class(log, first, T):
 
 
 @serial
-def _add_agreed(sums, base, k, first, T, many, group, truth, likely, column, K, by_class):
+def _add_agreed(sums, base, k, first, T, many, frames, truth, likely, column, K, by_class):
     """Add so many voxels whose observations are all of class k: they agree, and leaving one out changes none.
 
     column is the first with ground truth, where that is known; K classes.
     """
-    share, right = many / T, 1.0 if k == truth else 0.0
+    share, right, (group, frame) = many / T, 1.0 if k == truth else 0.0, frames
     for t in range(first, first + T):
-        r = base + group[t]
+        r = base + group[frame[t]]
         sums[r, VOXELS] += share
         sums[r, PSA] += share
         sums[r, OBSERVATIONS] += many
@@ -186,48 +186,48 @@ def _add_agreed(sums, base, k, first, T, many, group, truth, likely, column, K, 
 
 @serial
 def add_influences(
-    chunk, order, bounds, voxels, starts, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
+    chunk, order, bounds, voxels, rows, longest, log, K, frames, truth, likely, by_class, with_truth, groups, sums
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
-    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,). starts
-    (n + 1,) bound a voxel's rows of the log, `longest` at most, and of group (m,), truth (n,) is its true class or -1,
-    likely (n,) how likely it is stable, which is left open where that is empty. A place's
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,). rows
+    (starts (n,) and ends) bound a voxel's rows of the log, `longest` at most, and of frames: see `FrameGroups`. truth
+    (n,) is its true class or -1, likely (n,) how likely it is stable, which is left open where that is empty. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
     against, and the shares add up to T P.
     """
-    rows = np.zeros((longest, K))
-    total, squares, active = np.empty(K), np.empty(K), np.empty(K, np.int64)
-    own, without, mean = np.empty(longest), np.empty(longest, np.int64), np.empty(K)
-    surprise, apart = np.empty(K), np.empty(K)
+    starts, ends = rows
+    x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
+    total, squares, own, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
+    mean, surprise, apart, certain = np.empty(K), np.empty(K), np.empty(K), np.log(K)
     first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
+    group, frame = frames
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
-            first, T, steady = starts[i], starts[i + 1] - starts[i], likely[i] if likely.shape[0] else 0.0
+            first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
             k, many = _one_class(log, first, T), voxels[i]
             if k >= 0:
                 known = truth[i] if with_truth else -1
-                _add_agreed(sums, cell * groups, k, first, T, many, group, known, steady, first_truth, K, by_class)
+                _add_agreed(sums, cell * groups, k, first, T, many, frames, known, steady, first_truth, K, by_class)
                 continue
-            A = _classes_of(log, first, T, rows, total, squares, own, active)
-            best, agreed = _label(total, active, A), _agreement(total, squares, T, active, A, surprise, apart)
+            A = _looks(log, first, T, number, active, x, total, squares, own)
+            agreed, label = _agreement(total, squares, T, A, certain, surprise, apart), _label(total, A)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             part, of_others = many / T, 1.0 / (T - 1.0)
             for t in range(T):
-                r = cell * groups + group[first + t]
+                r = cell * groups + group[frame[first + t]]
                 with_others = surprised = 0.0
                 for j in range(A):
-                    k = active[j]
-                    s = rows[t, k]
-                    with_others += s * total[k]
+                    k, s = active[j], x[t * A + j]
+                    with_others += s * total[j]
                     sums[r, ENTROPY + 1 + k] += s * many
-                    surprised += s * surprise[k]
+                    surprised += s * surprise[j]
                     if by_class:
-                        others = (total[k] - s) * of_others
+                        others = (total[j] - s) * of_others
                         differs = s + others - 2.0 * s * others
-                        sums[r, ENTROPY + 1 + K + k] += (apart[k] + spread * (differs - apart[k])) * many
+                        sums[r, ENTROPY + 1 + K + k] += (apart[j] + spread * (differs - apart[j])) * many
                         sums[r, ENTROPY + 1 + 2 * K + k] += s**2 * many
                 share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
                 sums[r, VOXELS] += part
@@ -241,24 +241,23 @@ def add_influences(
                     sums[r, TWICE_AGREEING] += agreed * many
                 else:
                     sums[r, RECURRENT] += part
-                    sums[r, VSS] += rows[t, best] * part
+                    sums[r, VSS] += x[t * A + label] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, rows, first, T, many, group, truth[i], steady, total, active, A, without, mean,
-                    first_truth, K if by_class else 0,
+                    sums, cell * groups, x, first, T, many, frames, truth[i], steady, total, active, A, label, without,
+                    mean, first_truth, K if by_class else 0,
                 )  # fmt: skip
-            _cleared(log, first, T, rows)
 
 
 @serial
-def add_kinds(kind, voxels, first, bounds, group, groups, total):
+def add_kinds(kind, voxels, first, rows, frames, groups, total):
     """Add 1 / T for each of the T looks at voxels of kinds (n,) that there is room for, from the first on.
 
-    At (kind - first) * groups + group; each stands for voxels (n,), bounds (n + 1,) are of its rows of group (m,).
+    At (kind - first) * groups + group; each stands for voxels (n,); rows and frames as in `add_influences`.
     """
-    last = first + total.shape[0] // groups
+    last, (starts, ends), (group, frame) = first + total.shape[0] // groups, rows, frames
     for i in range(kind.shape[0]):
         if first <= kind[i] < last:
-            share, at = voxels[i] / (bounds[i + 1] - bounds[i]), (kind[i] - first) * groups
-            for row in range(bounds[i], bounds[i + 1]):
-                total[at + group[row]] += share
+            share, at = voxels[i] / (ends[i] - starts[i]), (kind[i] - first) * groups
+            for row in range(starts[i], ends[i]):
+                total[at + group[frame[row]]] += share

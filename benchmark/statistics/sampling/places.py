@@ -27,13 +27,13 @@ class Places:
     """The cubes of voxels, and sums over those in each.
 
     cell  (G, 3) int32 the cubes, sorted
-    at    (n,) int64 which of them each voxel is in, -1 for those that are left out
+    at    (n,) int32 which of them each voxel is in, -1 for those that are left out
     edge  metres, a power of 2
     voxels  (n,) how many voxels each stands for, None for one each
     """
 
     cell: npt.NDArray[np.int32]
-    at: npt.NDArray[np.int64]
+    at: npt.NDArray[np.int32]
     edge: float
     voxels: Float64 | None = None
 

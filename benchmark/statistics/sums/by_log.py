@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import stretches
-from semstab.model.measures import Beliefs, Voxels
 from semstab.model.statistics import RuleOutcome
 from semstab.model.voxels import Events, VoxelTable
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
+from semstab.statistics.correctness import rule_means_of
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order import fusion_rules
 from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns, varying
 from semstab.statistics.order.p_values import PValues
+from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
+from semstab.statistics.sums.by_rule import sums_by_rule
 
 Float64 = npt.NDArray[np.float64]
 FALSE_DISCOVERIES = 0.05
@@ -53,25 +53,30 @@ class LogSums:
         changes: Flips,
         seed: int,
     ) -> LogSums:
-        """Of a map with its log, from what is known of one voxel of each kind."""
-        every, (table, events, truth, places) = kinds.every, vars(kinds.one).values()
-        assert every.events is not None
-        vary = varying(table, events)[0]
-        rows, trend = trend_columns(table, drift)
+        """Of a map with its log, from what is known of one voxel of each kind; `drift` is that of their patterns."""
+        every, patterns, places = kinds.every, kinds.patterns, kinds.one.places
+        assert every.log is not None
+        assert patterns.log is not None
+        vary = patterns.spread(varying(patterns.table, patterns.log)[0])
+        tell, trend = trend_columns(patterns.table, drift)
+        number = np.full(len(patterns.table), -1)
+        number[tell] = np.arange(len(tell))
+        of = patterns.spread(number)
+        rows = np.flatnonzero(of >= 0)
         means = {
             "flip_rate": changes.rate,
             "flip_null": changes.null,
             "flip_excess": changes.rate - changes.null,
             "frames_since": changes.since,
         }
-        trends = places.rows(rows).sums(trend)
+        trends = places.rows(rows).sums(trend[of[rows]])
         excess = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
         return cls(
             PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
             trends.sum(axis=0),
-            PValues.of(np.where(table.op >= TESTABLE, drift.trend_p, np.nan)),
-            _rules(table, events, truth),
-            *sampled(every.table, every.events, seed, vary if kinds.of is None else vary[kinds.of]),
+            PValues.of(np.where(patterns.table.op >= TESTABLE, drift.trend_p, np.nan)),
+            sums_by_rule(kinds),
+            *sampled(every.table, every.log.events, seed, vary if kinds.of is None else vary[kinds.of]),
         )
 
     @classmethod
@@ -101,31 +106,12 @@ class LogSums:
         return order_test(self.table, self.events, seed=seed), drift_p(self.table, self.events, seed=seed)
 
 
-def log_maps(drift: VoxelDrift, changes: Flips) -> Maps:
-    """What a part's log says of each voxel; drift_p of those that are not sampled."""
+def log_maps(patterns: Patterns, drift: VoxelDrift, changes: Flips) -> Maps:
+    """What a part's log says of each voxel, whose patterns drift so; drift_p of those that are not sampled."""
     return {
-        "drift_p": drift.p_value,
-        "trend": drift.trend,
-        "trend_p": drift.trend_p,
+        "drift_p": patterns.spread(drift.p_value),
+        "trend": patterns.spread(drift.trend),
+        "trend_p": patterns.spread(drift.trend_p),
         "flip_rate": changes.rate,
         "frames_since_flip": changes.since,
     }
-
-
-def _rules(table: VoxelTable, events: Events, truth: Truth | None) -> Float64:
-    """(R, 2 + C), over the voxels with OP >= 2, some after the others."""
-    _, *others = fusion_rules.RULES  # the map's own rule is the first
-    total, seen = np.zeros(()), np.flatnonzero(table.op >= 2)
-    for some in stretches(len(seen)):
-        own = seen[some]
-        part = Voxels(table.op[own], table.evidence.take(own), table.drift_sum[own])
-        usual, voxels = fusion_rules.labels(part.evidence), table.voxels[own]
-        known = None if truth is None else Truth(truth.known[own], truth.label[own])
-        by_rule: list[Beliefs] = [part]
-        by_rule += fusion_rules.fuse_all(events, others, evidence=part.evidence, rows=own)
-        rows = []
-        for fused in by_rule:
-            relabelled = voxels.sum(where=fusion_rules.labels(fused.evidence) != usual)
-            rows.append(np.concatenate([[relabelled, voxels.sum()], rule_sums(fused, voxels, known)]))
-        total = total + np.stack(rows)
-    return total

@@ -17,8 +17,11 @@ from semstab.statistics.correctness import Judged, judged_strata, judged_where
 from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
-from semstab.statistics.order.drift import flips, voxel_drift
+from semstab.statistics.observed import Log
+from semstab.statistics.order.drift import Flips, changes, flips_of, untested_drift
+from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import PlaceSums
+from semstab.statistics.sampling.collect import FrameGroups
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
 from semstab.statistics.sums.stable_looks import StableLooks
@@ -42,8 +45,8 @@ class TruthSums:
     stable: StableLooks
 
     @classmethod
-    def of(cls, kinds: Kinds, edges: Sequence[int], step: int) -> TruthSums:
-        """Of a map with true classes, whose frames are taken in groups of so many."""
+    def of(cls, kinds: Kinds, edges: Sequence[int], groups: FrameGroups | None) -> TruthSums:
+        """Of a map with true classes, whose log has these groups of frames."""
         table, truth, places = kinds.one.table, kinds.one.truth, kinds.one.places
         assert truth is not None
         judged = Judged.of(table.evidence, truth.label, table.voxels)
@@ -52,7 +55,7 @@ class TruthSums:
             PlaceSums(places.cell, places.edge, places.means(right)),
             judged_strata(judged, table.op, truth.known, edges),
             judged_where(judged, truth.known & (table.op >= 2)),
-            StableLooks.of(kinds, step),
+            StableLooks.of(kinds, groups),
         )
 
     @classmethod
@@ -117,20 +120,28 @@ def first_look(
     See `analyse` for what it takes.
     """
     kinds = kinds.measured()
-    table, events = kinds.one.table, kinds.one.events
-    drift = None if events is None else voxel_drift(table, events, seed=seed, sample=0)
-    null = None if drift is None else drift.null
-    own = MapSums.of(kinds, edges, null=null)
+    table, seen = kinds.one.table, kinds.one.log
+    patterns = kinds.patterns
+    drift = None if patterns.log is None else untested_drift(patterns.table, patterns.log, seed=seed)
+    null = None if drift is None else patterns.spread(drift.null)
+    groups = None if kinds.every.log is None else FrameGroups.of_log(kinds.every.log)
+    own = MapSums.of(kinds, edges, null=null, groups=groups)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
-    if events is not None and drift is not None:
-        changes = flips(events)
-        log = LogSums.of(kinds, drift, changes, seed)
-        more = log_maps(drift, changes) | more
+    if seen is not None and drift is not None:
+        changed = _flips_of(patterns, seen)
+        log = LogSums.of(kinds, drift, changed, seed)
+        more = log_maps(patterns, drift, changed) | more
     found = FirstSums(
         own,
         Votes.of(table),
         log,
-        None if kinds.one.truth is None else TruthSums.of(kinds, edges, own.influence.step),
+        None if kinds.one.truth is None else TruthSums.of(kinds, edges, groups),
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null
+
+
+def _flips_of(patterns: Patterns, seen: Log) -> Flips:
+    """Of all voxels (n,), whose log is `seen`."""
+    assert patterns.log is not None
+    return flips_of(seen, *(patterns.spread(values) for values in changes(patterns.log)))

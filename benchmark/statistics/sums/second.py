@@ -19,7 +19,7 @@ from semstab.statistics.map_sums import Maps
 from semstab.statistics.order.drift import TESTABLE
 from semstab.statistics.order.p_values import PValues, benjamini_hochberg
 from semstab.statistics.ranks import distinct_rows
-from semstab.statistics.sampling import InfluenceSums, PlaceSums
+from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums
 from semstab.statistics.steady import Votes, steady
 from semstab.statistics.sums.by_log import FALSE_DISCOVERIES
 from semstab.statistics.sums.first import FirstSums
@@ -144,11 +144,12 @@ def second_look(kinds: Kinds, overall: Overall, limit: VoxelTable | None = None)
     kinds = kinds.measured()
     table, truth = kinds.one.table, kinds.one.truth
     stable, edge = steady(table, overall.shares), overall.edge
+    places = kinds.one.places if kinds.one.places.edge == edge else Places.of(table, edge)
     maps: Maps = {"stable": stable}
     if truth is not None:
         maps["stable_wrong"] = wrong_of_steady(table, truth, stable)
     found = SecondSums(
-        FlippingSums.of(table, stable, edge),
+        FlippingSums.of(table, stable, places),
         None if truth is None else quadrant_sums(table, truth, stable, edge),
         None if limit is None or overall.loss_edge is None else loss_sums(kinds.every.table, limit, overall.loss_edge),
     )

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.measures import dominant, vss
 from semstab.model.results import RECURRENT
-from semstab.model.voxels import Events
 from semstab.statistics.kinds import Kinds
+from semstab.statistics.observed import Log
 from semstab.statistics.ranks import distinct_rows, numbered
-from semstab.statistics.sampling.collect import frame_groups
+from semstab.statistics.sampling.collect import FrameGroups
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
 
@@ -44,30 +43,30 @@ class StableLooks:
     step: int
 
     @classmethod
-    def of(cls, kinds: Kinds, step: int) -> StableLooks:
+    def of(cls, kinds: Kinds, groups: FrameGroups | None) -> StableLooks:
         """Those of a map with true classes."""
         one = kinds.one
         assert one.truth is not None
         counted = np.flatnonzero(one.truth.known & (one.table.op >= RECURRENT))
-        some, edge = one.table.rows(counted), one.places.edge
-        cell, of = one.places.cell, one.places.at[counted]
-        T, wrong = some.op.astype(np.int64), dominant(some) != one.truth.label[counted]
+        evidence, edge = one.table.evidence.concentration, one.places.edge
+        cell, of = one.places.cell, one.places.at[counted].astype(np.int64)
+        T, wrong = one.table.op[counted].astype(np.int64), evidence.label[counted] != one.truth.label[counted]
         longest = int(T.max(initial=0)) + 1
-        packed = ((of * longest + T) * longest + np.rint(vss(some) * T).astype(np.int64)) * 2 + wrong
+        packed = ((of * longest + T) * longest + np.rint(evidence.largest[counted] * T).astype(np.int64)) * 2 + wrong
         votings, voting = numbered(packed)
         pairs, is_wrong = np.divmod(votings, 2)
         ofs, votes = np.divmod(pairs, longest * longest)
         keys = np.column_stack([cell[ofs], np.full(len(votings), -1), *np.divmod(votes, longest), is_wrong])
-        if one.events is None:
-            count = np.bincount(voting, weights=some.voxels, minlength=len(votings))
+        if one.log is None or groups is None:
+            count = np.bincount(voting, weights=one.table.voxels[counted], minlength=len(votings))
             return cls(keys.astype(np.int32), count.astype(np.float64), edge, 0)
-        groups, group = frame_groups(one.events.frame, step)
         of = np.full(len(one.table), -1)
         of[counted] = voting
-        key, weight = _by_frame(one.events, of, one.table.voxels, len(votings), group, len(groups))
-        own = keys[key // max(len(groups), 1)]
-        own[:, 3] = groups[key % max(len(groups), 1)]
-        return cls(own.astype(np.int32), weight, edge, step)
+        key, weight = _by_frame(one.log, of, one.table.voxels, len(votings), groups)
+        many = max(len(groups.groups), 1)
+        own = keys[key // many]
+        own[:, 3] = groups.groups[key % many]
+        return cls(own.astype(np.int32), weight, edge, groups.step)
 
     @classmethod
     def merged(cls, parts: Sequence[StableLooks], edge: float, step: int) -> StableLooks:
@@ -98,21 +97,20 @@ class StableLooks:
         ).coarsened(sums.edge, sums.step)
 
 
-def _by_frame(
-    events: Events, kind: Int64, voxels: Float64, kinds: int, group: Int64, groups: int
-) -> tuple[Int64, Float64]:
-    """What kinds (n,) of voxels, -1 is none, which groups (m,) of frames saw: kind * groups + group, and how many.
+def _by_frame(log: Log, kind: Int64, voxels: Float64, kinds: int, groups: FrameGroups) -> tuple[Int64, Float64]:
+    """What kinds (n,) of voxels, -1 is none, which groups of frames saw: kind * groups + group, and how many.
 
     A row stands for voxels (n,), of which each counts 1 / T for each of its T frames.
     """
     from semstab.statistics.sampling.loops import add_kinds
 
-    step, found = max(1, AT_ONCE // max(groups, 1)), [(kind[:0], np.zeros(0))]
+    count, found = len(groups.groups), [(kind[:0], np.zeros(0))]
+    step = max(1, AT_ONCE // max(count, 1))
     for first in range(0, kinds, step):
-        total = np.zeros(min(step, kinds - first) * groups)
-        add_kinds(kind, voxels, first, events.bounds, group, groups, total)
+        total = np.zeros(min(step, kinds - first) * count)
+        add_kinds(kind, voxels, first, (log.starts, log.ends), groups.of, count, total)
         key = np.flatnonzero(total)
-        found.append((key + first * groups, total[key]))
+        found.append((key + first * count, total[key]))
     keys, weights = zip(*found, strict=True)
     return np.concatenate(keys), np.concatenate(weights)
 
