@@ -84,7 +84,7 @@ def by_group(
 
     wide = -(-len(values) // TOGETHER) * TOGETHER
     sums, defined = np.zeros((2, wide, groups))
-    of, many = group.astype(np.int64, copy=False), np.zeros(0) if voxels is None else voxels
+    of, many = group.astype(np.int32, copy=False), np.zeros(0) if voxels is None else voxels
     for first in range(0, wide, TOGETHER):
         own = [np.ascontiguousarray(column, dtype=np.float64) for column in values[first : first + TOGETHER]]
         some = slice(first, first + TOGETHER)

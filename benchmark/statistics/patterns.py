@@ -84,7 +84,7 @@ class Patterns:
 
 
 def judged_alike(
-    beliefs: Sequence[Evidence], at: Int64, table: VoxelTable, rows: Int64, truth: Int64
+    beliefs: Sequence[Evidence], at: npt.NDArray[np.int32], table: VoxelTable, rows: Int64, truth: Int64
 ) -> npt.NDArray[np.float64]:
     """(R, C) `judged_sums` of some rows (n,) of a table with true classes (n,), where these are known.
 
@@ -99,7 +99,7 @@ def judged_alike(
         rest = np.zeros(0) if belief.unseen is None else belief.unseen
         errors_of(belief.entries, rest, found[r].label, K, top[r], errors[r])
     about = (top, np.stack([own.label for own in found]), np.stack([own.largest for own in found]), errors)
-    total, voxels = np.zeros((size[0], 3 + 3 * BINS + 3 * K)), table.voxels
+    total, voxels = np.zeros((size[0], 3 + 3 * BINS + 3 * K)), np.zeros(0) if table.copies is None else table.copies
     for first in range(0, len(rows), BLOCK):
         some, sums = slice(first, first + BLOCK), np.zeros_like(total)
         own = (at[some], rows[some], truth[some], voxels)

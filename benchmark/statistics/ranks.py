@@ -17,7 +17,7 @@ STRETCH = 1 << 16
 """Places are counted so many at a time: what stays in a core's cache costs no new memory."""
 
 
-def ranked(numbers: Int64) -> Int64:
+def ranked(numbers: npt.NDArray[np.integer]) -> Int64:
     """The order (n,) that sorts numbers from 0 on, stably.
 
     By radix where they have 16 bits at most; else with the place of each in its lowest bits, as far as there is room
@@ -32,19 +32,19 @@ def ranked(numbers: Int64) -> Int64:
     return placed
 
 
-def ordered(numbers: Int64) -> tuple[Int64, Int64]:
+def ordered(numbers: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
     """The numbers, ascending, and what `ranked` says of them."""
     bits = len(numbers).bit_length()
     if int(numbers.max(initial=0)) >> (63 - bits):
         order = ranked(numbers)
-        return numbers[order], order
+        return numbers[order].astype(np.int64), order
     placed = _placed(numbers, bits)
     order = placed & ((1 << bits) - 1)
     placed >>= bits
     return placed, order
 
 
-def _placed(numbers: Int64, bits: int) -> Int64:
+def _placed(numbers: npt.NDArray[np.integer], bits: int) -> Int64:
     """The numbers, ascending, with the place of each in so many lowest bits."""
     placed = numbers.astype(np.int64)
     placed <<= bits

@@ -197,7 +197,7 @@ def _sums_of_log(
     K, cells, again = events.K, places.count, np.flatnonzero(places.at >= 0)
     count = len(groups.groups)
     sums = np.zeros((cells, count, width(K, truth=true_label is not None)))
-    of = places.at[again].astype(np.int64)
+    of = places.at[again]
     order = again[ranked(of)]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
     options = (K <= MOST_CLASSES, true_label is not None)
@@ -205,7 +205,7 @@ def _sums_of_log(
         loops.add_influences,
         order,
         bounds,
-        np.ones(len(places.at)) if places.voxels is None else places.voxels,
+        np.zeros(0) if places.voxels is None else places.voxels,
         (events.starts, events.ends),
         int((events.ends - events.starts).max(initial=0)),
         events.evidence.entries,

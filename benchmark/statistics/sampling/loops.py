@@ -190,8 +190,8 @@ def add_influences(
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
-    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,). rows
-    (starts (n,) and ends) bound a voxel's rows of the log, `longest` at most, and of frames: see `FrameGroups`. truth
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,), for one
+    where that is empty. rows (starts (n,) and ends) bound a voxel's rows of the log, `longest` at most, and of frames: see `FrameGroups`. truth
     (n,) is its true class or -1, likely (n,) how likely it is stable, which is left open where that is empty. A place's
     pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was held
@@ -207,7 +207,7 @@ def add_influences(
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
             first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
-            k, many = _one_class(log, first, T), voxels[i]
+            k, many = _one_class(log, first, T), voxels[i] if voxels.shape[0] else 1.0
             if k >= 0:
                 known = truth[i] if with_truth else -1
                 _add_agreed(sums, cell * groups, k, first, T, many, frames, known, steady, first_truth, K, by_class)
@@ -258,6 +258,7 @@ def add_kinds(kind, voxels, first, rows, frames, groups, total):
     last, (starts, ends), (group, frame) = first + total.shape[0] // groups, rows, frames
     for i in range(kind.shape[0]):
         if first <= kind[i] < last:
-            share, at = voxels[i] / (ends[i] - starts[i]), (kind[i] - first) * groups
+            many, at = voxels[i] if voxels.shape[0] else 1.0, (kind[i] - first) * groups
+            share = many / (ends[i] - starts[i])
             for row in range(starts[i], ends[i]):
                 total[at + group[frame[row]]] += share

@@ -18,9 +18,8 @@ from semstab.statistics.order import fusion_rules
 from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, drift_p, trend_columns, varying
 from semstab.statistics.order.p_values import PValues
 from semstab.statistics.patterns import Patterns
-from semstab.statistics.sampling import PlaceSums
+from semstab.statistics.sampling import Places, PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
-from semstab.statistics.sums.by_rule import sums_by_rule
 
 Float64 = npt.NDArray[np.float64]
 FALSE_DISCOVERIES = 0.05
@@ -46,36 +45,28 @@ class LogSums:
     events: Events
 
     @classmethod
-    def of(
-        cls,
-        kinds: Kinds,
-        drift: VoxelDrift,
-        changes: Flips,
-        seed: int,
-    ) -> LogSums:
-        """Of a map with its log, from what is known of one voxel of each kind; `drift` is that of their patterns."""
+    def of(cls, kinds: Kinds, rules: Float64, drift: VoxelDrift, changes: Flips, seed: int) -> LogSums:
+        """Of a map with its log, from `sums_by_rule` and what is known of one voxel of each kind.
+
+        `drift` is that of their patterns.
+        """
         every, patterns, places = kinds.every, kinds.patterns, kinds.one.places
         assert every.log is not None
         assert patterns.log is not None
-        vary = patterns.spread(varying(patterns.table, patterns.log)[0])
-        tell, trend = trend_columns(patterns.table, drift)
-        number = np.full(len(patterns.table), -1)
-        number[tell] = np.arange(len(tell))
-        of = patterns.spread(number)
-        rows = np.flatnonzero(of >= 0)
+        trends = _trends(patterns, places, drift)
+        excess = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
         means = {
             "flip_rate": changes.rate,
             "flip_null": changes.null,
             "flip_excess": changes.rate - changes.null,
             "frames_since": changes.since,
         }
-        trends = places.rows(rows).sums(trend[of[rows]])
-        excess = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
+        vary = patterns.spread(varying(patterns.table, patterns.log)[0])
         return cls(
             PlaceSums(places.cell, places.edge, places.means(means) | {"trend_excess": excess}),
             trends.sum(axis=0),
             PValues.of(np.where(patterns.table.op >= TESTABLE, drift.trend_p, np.nan)),
-            sums_by_rule(kinds),
+            rules,
             *sampled(every.table, every.log.events, seed, vary if kinds.of is None else vary[kinds.of]),
         )
 
@@ -104,6 +95,16 @@ class LogSums:
     def tested(self, seed: int) -> tuple[OrderTest, Float64]:
         """What the orders of the sampled voxels say of all, and the p-value of the SBD of each of them (n,)."""
         return order_test(self.table, self.events, seed=seed), drift_p(self.table, self.events, seed=seed)
+
+
+def _trends(patterns: Patterns, places: Places, drift: VoxelDrift) -> Float64:
+    """(cells, 3) sums of `trend_columns` over the cubes of places, whose patterns drift so."""
+    tell, trend = trend_columns(patterns.table, drift)
+    number = np.full(len(patterns.table), -1, np.int32)
+    number[tell] = np.arange(len(tell))
+    of = patterns.spread(number)
+    rows = np.flatnonzero(of >= 0)
+    return places.rows(rows).sums(trend[of[rows]])
 
 
 def log_maps(patterns: Patterns, drift: VoxelDrift, changes: Flips) -> Maps:

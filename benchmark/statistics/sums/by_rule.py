@@ -40,15 +40,16 @@ def sums_by_rule(kinds: Kinds) -> Float64:
     return total
 
 
-def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, Int64]]:
+def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, npt.NDArray[np.int32]]]:
     """Some patterns (p,) with OP >= 2 after the others, the rows (n,) of the voxels that have one, and which (n,)."""
     of, again = kinds.patterns.of, kinds.patterns.table.op >= 2
     seen, rows = np.flatnonzero(again), np.flatnonzero(kinds.one.table.op >= 2)
-    at = (np.cumsum(again) - 1)[rows if of is None else of[rows]]
+    at = np.cumsum(again, dtype=np.int32)[rows if of is None else of[rows]]
+    at -= 1
     if len(seen) <= STRETCH:
         yield seen, rows, at
         return
-    at, order = ordered(at)
+    at_all, order = ordered(at)
     for some in stretches(len(seen)):
-        own = slice(*np.searchsorted(at, [some.start, some.stop]))
-        yield seen[some], rows[order[own]], at[own] - some.start
+        own = slice(*np.searchsorted(at_all, [some.start, some.stop]))
+        yield seen[some], rows[order[own]], (at_all[own] - some.start).astype(np.int32)

@@ -24,6 +24,7 @@ from semstab.statistics.sampling import PlaceSums
 from semstab.statistics.sampling.collect import FrameGroups
 from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
+from semstab.statistics.sums.by_rule import sums_by_rule
 from semstab.statistics.sums.stable_looks import StableLooks
 
 Float64 = npt.NDArray[np.float64]
@@ -122,20 +123,22 @@ def first_look(
     kinds = kinds.measured()
     table, seen = kinds.one.table, kinds.one.log
     patterns = kinds.patterns
+    groups = None if kinds.every.log is None else FrameGroups.of_log(kinds.every.log)
+    rules = None if seen is None else sums_by_rule(kinds)  # before all that is kept: what follows has its memory
+    truth = None if kinds.one.truth is None else TruthSums.of(kinds, edges, groups)
     drift = None if patterns.log is None else untested_drift(patterns.table, patterns.log, seed=seed)
     null = None if drift is None else patterns.spread(drift.null)
-    groups = None if kinds.every.log is None else FrameGroups.of_log(kinds.every.log)
     own = MapSums.of(kinds, edges, null=null, groups=groups)
     log, more = None, {} if kinds.one.label is None else {"true_label": kinds.one.label}
-    if seen is not None and drift is not None:
+    if seen is not None and drift is not None and rules is not None:
         changed = _flips_of(patterns, seen)
-        log = LogSums.of(kinds, drift, changed, seed)
+        log = LogSums.of(kinds, rules, drift, changed, seed)
         more = log_maps(patterns, drift, changed) | more
     found = FirstSums(
         own,
         Votes.of(table),
         log,
-        None if kinds.one.truth is None else TruthSums.of(kinds, edges, groups),
+        truth,
         None if limit is None else Occupied.of(kinds.every.table.index[repeated(kinds.every.table, limit)[0]]),
     )
     return found, more, null

@@ -60,9 +60,9 @@ class StableLooks:
         if one.log is None or groups is None:
             count = np.bincount(voting, weights=one.table.voxels[counted], minlength=len(votings))
             return cls(keys.astype(np.int32), count.astype(np.float64), edge, 0)
-        of = np.full(len(one.table), -1)
-        of[counted] = voting
-        key, weight = _by_frame(one.log, of, one.table.voxels, len(votings), groups)
+        kind = np.full(len(one.table), -1, np.int32)
+        kind[counted] = voting
+        key, weight = _by_frame(one.log, kind, one.table.copies, len(votings), groups)
         many = max(len(groups.groups), 1)
         own = keys[key // many]
         own[:, 3] = groups.groups[key % many]
@@ -97,14 +97,17 @@ class StableLooks:
         ).coarsened(sums.edge, sums.step)
 
 
-def _by_frame(log: Log, kind: Int64, voxels: Float64, kinds: int, groups: FrameGroups) -> tuple[Int64, Float64]:
+def _by_frame(
+    log: Log, kind: npt.NDArray[np.int32], copies: Float64 | None, kinds: int, groups: FrameGroups
+) -> tuple[Int64, Float64]:
     """What kinds (n,) of voxels, -1 is none, which groups of frames saw: kind * groups + group, and how many.
 
-    A row stands for voxels (n,), of which each counts 1 / T for each of its T frames.
+    A row stands for `copies` (n,) of voxels, for one where these are not given, of which each counts 1 / T for each of its T frames.
     """
     from semstab.statistics.sampling.loops import add_kinds
 
-    count, found = len(groups.groups), [(kind[:0], np.zeros(0))]
+    count, found = len(groups.groups), [(np.zeros(0, np.int64), np.zeros(0))]
+    voxels = np.zeros(0) if copies is None else copies
     step = max(1, AT_ONCE // max(count, 1))
     for first in range(0, kinds, step):
         total = np.zeros(min(step, kinds - first) * count)
