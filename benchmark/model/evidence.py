@@ -31,9 +31,9 @@ def row_chunks(rows: int, K: int) -> Iterator[slice]:
     return (slice(first, min(first + step, rows)) for first in range(0, max(rows, 1), step))
 
 
-def stretches(rows: int) -> Iterator[slice]:
+def stretches(rows: int, most: int = STRETCH) -> Iterator[slice]:
     """Consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
-    return (slice(first, min(first + STRETCH, rows)) for first in range(0, max(rows, 1), STRETCH))
+    return (slice(first, min(first + most, rows)) for first in range(0, max(rows, 1), most))
 
 
 @dataclass(frozen=True, eq=False)

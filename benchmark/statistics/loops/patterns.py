@@ -99,8 +99,8 @@ def add_alike(at, rows, truth, voxels, starts, labels, first, top, dominant, lar
     """Add voxels with R beliefs to sums (R, C), see `judged_sums`; nothing where the true class (n,) is -1.
 
     at (n,) is which of the beliefs, whose entries begin at first (p + 1,), a voxel has, rows (n,) where its own classes
-    stand in starts and labels, and its number of voxels, one where these are empty. top and errors are those of `errors_of`, dominant and largest
-    (R, p) the most likely class and the belief in it.
+    stand in starts and labels, and its number of voxels, one where these are empty. top and errors are
+    those of `errors_of`, dominant and largest (R, p) the most likely class and the belief in it.
     """
     K = (sums.shape[1] - 3 - 3 * bins) // 3
     kind = 3 + 3 * bins

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.evidence import STRETCH, stretches
+from semstab.model.evidence import stretches
 from semstab.model.measures import Voxels
 from semstab.statistics.correctness import rule_sums
 from semstab.statistics.kinds import Kinds
@@ -17,6 +17,9 @@ from semstab.statistics.ranks import ordered
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+
+TOGETHER = 1 << 15
+"""Patterns whose beliefs are held at once."""
 
 
 def sums_by_rule(kinds: Kinds) -> Float64:
@@ -46,10 +49,12 @@ def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, npt.NDArray[np.
     seen, rows = np.flatnonzero(again), np.flatnonzero(kinds.one.table.op >= 2)
     at = np.cumsum(again, dtype=np.int32)[rows if of is None else of[rows]]
     at -= 1
-    if len(seen) <= STRETCH:
+    if len(seen) <= TOGETHER:
         yield seen, rows, at
         return
-    at_all, order = ordered(at)
-    for some in stretches(len(seen)):
-        own = slice(*np.searchsorted(at_all, [some.start, some.stop]))
-        yield seen[some], rows[order[own]], (at_all[own] - some.start).astype(np.int32)
+    if of is not None:
+        at, order = ordered(at)
+        rows = rows[order]
+    for some in stretches(len(seen), TOGETHER):
+        own = slice(*np.searchsorted(at, [some.start, some.stop]))
+        yield seen[some], rows[own], (at[own] - some.start).astype(np.int32)

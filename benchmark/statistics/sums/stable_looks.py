@@ -102,7 +102,8 @@ def _by_frame(
 ) -> tuple[Int64, Float64]:
     """What kinds (n,) of voxels, -1 is none, which groups of frames saw: kind * groups + group, and how many.
 
-    A row stands for `copies` (n,) of voxels, for one where these are not given, of which each counts 1 / T for each of its T frames.
+    A row stands for `copies` (n,) of voxels, for one where these are not given, of which each counts
+    1 / T for each of its T frames.
     """
     from semstab.statistics.sampling.loops import add_kinds
 
