@@ -193,7 +193,7 @@ def add_influences(
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,), for one
     where that is empty. rows (starts (n,) and ends) bound a voxel's rows of the log, `longest` at most, and of frames:
     see `FrameGroups`. truth (n,) is its true class or -1, likely (n,) how likely it is stable, which is left open where
-    that is empty. A place's pairwise agreement P is shared out among its frames as P + 2 (T - 1) / (T - 2) (a_t - P), a_t
+    that is empty. The pairwise agreement P of a place is shared out as P + 2 (T - 1) / (T - 2) (a_t - P), a_t
     being frame t's mean agreement with the others: what is left of a frame is then its own quality, free of that of the
     frames it was held against, and the shares add up to T P.
     """
