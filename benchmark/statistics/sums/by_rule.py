@@ -47,10 +47,10 @@ def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, npt.NDArray[np.
     """Some patterns (p,) with OP >= 2 after the others, the rows (n,) of the voxels that have one, and which (n,)."""
     of, again = kinds.patterns.of, kinds.patterns.table.op >= 2
     seen, rows = np.flatnonzero(again), np.flatnonzero(kinds.one.table.op >= 2)
-    at = np.cumsum(again, dtype=np.int32)[rows if of is None else of[rows]]
+    at: npt.NDArray[np.integer] = np.cumsum(again, dtype=np.int32)[rows if of is None else of[rows]]
     at -= 1
     if len(seen) <= TOGETHER:
-        yield seen, rows, at
+        yield seen, rows, at.astype(np.int32, copy=False)
         return
     if of is not None:
         at, order = ordered(at)
