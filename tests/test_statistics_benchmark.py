@@ -1,4 +1,4 @@
-"""The benchmark of the statistics runs and prints its table, at a size where its figures mean nothing."""
+"""The benchmarks of the statistics run and print their tables, at a size where the figures mean nothing."""
 
 from __future__ import annotations
 
@@ -17,3 +17,13 @@ def test_the_benchmark_prints_its_table_and_writes_it(tmp_path, capsys, monkeypa
     runpy.run_path(str(PERF / "bench_statistics.py"), run_name="__main__")
     assert "all statistics" in capsys.readouterr().out
     assert {"fusion", "table", "all statistics"} < set(json.loads((tmp_path / "figures.json").read_text())["seconds"])
+
+
+def test_the_benchmark_of_whole_runs_prints_its_tables(capsys, monkeypatch):
+    monkeypatch.syspath_prepend(str(PERF))
+    small = ["--frames", "4", "--size", "64x48", "--voxel-size", "0.2", "--runs", "1"]
+    monkeypatch.setattr(sys, "argv", ["bench_run.py", *small])
+    runpy.run_path(str(PERF / "bench_run.py"), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert "as it is" in printed
+    assert "with --statistics" in printed

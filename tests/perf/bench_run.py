@@ -63,7 +63,8 @@ def main() -> None:
     arguments = parser.parse_args()
     width, height = (int(side) for side in arguments.size.split("x"))
     with tempfile.TemporaryDirectory() as there:
-        root = arguments.data or str(written(Path(there), walked(arguments.frames, (width, height), 7, 1), 7))
+        frames = walked(arguments.frames, (width, height), 7, 1)
+        root = arguments.data or str(written(Path(there), arguments.frames, frames, 7))
         settings = {"dataset": {"name": "posed_folder", "options": {"root": root}}, "voxel_size": arguments.voxel_size}
         settings |= {"check": None, "backends": ["numba"]}
         if arguments.backbone:
