@@ -13,7 +13,9 @@ from scipy import stats
 from simulated_events import grid, log_of
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval
+from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling import (
+    Places,
     answers,
     asked_of,
     difference,
@@ -26,6 +28,7 @@ from semstab.statistics.sampling import (
     value,
 )
 from semstab.statistics.sampling.arrangement import arranged
+from semstab.statistics.sampling.intervals import NO_PLACES
 
 
 def sums_from(labels, side, voxel_size=0.125):
@@ -66,6 +69,15 @@ def test_no_error_seen_is_not_no_error():
     assert psa.low == pytest.approx(0.025 ** (1 / 100))
     assert alpha.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
     assert estimate(sums, "alpha").low < 0
+
+
+def test_what_weighs_next_to_nothing_is_nowhere():
+    """Of 150 classes so few voxels may be stable that the square of their number is none any more."""
+    rng = np.random.default_rng(0)
+    places = Places.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
+    columns = np.stack([rng.random(32 * 32) < 0.3, np.ones(32 * 32)], axis=1)
+    assert places.estimate(columns, ratio_of).decided
+    assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_PLACES
 
 
 def test_few_places_that_disagree_leave_a_wide_interval_below():

@@ -79,8 +79,8 @@ def influences(where: Where, columns: Float64, of: Statistic, halves: Float64 | 
     gradient = gradient_of(of, total)
     everything = np.abs(where.by_place(columns[:, 1]))
     some = everything > TINY * everything.sum()
-    if some.sum() < 2 or not np.isfinite(gradient).all():
-        return None
+    if some.sum() < 2 or everything.sum() < TINY or not np.isfinite(gradient).all():
+        return None  # of 150 classes hardly any voxel may count as stable: 1e-112 of all of them
     own: Float64 = columns @ gradient
     shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
     by_frame, size = where.by_both(shared), where.by_both(np.abs(columns[:, 1]))
