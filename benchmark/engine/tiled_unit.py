@@ -30,6 +30,8 @@ class TiledUnit:
     many voxels the parts before had, of how many were expected. Where several tasks share the parts, the largest are
     first, and the last one of each is cut in two as well: none is left with a large one when the others are done.
     What needs no part, or no second look at one, is put together `beside` those who are at them.
+
+    key  under which its portions are kept
     """
 
     def __init__(
@@ -37,17 +39,17 @@ class TiledUnit:
     ) -> None:
         self.planned, self._folder, self._tiling = planned, folder, tiling
         self._beside = beside or Beside()
-        self._key = unit_key(planned.identity, planned.digest)
+        self.key = unit_key(planned.identity, planned.digest)
         self._there: dict[str, Finished] = {}
-        there = folder.portions(self._key)
-        whole = self._evened(Request.portions(planned, self._key, tiling, width), width, there)
+        there = folder.portions(self.key)
+        whole = self._evened(Request.portions(planned, self.key, tiling, width), width, there)
         requests = [each for request in whole for each in self._as_cut(request, there - {_name(one) for one in whole})]
         self._requests = {_name(request): request for request in requests}
         self._whole: Whole | None = None
         self._second: dict[str, Request] | None = None  # looks at the parts, once all of them are there
         self._again: dict[str, SeenAgain] = {}
         for name in self._requests.keys() & there:
-            if (found := folder.portion(self._key, name)) is not None:
+            if (found := folder.portion(self.key, name)) is not None:
                 self._there[name] = found.without_rows()
         self._failed = False
         self._sampled: cf.Future[Sampled] | None = None  # what all frames tell, once they are looked at
@@ -64,11 +66,6 @@ class TiledUnit:
     def name(self) -> str:
         """What the progress calls it."""
         return f"{self.planned.unit.scene} · {self.planned.unit.backbone}"
-
-    @property
-    def key(self) -> str:
-        """Under which it is kept."""
-        return self._key
 
     @property
     def finished(self) -> list[str]:
@@ -110,7 +107,7 @@ class TiledUnit:
     def _keep(self, outcome: Outcome, name: str) -> Outcome | None:
         """A finished portion; why the unit failed, where it cannot be kept."""
         self._folder.save_files(outcome)
-        found = self._folder.portion(self._key, name)
+        found = self._folder.portion(self.key, name)
         if found is None:
             return self._error(name, f"part {name} is not in the folder; start it again")
         self._there[name] = found.without_rows()
@@ -142,7 +139,7 @@ class TiledUnit:
 
     def _loaded(self, name: str) -> Finished:
         """A portion with what it has of each frame. Raises DataError where it is gone meanwhile."""
-        if (found := self._folder.portion(self._key, name)) is None:
+        if (found := self._folder.portion(self.key, name)) is None:
             raise DataError(f"{self.name}: part {name} is no longer in the folder as it was; start it again")
         return found
 

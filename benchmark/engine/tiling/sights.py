@@ -21,6 +21,7 @@ from semstab.model.labels import fixed
 from semstab.pixels.perturbation import perturb
 from semstab.runtime.array_files import read_arrays, write_arrays
 from semstab.runtime.prefetch import prefetch
+from semstab.statistics.ranks import distinct_rows
 from semstab.task import Task
 
 SIGHTS = "sights"
@@ -60,11 +61,12 @@ class Sights:
         """The same for cells of that size, a multiple of this one."""
         shift = (size // self.size).bit_length() - 1
         rows = np.unique(np.column_stack([self.frame, self.cell >> shift]), axis=0)
-        place, of = _distinct(self.place >> shift)
+        place, of = distinct_rows(self.place >> shift)
         cells = len(place)
         voxels = np.bincount(of, weights=self.voxels, minlength=cells).astype(np.float64)
         observations = np.bincount(of, weights=self.observations, minlength=cells).astype(np.float64)
-        return Sights(size, rows[:, 0], rows[:, 1:], place, voxels, observations, self.frames, self.origin)
+        parts = rows[:, 0], rows[:, 1:], place.astype(np.int32)
+        return Sights(size, *parts, voxels, observations, self.frames, self.origin)
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
@@ -137,18 +139,12 @@ def sights_of(stretches: Iterable[Seen], origin: tuple[int, int, int], cell: int
     seen, first = collected.seen(), np.array(origin, dtype=np.int64)
     index = index_of_keys(seen.key, first)[:, :2] >> (seen.size.bit_length() - 1)
     places = np.concatenate([index.astype(np.int32), seen.rows[:, 1:]])
-    place, of = _distinct(places)
+    place, of = distinct_rows(places)
     of, scale = of[: len(index)], ALL / seen.share
     voxels = (scale * np.bincount(of, minlength=len(place))).astype(np.float64)
     observations = (scale * np.bincount(of, weights=seen.looks, minlength=len(place))).astype(np.float64)
-    return Sights(seen.size, seen.rows[:, 0], seen.rows[:, 1:], place, voxels, observations, seen.frames, first)
-
-
-def _distinct(cells: Int32) -> tuple[Int32, npt.NDArray[np.intp]]:
-    """The different ones of (n, 2) cells, sorted, and which of them each is: by one number each, which sorts fast."""
-    half = np.int64(1) << 31
-    packed, of = np.unique((cells[:, 0].astype(np.int64) << 32) + cells[:, 1] + half, return_inverse=True)
-    return np.column_stack([packed >> 32, (packed & (2 * half - 1)) - half]).astype(np.int32), of
+    cells = seen.rows[:, 0], seen.rows[:, 1:], place.astype(np.int32)
+    return Sights(seen.size, *cells, voxels, observations, seen.frames, first)
 
 
 def _geometry(task: Task, index: int, pixel_stride: int) -> Frame:
