@@ -12,9 +12,10 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.config import validated
+from semstab.core.registry import Entry, Registry
+from semstab.core.types import Float32, UInt8, UInt16
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
-from semstab.runtime.registry import Entry, Registry
 
 REGISTRY = Registry(
     "backbone",
@@ -24,45 +25,45 @@ REGISTRY = Registry(
             "k-means of colour and texture, one codebook a sequence: a baseline without weights",
         ),
         "transformers": Entry(
-            "semstab.backbones.pretrained.segmenter:Segmenter",
+            "semstab.backbones.segmenter:Segmenter",
             "any transformers checkpoint that segments: SegFormer, UPerNet, Mask2Former, OneFormer, EoMT, CLIPSeg, ...",
             install="pip install 'semstab[segformer]'",
         ),
         "segformer": Entry(
-            "semstab.backbones.pretrained.segmenter:Segmenter",
+            "semstab.backbones.segmenter:Segmenter",
             "the same by its first name",
             install="pip install 'semstab[segformer]'",
         ),
         "sam-raw": Entry(
-            "semstab.backbones.sam.raw:SamRaw",
+            "semstab.backbones.sam:SamRaw",
             "Segment Anything's proposals as regions without classes",
             install="pip install 'semstab[sam]'",
         ),
         "sam-heuristic": Entry(
-            "semstab.backbones.sam.heuristic:SamHeuristic",
+            "semstab.backbones.sam:SamHeuristic",
             "Segment Anything's proposals with classes from rules on colour, size and shape",
             install="pip install 'semstab[sam]'",
         ),
         "sam-vote": Entry(
-            "semstab.backbones.sam.vote:SamVote",
+            "semstab.backbones.sam:SamVote",
             "another backbone's labels, by majority inside Segment Anything's proposals",
             install="pip install 'semstab[sam]'",
         ),
         "segearth-ov": Entry(
-            "semstab.backbones.segearth.segearth_ov:SegEarthOV",
+            "semstab.backbones.segearth_ov:SegEarthOV",
             "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
             install="pip install 'semstab[segearth]'",
         ),
         "stored": Entry(
-            "semstab.predict.stored:Stored", "labels that a scene has already, for --filter: --set source=NAME"
+            "semstab.predict.predictor:Stored", "labels that a scene has already, for --filter: --set source=NAME"
         ),
     },
 )
 
-Image = npt.NDArray[np.uint8]
+Image = UInt8
 """(H, W, 3) uint8 RGB."""
 
-Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Labels = UInt8 | UInt16
 
 UNASSIGNED = 0
 """The id of a pixel without a region, in the maps of backbones without classes."""
@@ -78,7 +79,7 @@ class Prediction:
     """
 
     labels: Labels
-    scores: npt.NDArray[np.float32] | None = None
+    scores: Float32 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ class Streamed:
     """
 
     labels: Labels
-    maps: Callable[[], Iterator[npt.NDArray[np.float32]]]
+    maps: Callable[[], Iterator[Float32]]
 
 
 class Backbone(Protocol):
@@ -178,9 +179,8 @@ def backbone_class(name: str) -> Any:
 
     It has `Options` and is called with them. Raises ConfigError, DataError, MissingDependencyError.
     """
-    from semstab.backbones.outside.code import is_code
-    from semstab.backbones.outside.network import NetworkMaker, is_network
-    from semstab.backbones.outside.own import Own
+    from semstab.backbones.custom import Own, is_code
+    from semstab.backbones.network import NetworkMaker, is_network
 
     if is_network(name):
         return NetworkMaker(name)

@@ -10,15 +10,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.config import Settings
+from semstab.core.types import Float32
 from semstab.errors import ConfigError
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
-Features = npt.NDArray[np.float32]
+Features = Float32
 
 LIGHTNESS = 0
 """The feature by which clusters are numbered."""

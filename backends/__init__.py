@@ -10,12 +10,13 @@ from typing import Any, Protocol, cast, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.registry import Entry, Registry
+from semstab.core.types import Float32, Float64, Int64, UInt16
 from semstab.errors import ConfigError
+from semstab.model.events import Events
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Events, VoxelTable
-from semstab.model.voxels.extent import Extent
-from semstab.runtime.registry import Entry, Registry
+from semstab.model.voxels import Extent, VoxelTable
 
 OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
 
@@ -92,14 +93,14 @@ class Changes:
     before, after  (n,) uint16 its dominant class; where it was not seen before, both are the one after
     """
 
-    row: npt.NDArray[np.int64]
-    key: npt.NDArray[np.int64]
-    drift: npt.NDArray[np.float32]
-    before: npt.NDArray[np.uint16]
-    after: npt.NDArray[np.uint16]
+    row: Int64
+    key: Int64
+    drift: Float32
+    before: UInt16
+    after: UInt16
 
     @classmethod
-    def room(cls, row: npt.NDArray[np.int64], key: npt.NDArray[np.int64]) -> Changes:
+    def room(cls, row: Int64, key: Int64) -> Changes:
         """To be filled, for the voxels of these rows and keys."""
         n = len(row)
         return cls(row, key, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
@@ -109,7 +110,7 @@ class Changes:
 class GrowingMap(FusionBackend, Protocol):
     """A backend whose map can be followed voxel by voxel while it grows: what the recording asks for.
 
-    A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.pixels.keys`.
+    A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.keys`.
     """
 
     @property
@@ -117,7 +118,7 @@ class GrowingMap(FusionBackend, Protocol):
         """Edge of a voxel, metres."""
 
     @property
-    def origin(self) -> npt.NDArray[np.int64]:
+    def origin(self) -> Int64:
         """(3,) voxel index that packed keys count from; of an empty map 0."""
 
     @property
@@ -127,13 +128,13 @@ class GrowingMap(FusionBackend, Protocol):
     def __len__(self) -> int:
         """The number of voxels."""
 
-    def column(self, name: str, rows: npt.NDArray[np.int64] | slice = ...) -> npt.NDArray[Any]:
+    def column(self, name: str, rows: Int64 | slice = ...) -> npt.NDArray[Any]:
         """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""
 
-    def evidence_of(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    def evidence_of(self, rows: Int64) -> Float64:
         """Evidence (n, K) of the voxels of those rows."""
 
-    def index_of(self, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def index_of(self, rows: Int64) -> Int64:
         """Voxel indices (n, 3) of the voxels of those rows."""
 
 
@@ -161,7 +162,7 @@ def create(
 def _restricted(
     cls: Any, name: str, voxel_size: float, num_classes: int, within: Extent, options: Mapping[str, Any]
 ) -> FusionBackend:
-    from semstab.backends.shared.restricted import Restricted
+    from semstab.backends.shared.association import Restricted
 
     if not restrictable(name):
         raise ConfigError(f"backend '{name}' does not associate pixel by pixel; it cannot be restricted to a part")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numba as nb
@@ -17,34 +18,102 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import Changes
-from semstab.backends.numba_parts.dense import count_rows, update_dense
-from semstab.backends.numba_parts.history import History
-from semstab.backends.numba_parts.loops import (
+from semstab.backends.numba_loops import (
     SLOT,
     count_chain,
+    count_rows,
     look_up,
+    place_observations,
     read_chain,
     record_types,
     rehash,
     unchain,
     update,
+    update_dense,
 )
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.hashing import PARTITIONS, mix
-from semstab.backends.shared.observed import Observed, ObservedScores
-from semstab.backends.shared.pixels.keys import columns_of_keys, index_of_keys
-from semstab.backends.shared.scores.vectors import LANES
-from semstab.backends.shared.total import Change, MapTotal
+from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys, mix
+from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
+from semstab.backends.shared.score_loops import LANES
+from semstab.core.compiled import is_kept, settings
+from semstab.core.types import Float64, Int32, Int64, UInt16
 from semstab.errors import ConfigError
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Events, VoxelTable
-from semstab.model.voxels.extent import Extent
-from semstab.runtime.compiled import is_kept, settings
+from semstab.model.voxels import Extent, VoxelTable
 
-Int64 = npt.NDArray[np.int64]
+# The log of observations that the numba backend keeps on request.
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A frame's observations, kept: rows of the map, pixels, and their entries as in `Observed`, without empty ones."""
+
+    frame: int
+    row: Int32
+    pixels: Int32
+    entries: UInt16
+    label: UInt16
+    weight: Float64
+
+
+class History:
+    """Every observation of a map, frame after frame."""
+
+    def __init__(self, voxel_size: float, num_classes: int) -> None:
+        self.voxel_size = voxel_size
+        self.num_classes = num_classes
+        self._seen: list[_Seen] = []
+
+    def append(self, seen: Observed, row: Int64, frame: int) -> None:
+        """Keep a copy of the observations of the map's rows that outlives the next frame."""
+        some = seen.weight > 0
+        entries = (
+            np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if len(seen.key) else seen.key.astype(np.uint16)
+        )
+        self._seen.append(
+            _Seen(
+                frame,
+                row.astype(np.int32),
+                seen.pixels.astype(np.int32),
+                entries,
+                seen.label[some],
+                seen.weight[some],
+            )
+        )
+
+    def events(self, order: Int32, index: dict[str, Any]) -> Events:
+        """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order))
+        observations, entries = np.zeros(len(order) + 1, np.int64), np.zeros(len(order) + 1, np.int64)
+        for seen in self._seen:
+            voxel = rank[seen.row] + 1  # a voxel is in a frame once
+            observations[voxel] += 1
+            entries[voxel] += seen.entries
+        place, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
+        voxels = np.repeat(np.arange(len(order), dtype=np.int32), observations[1:])
+        frame, pixels = (np.empty(len(voxels), np.int32) for _ in range(2))
+        starts = np.empty(len(voxels) + 1, np.int64)
+        starts[-1] = entry[-1]
+        label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])
+        for seen in self._seen:
+            place_observations(
+                rank, seen.frame, seen.row, seen.pixels, seen.entries, seen.label, seen.weight,
+                place, entry, frame, pixels, starts, label, weight,
+            )  # fmt: skip
+        return Events(
+            **index,
+            voxel=voxels,
+            frame=frame,
+            evidence=Evidence(starts, label, weight, self.num_classes),
+            pixels=pixels,
+            voxel_size=self.voxel_size,
+        )
+
 
 FULL = 0.7
 """Largest share of a partition's slots in use."""
@@ -177,7 +246,7 @@ class NumbaHash:
             voxel_size=self.voxel_size,
         )
 
-    def _order(self) -> npt.NDArray[np.int32]:
+    def _order(self) -> Int32:
         """The voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
         return np.argsort(self._records["key"][: len(self)], kind="stable").astype(np.int32)
 
@@ -186,7 +255,7 @@ class NumbaHash:
         values: npt.NDArray[Any] = self._records[name][: len(self)][rows].copy()  # the array may move as it grows
         return values
 
-    def evidence_of(self, rows: Int64) -> npt.NDArray[np.float64]:
+    def evidence_of(self, rows: Int64) -> Float64:
         """Evidence (n, K) of the voxels of those rows."""
         evidence = np.zeros((len(rows), self.num_classes))
         unchain(self._records, self._nodes, self._dense, rows, evidence)

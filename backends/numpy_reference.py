@@ -11,22 +11,21 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.shared.association import (
-    Int64,
-    Mask,
     Observations,
     check_depth,
     check_frame,
     check_settings,
+    falling_into,
     observe,
     pixels_held,
 )
-from semstab.backends.shared.restricted import falling_into
-from semstab.backends.shared.total import Change, MapTotal
+from semstab.backends.shared.observations import Change, MapTotal
+from semstab.core.types import Int32, Int64, Mask
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Events, VoxelTable, index_columns
-from semstab.model.voxels.extent import Extent
+from semstab.model.voxels import Extent, VoxelTable, index_columns
 
 ONE_IN = 16
 """Of so many voxels the sample holds one."""
@@ -39,7 +38,7 @@ ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 class _Seen:
     """What a frame says of voxels by their rows (n,): mean evidence, of which most is 0, and pixels (n,)."""
 
-    rows: npt.NDArray[np.int32]
+    rows: Int32
     frame: int
     s_bar: Evidence
     pixels: Int64

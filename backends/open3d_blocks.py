@@ -17,17 +17,15 @@ from open3d.t.geometry import VoxelBlockGrid
 
 from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator
-from semstab.backends.shared.association import Int64, check_depth, check_frame, check_settings
-from semstab.backends.shared.blocks import blocks_of
-from semstab.backends.shared.columns import update_rows
-from semstab.backends.shared.observed import Observed, ObservedScores
-from semstab.backends.shared.total import Change, MapTotal
+from semstab.backends.shared.association import check_depth, check_frame, check_settings
+from semstab.backends.shared.columns import blocks_of, update_rows
+from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
+from semstab.core.types import Int64
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
-from semstab.model.voxels import VoxelTable, index_columns
-from semstab.model.voxels.extent import Extent
+from semstab.model.voxels import Extent, VoxelTable, index_columns
 
 INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""

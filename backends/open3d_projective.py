@@ -13,15 +13,15 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import open3d.core as o3c
 from open3d.t.geometry import PointCloud, VoxelBlockGrid
 
 from semstab.backends.open3d_blocks import Open3DBlocks
 from semstab.backends.shared.aggregator import Aggregator
-from semstab.backends.shared.association import Float64, Int64, check_depth, check_frame
-from semstab.backends.shared.hashing import PARTITIONS
-from semstab.backends.shared.observed import Observed
+from semstab.backends.shared.association import check_depth, check_frame
+from semstab.backends.shared.keys import PARTITIONS
+from semstab.backends.shared.observations import Observed
+from semstab.core.types import Float64, Int64, UInt16
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT
@@ -137,7 +137,7 @@ class Projector(Aggregator):
         bounds = np.linspace(0, n, PARTITIONS + 1).astype(np.int64)
         return Observed(np.arange(n), np.ones(n, dtype=np.int64), start, labels, weights, bounds)
 
-    def _evidence(self, frame: Frame, pixel: Int64) -> tuple[npt.NDArray[np.uint16], Float64]:
+    def _evidence(self, frame: Frame, pixel: Int64) -> tuple[UInt16, Float64]:
         """Classes and evidence of the pixels, row after row: one label each, or K normalised scores."""
         if frame.labels is not None:
             return frame.labels.reshape(-1)[pixel].astype(np.uint16), np.ones(len(pixel))

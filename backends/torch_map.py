@@ -7,18 +7,266 @@ On a CUDA device Triton kernels do the work (`triton_launch`), elsewhere plain t
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import torch
 
-from semstab.backends import FusionBackend
-from semstab.backends.shared.association import check_depth
-from semstab.backends.torch_parts.maps import TorchMaps
-from semstab.backends.torch_parts.storage import SLOT_BYTES
-from semstab.backends.torch_parts.views import DepthView, Image, TensorPrediction, evidence_of_frame
+from semstab.backends import FusionBackend, torch_eager
+from semstab.backends.shared.association import INDEX_LIMIT, check_depth, check_settings
+from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
+from semstab.backends.shared.observations import Change, MapTotal
+from semstab.backends.torch_eager import LOST, Association, ViewEvidence
+from semstab.backends.torch_storage import (
+    EMPTY,
+    SLOT_BYTES,
+    Columns,
+    DepthView,
+    Image,
+    Labels,
+    MapGrid,
+    Scores,
+    Storage,
+    TensorPrediction,
+    evidence_of,
+    evidence_of_frame,
+)
+from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import VoxelTable, index_columns
+
+# Where the torch backend runs, and which of its kernels do the work there.
+
+
+def device_of(name: str | None) -> torch.device:
+    """The device of that name, as torch or Open3D writes it."""
+    if name is None:
+        return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
+    try:
+        device = torch.device(name.lower())
+    except RuntimeError as error:
+        raise ConfigError(f"device '{name}' is not one; use CPU:0 or CUDA:0") from error
+    if device.type == "cpu":
+        return torch.device("cpu")
+    if device.type != "cuda" or (device.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(f"device '{name}': torch sees {torch.cuda.device_count()} CUDA devices here; use CPU:0")
+    return torch.device("cuda", device.index or 0)
+
+
+def kernels_for(name: str, device: torch.device) -> ModuleType:
+    """The module that does the work on that device. Raises ConfigError or MissingDependencyError where it cannot."""
+    if name not in ("auto", "torch", "triton"):
+        raise ConfigError(f"kernels = '{name}': use auto, torch or triton")
+    if name == "torch" or (name == "auto" and device.type == "cpu"):
+        return torch_eager
+    try:
+        from semstab.backends import triton_launch
+    except ImportError as error:
+        if name == "auto":
+            return torch_eager
+        raise MissingDependencyError(
+            f"kernels = 'triton' cannot be used ({one_line(error)}); pip install triton"
+        ) from error
+    if not triton_launch.runs_on(device):
+        raise ConfigError(f"kernels = 'triton': they run on a CUDA device, not on {device}; use torch, or auto")
+    return triton_launch
+
+
+# Maps on a device, and how a view goes into them.
+
+FIRST_ROWS = 1 << 12
+"""Voxels that a new map has room for, at most."""
+
+FIRST_BYTES = 1 << 27
+"""Memory that a new map takes at once, at most: with 20,000 classes that are fewer voxels."""
+
+COPIED_ROWS = 1 << 20
+"""Rows that go to memory at a time."""
+
+
+class TorchMaps:
+    """Maps of several backbones over the same depth: one association and one hash, and evidence of each backbone.
+
+    num_classes has K of each backbone by its name; the other settings are those of `TorchMap`.
+    """
+
+    def __init__(
+        self,
+        voxel_size: float,
+        num_classes: Mapping[str, int],
+        device: str | None = None,
+        precision: str = "float64",
+        kernels: str = "auto",
+        memory_gb: float | None = None,
+        reserve: int = 0,
+    ) -> None:
+        if not num_classes:
+            raise ConfigError("num_classes names no backbone; give K of each by its name")
+        for K in num_classes.values():
+            check_settings(voxel_size, K)
+        if precision not in ("float64", "float32"):
+            raise ConfigError(f"precision = '{precision}': use float64 or float32")
+        if memory_gb is not None and not memory_gb > 0:
+            raise ConfigError(f"memory_gb = {memory_gb:g}: it must be positive")
+        if reserve < 0:
+            raise ConfigError(f"reserve = {reserve}: it is a number of voxels")
+        self.voxel_size = voxel_size
+        self.device = device_of(device)
+        self._dtype = torch.float64 if precision == "float64" else torch.float32
+        self._kernels: Any = kernels_for(kernels, self.device)
+        self._associate = self._kernels.Associator()
+        self._grid: MapGrid | None = None
+        with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
+            self.storage = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
+            first = min(FIRST_ROWS, FIRST_BYTES // sum(c.row_bytes for c in self.storage.columns.values()))
+            self.storage.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or first)
+        self._totals = {name: MapTotal(K) for name, K in num_classes.items()}
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the maps take on the device."""
+        return self.storage.bytes
+
+    def integrate_tensors(
+        self,
+        depth: Image,
+        intrinsics: Intrinsics,
+        T_wc: npt.ArrayLike,
+        predictions: Mapping[str, TensorPrediction],
+        *,
+        index: int,
+    ) -> dict[str, FrameReport]:
+        """Fuse what some of the backbones say of one view; a report for each.
+
+        Raises DataError, with all maps unchanged, where one of them cannot be fused, ConfigError for an unknown name.
+        """
+        started = time.perf_counter()
+        view = DepthView.of(depth, intrinsics, T_wc, index, self.device)
+        said = {
+            name: evidence_of(of_name, view, self._columns_of(name).num_classes, _where(view, of_name.kind, name))
+            for name, of_name in predictions.items()
+        }
+        return self.fuse(view, said, started)
+
+    def fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
+        """Fuse a view that is on the device, with what some backbones say of its pixels; timed from `started`."""
+        on_device = torch.cuda.device(-1 if self.device.index is None else self.device.index)  # for Triton's launches
+        with torch.inference_mode(False), torch.no_grad(), on_device:
+            return self._fuse(view, said, started)
+
+    def _fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
+        grid = self._grid or self._first_grid(view)
+        seen = self._associate(view, grid)
+        evidence = {name: self._evidence(seen, image, name, view) for name, image in said.items()}
+        rows, voxels = self._look_up(seen, evidence, view, grid)
+        associated = time.perf_counter()
+        self.storage.make_room(voxels, f"frame {view.camera.index}")
+        self.storage.add(seen.keys, rows, voxels)
+        self._grid = grid
+        changes = [
+            self._kernels.update(self.storage.columns[name], rows, of_name, view.camera.index)
+            for name, of_name in evidence.items()
+        ]
+        sums = torch.stack(changes).tolist() if changes else []
+        return {
+            name: self._totals[name].add(view.camera.index, Change.of(of_name), started, associated)
+            for name, of_name in zip(said, sums, strict=True)
+        }
+
+    def table(self, name: str) -> VoxelTable:
+        """The map of a backbone so far, brought to memory. Raises ConfigError for an unknown name."""
+        columns = self._columns_of(name)
+        used = torch.nonzero(self.storage.hash.keys != EMPTY)[:, 0]
+        keys, order = torch.sort(self.storage.hash.keys[used])  # packed keys sort like (ix, iy, iz)
+        rows = self.storage.hash.rows[used[order]].to(torch.int64)
+        seen = columns.op[rows] > 0
+        keys, rows = keys[seen].cpu(), rows[seen]
+        values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES[1:]}
+        values["evidence"] = Evidence.read(
+            len(rows), columns.num_classes, lambda some: _at_home(columns.evidence, rows[some])
+        )
+        index = index_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
+        return VoxelTable(**index_columns(index), **values, voxel_size=self.voxel_size)
+
+    def _columns_of(self, name: str) -> Columns:
+        if name not in self.storage.columns:
+            raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self.storage.columns)}")
+        return self.storage.columns[name]
+
+    def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
+        K = self.storage.columns[name].num_classes
+        evidence: ViewEvidence
+        if isinstance(said, Labels):
+            evidence = self._kernels.count_labels(seen, said, K)
+        else:
+            if len(said.values) != K:
+                kind = "logits" if said.softmax else "scores"
+                raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(said.values)} classes, the map {K}")
+            evidence = self._kernels.sum_scores(seen, said, K)
+        return evidence
+
+    def _look_up(
+        self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
+    ) -> tuple[torch.Tensor, int]:
+        """Rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
+        rows = self._kernels.find(self.storage.hash, seen.keys)
+        observed = torch.zeros_like(rows, dtype=torch.bool)
+        for of_name in evidence.values():
+            observed |= of_name.pixels > 0
+        new = observed & (rows == EMPTY)
+        row_of_new = torch.cumsum(new, dim=0) + (self.storage.voxels - 1)
+        wrong = [of_name.flags for of_name in evidence.values()]
+        added, *flags = torch.cat([new.sum()[None], *wrong]).tolist()  # the one wait for the device before the update
+        for n, name in enumerate(evidence):
+            highest, lost, negative = flags[3 * n : 3 * n + 3]
+            self._check(name, highest, bool(lost), bool(negative), view, grid, seen)
+        return torch.where(new, row_of_new, rows), self.storage.voxels + int(added)
+
+    def _check(
+        self, name: str, highest: int, lost: bool, negative: bool, view: DepthView, grid: MapGrid, seen: Association
+    ) -> None:
+        """Raise DataError where a label, score or point is none that the map can hold."""
+        K = self.storage.columns[name].num_classes
+        if highest >= K:
+            where = _where(view, "labels", name)
+            raise DataError(f"{where}: label id {highest} is outside 0 to {K - 1}; map it or ignore it")
+        if negative:
+            where = _where(view, "scores", name)
+            raise DataError(f"{where}: scores are negative; give logits as logits, or apply a softmax first")
+        if lost:
+            raise out_of_reach(view.frame(seen.voxel == LOST), grid.origin, grid.voxel_size)
+
+    def _first_grid(self, view: DepthView) -> MapGrid:
+        """Keys that count from the camera's voxel. Raises DataError where the camera is out of reach."""
+        camera = view.camera.T_wc[:3, 3]
+        origin = np.floor(camera / self.voxel_size)
+        if np.abs(origin).max() > INDEX_LIMIT - 2 * HALF:
+            frame = view.camera
+            raise DataError(
+                f"{frame.where('pose')}: frame {frame.index} has its camera at {camera.round(1).tolist()} m,"
+                f" beyond 2^31 voxels of {self.voxel_size:g} m; check pose units, or use larger voxels"
+            )
+        x, y, z = origin.astype(np.int64).tolist()
+        return MapGrid(self.voxel_size, (x, y, z), self._dtype)
+
+
+def _where(view: DepthView, kind: str, name: str) -> str:
+    """What an error calls the labels, scores or logits of a backbone."""
+    return view.camera.where(kind) + (f" of '{name}'" if name else "")
+
+
+def _at_home(column: torch.Tensor, rows: torch.Tensor) -> npt.NDArray[Any]:
+    """Rows of a column in memory; they are gathered a part at a time, so that the device needs no second column."""
+    home = torch.empty((len(rows), *column.shape[1:]), dtype=column.dtype)
+    for part in torch_eager.parts(len(rows), COPIED_ROWS):
+        home[part] = column[rows[part]].cpu()
+    values: npt.NDArray[Any] = home.numpy()
+    return values
 
 
 class TorchMap(FusionBackend):

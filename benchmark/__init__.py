@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from semstab import backbones, backends, datasets, engine, metrics, statistics
     from semstab.api import run, run_study
+    from semstab.comparison.gate import GateConfig, gate
     from semstab.comparison.writing import compare
     from semstab.config import Config
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
-    from semstab.gating import GateConfig, gate
+    from semstab.exports import export
+    from semstab.exports.relabel import Belief, relabel
+    from semstab.model.events import Events
     from semstab.model.frames import Frame, Intrinsics
     from semstab.model.labels import LabelSpace
-    from semstab.model.voxels import Events, VoxelTable
-    from semstab.outputs.export import export
-    from semstab.outputs.loaded import load
-    from semstab.outputs.relabel import Belief, relabel
+    from semstab.model.voxels import VoxelTable
+    from semstab.report.loaded import load
     from semstab.settings import load_config, load_study
-    from semstab.statistics.judging.commit import Commit
+    from semstab.statistics.commit import Commit
 
 __version__ = "0.3.0"
 
@@ -57,27 +58,27 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Belief": "outputs.relabel",
-    "Commit": "statistics.judging.commit",
+    "Belief": "exports.relabel",
+    "Commit": "statistics.commit",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
-    "Events": "model.voxels",
+    "Events": "model.events",
     "Frame": "model.frames",
-    "GateConfig": "gating",
+    "GateConfig": "comparison.gate",
     "Intrinsics": "model.frames",
     "LabelSpace": "model.labels",
     "MissingDependencyError": "errors",
     "SemstabError": "errors",
     "VoxelTable": "model.voxels",
     "compare": "comparison.writing",
-    "export": "outputs.export",
-    "gate": "gating",
-    "load": "outputs.loaded",
+    "export": "exports",
+    "gate": "comparison.gate",
+    "load": "report.loaded",
     "load_config": "settings",
     "load_result": "engine.folder",
     "load_study": "settings",
-    "relabel": "outputs.relabel",
+    "relabel": "exports.relabel",
     "run": "api",
     "run_study": "api",
 }

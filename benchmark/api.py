@@ -11,7 +11,7 @@ from semstab.engine import Executor, Observer
 from semstab.engine.execution import run as execute
 from semstab.engine.execution import run_study as execute_study
 from semstab.model.records import Result
-from semstab.outputs.report import Reporting
+from semstab.report import Reporting
 from semstab.settings import as_config
 
 

@@ -11,9 +11,8 @@ from semstab.check import with_voxel_size
 from semstab.config import Config, merge
 from semstab.datasets import Scene, open_dataset
 from semstab.predict.filters import parse
-from semstab.predict.predictor import PredictorConfig
-from semstab.predict.stored import NAME as STORED
-from semstab.predict.stored import StoredSequence
+from semstab.predict.predictor import NAME as STORED
+from semstab.predict.predictor import PredictorConfig, StoredSequence
 from semstab.settings import dataset_defaults, load_config, load_study, predicted_config, resolve
 
 STUDY = "remedies"

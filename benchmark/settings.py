@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config, merge, nearest, read_yaml, validated
-from semstab.config.selection import in_full
+from semstab.config.settings import in_full
 from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
 from semstab.errors import ConfigError
 from semstab.predict.live import NAME as PREDICTED
-from semstab.predict.predictor import PredictorConfig
-from semstab.predict.stored import NAME as STORED
-from semstab.predict.stored import StoredSequence
+from semstab.predict.predictor import NAME as STORED
+from semstab.predict.predictor import PredictorConfig, StoredSequence
 
 
 def load_config(

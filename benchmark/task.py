@@ -10,14 +10,12 @@ from functools import cached_property
 
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range
 from semstab.datasets import GROUND_TRUTH, Scene
-from semstab.datasets.selection import Selected, select_frames
+from semstab.datasets.scene import Selected, select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelMapping, LabelSpace
 from semstab.model.results import Unit
-from semstab.pixels.exclusion import leave_out
-from semstab.pixels.perturbation import perturb
-from semstab.pixels.top_k import keep_largest
+from semstab.pixels.preparation import keep_largest, leave_out, perturb
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.files import read_limited, write_text
 from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.measures import measures
 from semstab.model.voxels import VoxelTable
-from semstab.runtime.files import read_limited, write_text
 
 CASE, EXPECTED = "case.txt", "expected.csv"
 FIRST_LINE = "semstab conformance 1"

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.conformance.cases import EXPECTED, write_case
 from semstab.conformance.fuse import fuse
+from semstab.core.files import write_text
+from semstab.core.types import Float64
 from semstab.model.frames import Frame, Intrinsics
-from semstab.runtime.files import write_text
 
 Case = tuple[float, int, list[Frame]]
 """Voxel size in metres, number of classes, frames."""
@@ -81,7 +81,7 @@ def _scored() -> list[list[tuple[float, tuple[float, ...]]]]:
     ]
 
 
-def _walk(count: int, K: int, start: npt.NDArray[np.float64], soft: type[Any] | None = None) -> list[Frame]:
+def _walk(count: int, K: int, start: Float64, soft: type[Any] | None = None) -> list[Frame]:
     """A camera that wanders and turns before a scattered scene with gaps; labels, or scores of a type."""
     rng = np.random.default_rng(count)
     frames = []
@@ -97,7 +97,7 @@ def _walk(count: int, K: int, start: npt.NDArray[np.float64], soft: type[Any] | 
     return frames
 
 
-def _pose(turn: Sequence[float] | npt.NDArray[np.float64], at: Any) -> npt.NDArray[np.float64]:
+def _pose(turn: Sequence[float] | Float64, at: Any) -> Float64:
     """Camera-to-world: turned about x, then y, then z (radians)."""
     T_wc = np.eye(4)
     for axis, angle in enumerate(turn):

@@ -8,8 +8,8 @@ from typing import Any, cast
 from pydantic import BaseModel
 
 from semstab.config import DatasetConfig, validated
+from semstab.core.registry import Entry, Registry
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
-from semstab.runtime.registry import Entry, Registry
 
 __all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Filtering", "Scene", "open_dataset", "options_model", "resolved"]
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions, PixelCentre, PoseConvention
+from semstab.datasets.files.options import FileOptions, Folders, PixelCentre, PoseConvention, Template, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.templates import Folders, Template, inside
 from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
 from semstab.datasets.formats.images import DEPTH_SUFFIXES
 

@@ -13,9 +13,8 @@ from pydantic import BaseModel
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import DepthScale, FileOptions
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.text_files import read_intrinsics
-from semstab.datasets.formats.text_tables import read_matrices
-from semstab.datasets.views.cameras import Camera
+from semstab.datasets.formats.disk import read_intrinsics, read_matrices
+from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 
 

@@ -21,10 +21,9 @@ from semstab.datasets.files.options import (
     ScoresLayout,
 )
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import files_by_stem, naturally
+from semstab.datasets.formats.disk import files_by_stem, naturally, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from semstab.datasets.formats.text_files import read_intrinsics
-from semstab.datasets.views.cameras import Camera
+from semstab.datasets.geometry.cameras import Camera
 
 SETTINGS_FILE = "scene.yaml"
 MASKS = "mask/{name}"

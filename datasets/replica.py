@@ -15,9 +15,8 @@ from pydantic import BaseModel, Field
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import FileOptions, FourIntrinsics, GroundTruth, UpAxis, VoidIds, zero_is_void
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
-from semstab.datasets.formats.json_files import number, read_object
-from semstab.datasets.formats.text_tables import read_matrices
-from semstab.datasets.views.cameras import Camera, camera_of
+from semstab.datasets.formats.disk import number, read_matrices, read_object
+from semstab.datasets.geometry.cameras import Camera, camera_of
 from semstab.errors import DataError
 
 

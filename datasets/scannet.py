@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
 
+from semstab.core.types import UInt16
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.label_ids import NO_ID
+from semstab.datasets.files.labels import NO_ID
 from semstab.datasets.files.options import DepthScale, FileOptions, GroundTruth, Size, UpAxis, VoidIds, zero_is_void
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.disk import read_bytes
-from semstab.datasets.formats.text_files import read_intrinsics
-from semstab.datasets.views.cameras import Camera
+from semstab.datasets.formats.disk import read_bytes, read_intrinsics
+from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 from semstab.model.labels import IGNORE_16BIT
 
@@ -63,7 +62,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         depth = self.depth_files(folder / "depth", "", ".png", instead=files_named(folder / "pose", "", ".txt"))
         return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
-    def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
+    def class_ids(self) -> Mapping[str, UInt16]:
         """The ids of the ground truth as those of the class table's column, where a table is given."""
         table = self.options.class_table
         return {} if table is None else {GROUND_TRUTH: read_class_table(table, self.options.class_column)}
@@ -73,7 +72,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         return Camera(read_intrinsics(_matrix_file(folder, which)), size)
 
 
-def read_class_table(path: Path, column: str) -> npt.NDArray[np.uint16]:
+def read_class_table(path: Path, column: str) -> UInt16:
     """(65536,) the column's id for each ScanNet id; `IGNORE_16BIT` where the column is empty, `NO_ID` where no row is.
 
     Raises DataError for a file without the columns, or an id that is no whole number.

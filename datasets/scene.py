@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import logging
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel
 
-from semstab.datasets.views.resampling import Labels, Scores
-from semstab.datasets.views.same_view import at_image, fitted
+from semstab.config import FrameSelection
+from semstab.core.types import Float32, Float64, UInt8
+from semstab.datasets.geometry.lenses import Labels, Scores, at_image, fitted
 from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.georeference import Georeference
@@ -63,7 +67,7 @@ class Scene(ABC):
     backbones: tuple[str, ...]
     ground_truth: bool = False
     regions: tuple[str, ...] = ()
-    up: npt.NDArray[np.float64] | None = None
+    up: Float64 | None = None
     georeference: Georeference | None = None
     folder: Path | None = None
     label_paths: tuple[str, ...] = ()
@@ -96,7 +100,7 @@ class Scene(ABC):
         """A hash of the content behind those frames: the same digest means the same numbers."""
 
     @property
-    def timestamps(self) -> npt.NDArray[np.float64] | None:
+    def timestamps(self) -> Float64 | None:
         """(len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
         return None
 
@@ -135,11 +139,11 @@ class Scene(ABC):
                 return dataclasses.replace(frame, labels=np.zeros(frame.shape, dtype=np.uint8), scores=None)
         raise DataError(f"{self.name}: there are no labels, and without any this dataset yields no depth")
 
-    def depth(self, index: int) -> npt.NDArray[np.float32]:
+    def depth(self, index: int) -> Float32:
         """Depth (H, W) float32 in metres along the optical axis."""
         return self.geometry(index).depth
 
-    def T_wc(self, index: int) -> npt.NDArray[np.float64]:
+    def T_wc(self, index: int) -> Float64:
         """Pose (4, 4) camera-to-world in metres, OpenCV camera axes."""
         return self.geometry(index).T_wc
 
@@ -147,11 +151,11 @@ class Scene(ABC):
         """Intrinsics of the frame's depth image, of shape (H, W); pixels."""
         return self.geometry(index).intrinsics
 
-    def color(self, index: int) -> npt.NDArray[np.uint8] | None:
+    def color(self, index: int) -> UInt8 | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none."""
         return self.geometry(index, color=True).color
 
-    def image(self, index: int) -> npt.NDArray[np.uint8]:
+    def image(self, index: int) -> UInt8:
         """Colour (H, W, 3) uint8 RGB. Raises DataError where the frame has none."""
         color = self.color(index)
         if color is None:
@@ -194,3 +198,86 @@ class Dataset(ABC):
     @abstractmethod
     def scene(self, name: str) -> Scene:
         """Open one. Raises DataError where its files are missing or contradict each other."""
+
+
+# Names and paths as error messages list them.
+
+MAX_LISTED = 5
+
+
+def listed(missing: Sequence[str], folder: str = "") -> str:
+    """The number of missing files and the first of them, as they are called in the folder."""
+    missing = [path.removeprefix(f"{folder}{os.sep}") for path in missing]
+    more = f", ... ({len(missing) - MAX_LISTED} more)" if len(missing) > MAX_LISTED else ""
+    return f"{len(missing)} missing: {', '.join(missing[:MAX_LISTED])}{more}"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The known names, those most like `name` first."""
+    names = list(known)
+    return f"there are {', '.join(difflib.get_close_matches(name, names, n=len(names), cutoff=0))}"
+
+
+# The frames of a scene that a selection picks, without those that lack a file or whose pose was lost.
+
+logger = logging.getLogger("semstab")
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Indices of frames, in order.
+
+    indices     those to read
+    incomplete  selected ones that were left out because they lack a file
+    lost        selected ones that were left out because tracking was lost
+    """
+
+    indices: list[int]
+    incomplete: tuple[int, ...] = ()
+    lost: tuple[int, ...] = ()
+
+    @property
+    def left_out(self) -> int:
+        """How many frames were selected, but left out."""
+        return len(self.incomplete) + len(self.lost)
+
+
+def select_frames(
+    scene: Scene, selection: FrameSelection, sources: Sequence[str] = (), *, color: bool = False
+) -> Selected:
+    """The selected frames of a sequence, to be read with the labels of these sources (or its colour) and no others.
+
+    What is left out is said in a warning. Reads no image. Raises ConfigError for a frame or a range of time that the
+    scene does not have, DataError where selected frames lack files and the scene does not leave such frames out.
+    """
+    times = scene.timestamps
+    chosen = selection.indices(len(scene), None if times is None else times.tolist())
+    missing = {index: paths for index in chosen if (paths := scene.missing(index, sources, color=color))}
+    complete = [index for index in chosen if index not in missing]
+    if len(complete) < len(chosen):
+        needs = ("depth", "pose", *(("labels",) if sources else ()), *(("colour",) if color else ()))
+        _tell_missing(scene, [path for paths in missing.values() for path in paths], len(complete), len(chosen), needs)
+    lost = {index for index in complete if not scene.tracked(index)}
+    if lost:
+        more = ", ..." if len(lost) > MAX_LISTED else ""
+        logger.warning(
+            "%s: %d of %d selected frames have no pose (tracking was lost) and are left out: %s%s",
+            scene.name, len(lost), len(chosen), ", ".join(map(str, sorted(lost)[:MAX_LISTED])), more,
+        )  # fmt: skip
+    return Selected(
+        indices=[index for index in complete if index not in lost],
+        incomplete=tuple(missing),
+        lost=tuple(sorted(lost)),
+    )
+
+
+def _tell_missing(scene: Scene, paths: list[str], complete: int, selected: int, needs: Sequence[str]) -> None:
+    where = str(scene.folder or scene.name)
+    if not scene.skips_incomplete:
+        skip = "set incomplete: skip (--option incomplete=skip) to leave such frames out"
+        raise DataError(f"{where}: {listed(paths, where)}; add them, or {skip}")
+    if not complete:
+        raise DataError(
+            f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths, where)})"
+        )
+    logger.warning("%s: %d of %d frames left out: %s", where, selected - complete, selected, listed(paths, where))

@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, InvalidDepth, Size
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.text_files import read_intrinsics
-from semstab.datasets.views.cameras import Camera, camera_of
+from semstab.datasets.formats.disk import read_intrinsics
+from semstab.datasets.geometry.cameras import Camera, camera_of
 from semstab.model.frames import Intrinsics
 
 IMAGE_SIZE = (640, 480)

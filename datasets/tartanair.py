@@ -14,9 +14,8 @@ from pydantic import BaseModel, Field
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import CameraAxes, FileOptions, FourIntrinsics, MaxDepth, UpAxis
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
-from semstab.datasets.formats.text_tables import read_table
-from semstab.datasets.views.cameras import camera_of
-from semstab.datasets.views.poses import from_quaternions
+from semstab.datasets.formats.disk import read_table
+from semstab.datasets.geometry.cameras import camera_of, from_quaternions
 
 IMAGE_SIZE = (640, 480)
 USUAL = (320.0, 320.0, 320.0, 240.0)

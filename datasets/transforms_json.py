@@ -16,13 +16,11 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import CameraAxes, FileOptions, PixelCentre
+from semstab.datasets.files.options import CameraAxes, FileOptions, Folders, PixelCentre, Template, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.templates import Folders, Template, inside
-from semstab.datasets.formats.disk import natural
+from semstab.datasets.formats.disk import matrix, natural, number, read_object
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
-from semstab.datasets.formats.json_files import matrix, number, read_object
-from semstab.datasets.views.cameras import Camera
+from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 

@@ -13,13 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, Field
 
+from semstab.core.types import Float64
 from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, Positive, UpAxis
+from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, Positive, UpAxis, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.files.templates import inside
-from semstab.datasets.formats.text_tables import read_table, records, to_number
-from semstab.datasets.views.cameras import camera_of
-from semstab.datasets.views.poses import at_times, from_quaternions, nearest
+from semstab.datasets.formats.disk import read_table, records, to_number
+from semstab.datasets.geometry.cameras import at_times, camera_of, from_quaternions, nearest
 from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")
@@ -105,7 +104,7 @@ class Tum(FileDataset[TumOptions]):
         cast = self.options.surface is not None and not (folder / "depth.txt").is_file()
         return "rgb.txt" if cast else "depth.txt"
 
-    def _colors(self, folder: Path, times: npt.NDArray[np.float64]) -> list[Path | None]:
+    def _colors(self, folder: Path, times: Float64) -> list[Path | None]:
         """The colour image of each depth image; none at all where there is no rgb.txt."""
         if not (folder / "rgb.txt").is_file():
             return []
@@ -113,7 +112,7 @@ class Tum(FileDataset[TumOptions]):
         partners = mutual_nearest(times, color_times, self.options.max_difference)
         return [None if partner < 0 else colors[partner] for partner in partners]
 
-    def _listed(self, folder: Path, name: str) -> tuple[npt.NDArray[np.float64], list[Path]]:
+    def _listed(self, folder: Path, name: str) -> tuple[Float64, list[Path]]:
         """Time stamps and paths of a list of images."""
         path = folder / name
         times, paths = [], []
@@ -130,16 +129,14 @@ class Tum(FileDataset[TumOptions]):
         return stamps, paths
 
 
-def mutual_nearest(
-    times: npt.NDArray[np.float64], others: npt.NDArray[np.float64], max_difference: float
-) -> npt.NDArray[np.intp]:
+def mutual_nearest(times: Float64, others: Float64, max_difference: float) -> npt.NDArray[np.intp]:
     """For each of the ascending times the index of the other one where each is the other's nearest; -1 for none."""
     to_other, back = nearest(times, others), nearest(others, times)
     mutual = (back[to_other] == np.arange(len(times))) & (np.abs(others[to_other] - times) <= max_difference)
     return np.where(mutual, to_other, -1)
 
 
-def _require_ascending(path: Path, times: npt.NDArray[np.float64]) -> None:
+def _require_ascending(path: Path, times: Float64) -> None:
     if not np.isfinite(times).all():
         raise DataError(f"{path}: the time stamp of record {np.flatnonzero(~np.isfinite(times))[0] + 1} is not finite")
     if (late := np.diff(times) <= 0).any():

@@ -16,19 +16,20 @@ from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
+    Folders,
     FourIntrinsics,
     GroundTruth,
     PixelCentre,
     PoseConvention,
+    Template,
+    inside,
 )
 from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.files.templates import Folders, Template, inside
 from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
+from semstab.datasets.formats.disk import read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from semstab.datasets.formats.text_files import read_intrinsics
+from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.transforms_json import read_transforms
-from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.poses import Poses
 from semstab.errors import ConfigError
 from semstab.model.frames import Intrinsics
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import semstab
-from semstab.runtime.process import settle
+from semstab.core.process import settle
 
 pytest.register_assert_rewrite("semstab.testing")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it starts in the background ignore Ctrl-C

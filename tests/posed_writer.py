@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from semstab.convert.folder import CONVERSION_FILE, DepthFormat, SceneFolder
+from semstab.convert import CONVERSION_FILE, DepthFormat, SceneFolder
 from semstab.model.frames import Frame
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.model.voxels import Events
+from semstab.model.events import Events
 
 
 def log_of(labels, K=3, index=None, frames=None, voxel_size=0.2):

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from semstab.runtime.arrow import column, values_of
+from semstab.core.arrays import column, values_of
 
 
 @pytest.mark.parametrize("dtype", ["int32", "uint16", "int64", "float64", "float32", "bool"])
@@ -39,6 +39,6 @@ def test_a_column_with_gaps_has_none_filled_with_what_lay_there() -> None:
 def test_pandas_is_not_imported_for_a_column(tmp_path: Path) -> None:
     """Neither for one that is made, nor for one that is read."""
     pq.write_table(pa.table({"op": [1, 2]}), tmp_path / "map.parquet")
-    code = "import sys, numpy; from semstab.runtime.arrow import column; column(numpy.ones(3))"
+    code = "import sys, numpy; from semstab.core.arrays import column; column(numpy.ones(3))"
     code += f"; from semstab.model.voxels import parquet; parquet.columns({str(tmp_path / 'map.parquet')!r}, ['op'])"
     subprocess.run([sys.executable, "-c", f"{code}; assert 'pandas' not in sys.modules"], check=True)

@@ -17,7 +17,7 @@ from huggingface_hub.errors import (
 from model_folders import tiny
 
 from semstab.backbones import create
-from semstab.backbones.pretrained.checkpoint import Checkpoint, ModelOptions
+from semstab.backbones.checkpoint import Checkpoint, ModelOptions
 from semstab.errors import ConfigError, DataError
 
 

@@ -5,7 +5,7 @@ import pytest
 import tiny_models
 
 from semstab.backbones import Backbone, Prediction
-from semstab.backbones.class_names import InTaxonomy, class_mapping, vocabularies
+from semstab.backbones.names import InTaxonomy, class_mapping, vocabularies
 from semstab.errors import ConfigError
 from semstab.model.labels import LabelSpace
 

@@ -15,7 +15,7 @@ from pictures import blobs
 from typer.testing import CliRunner
 
 from semstab.backbones import Backbone, Prediction, create
-from semstab.backbones.outside.border import Checked
+from semstab.backbones.border import Checked
 from semstab.cli import app
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.model.labels import LabelSpace

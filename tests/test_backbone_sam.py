@@ -14,18 +14,17 @@ from model_folders import KINDS, folder_of, tiny
 from pictures import blobs
 
 from semstab.backbones import create
-from semstab.backbones.sam.heuristic import Range, look_of, read_rules
-from semstab.backbones.sam.models import full_size
-from semstab.backbones.sam.proposals import (
+from semstab.backbones.sam import Range, look_of, majority, read_rules
+from semstab.backbones.sam_proposals import (
     Proposals,
     SamOptions,
     SamProposer,
+    full_size,
     point_grid,
     region_map,
     stability_score,
     suppress,
 )
-from semstab.backbones.sam.vote import majority
 from semstab.errors import ConfigError
 from semstab.testing import checks
 

@@ -13,11 +13,20 @@ from pictures import blobs
 from transformers import AutoTokenizer, CLIPModel
 
 from semstab.backbones import create
-from semstab.backbones.segearth.dense_clip import dense_features, self_self_attention
-from semstab.backbones.segearth.prompts import Prompts, read_prompts
-from semstab.backbones.segearth.segearth_ov import CLIP_MEAN, CLIP_STD, normalised
-from semstab.backbones.segearth.simfeatup import JointBilateralUpsampler, SimFeatUp
-from semstab.backbones.segearth.windows import padded, slide, starts
+from semstab.backbones.segearth_ov import (
+    CLIP_MEAN,
+    CLIP_STD,
+    JointBilateralUpsampler,
+    Prompts,
+    SimFeatUp,
+    dense_features,
+    normalised,
+    padded,
+    read_prompts,
+    self_self_attention,
+    slide,
+    starts,
+)
 from semstab.errors import ConfigError, DataError
 from semstab.testing import checks
 

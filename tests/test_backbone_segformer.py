@@ -11,11 +11,10 @@ from model_folders import KINDS, folder_of, tiny
 from pictures import blobs
 from torch.nn.functional import interpolate
 
-from semstab.backbones import create
-from semstab.backbones.pretrained import segmenter
-from semstab.backbones.pretrained.checkpoint import bilinear
-from semstab.backbones.pretrained.heads import working_size
-from semstab.backbones.pretrained.segmenter import label_space, largest_upsampled
+from semstab.backbones import create, segmenter
+from semstab.backbones.checkpoint import bilinear
+from semstab.backbones.heads import working_size
+from semstab.backbones.segmenter import label_space, largest_upsampled
 from semstab.errors import ConfigError, DataError
 
 IMAGES = [blobs(shift=k) for k in range(3)]

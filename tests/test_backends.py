@@ -16,10 +16,10 @@ from oracle import Oracle
 from semstab import backends
 from semstab.backends.numpy_reference import NumpyReference
 from semstab.backends.shared import aggregator
+from semstab.core.files import read_json
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import dominant, entropy, sbd, vss
 from semstab.model.frames import Frame, Intrinsics
-from semstab.runtime.files import read_json
 from semstab.testing import EXACT, SUMS, BackendConformance, checks, random_frames, sight_line, voxels
 from semstab.testing.builders import assert_same_map
 

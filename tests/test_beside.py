@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from semstab.engine.beside import Beside
+from semstab.engine.tiled_units import Beside
 from semstab.errors import DataError
 
 

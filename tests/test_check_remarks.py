@@ -15,8 +15,7 @@ from room_scene import CLASSES, Room, walk, write
 from typer.testing import CliRunner
 
 from semstab.check import check
-from semstab.check.registration import depth_edges, find_offset, grey_levels, image_edges
-from semstab.check.sentinels import find_sentinel
+from semstab.check.registration import depth_edges, find_offset, find_sentinel, grey_levels, image_edges
 from semstab.cli import app
 from semstab.datasets import open_dataset
 

@@ -410,7 +410,7 @@ def test_soft_scores_sum_to_one_and_keep_the_class(small: City) -> None:
 
 def test_known_settings_give_known_results() -> None:
     """The hash is splitmix64, whose outputs for the states 0 and 1 are published."""
-    from semstab.datasets.city.hashing import splitmix64
+    from semstab.datasets.city.rendering import splitmix64
 
     assert [hex(int(x)) for x in splitmix64(np.array([0, 1], dtype=np.uint64))] == [
         "0xe220a8397b1dcdaf",

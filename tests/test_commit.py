@@ -17,8 +17,8 @@ from semstab.cli import app
 from semstab.errors import ConfigError, DataError
 from semstab.model.measures import dominant, vss
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.commit import Commit, calibrate
 from semstab.statistics.correctness import Truth
-from semstab.statistics.judging.commit import Commit, calibrate
 
 CLASSES = ("road", "car", "tree")
 

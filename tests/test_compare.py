@@ -18,15 +18,15 @@ from rich.console import Console
 
 import semstab
 from semstab.comparison.contrasts import corrected, over_scenes
+from semstab.comparison.narrative import print_comparison
 from semstab.comparison.opening import open_contenders
 from semstab.comparison.pairing import pair
-from semstab.comparison.terminal import print_comparison
 from semstab.comparison.writing import load_comparison, markdown
 from semstab.errors import ConfigError, DataError
+from semstab.model.contrast import Against, Contrast, RunComparison
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.georeference import Georeference
 from semstab.model.statistics import Interval
-from semstab.model.statistics.contrast import Against, Contrast, RunComparison
 
 FAULTY = (2, 5, 8)
 CLASSES = ["wall", "door", "window", "floor"]

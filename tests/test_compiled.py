@@ -14,9 +14,9 @@ import pytest
 import semstab
 
 IMPORT = """
-import semstab.outputs.recording, semstab.statistics.loops.orders  # whatever is compiled is imported without an error
+import semstab.recording, semstab.statistics.loops.orders  # whatever is compiled is imported without an error
 from semstab.backends.numba_hash import NumbaHash
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
 
 @serial
 def twice(x):
@@ -82,7 +82,7 @@ def test_where_nothing_can_be_kept_it_is_compiled_anew(installed, tmp_path) -> N
 
 
 HELPERS = """
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
 
 OFFSET = 1
 
@@ -92,7 +92,7 @@ def helper(x):
 """
 CALLER = """
 from helpers import OFFSET, helper
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
 
 @serial
 def caller(x):

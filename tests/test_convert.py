@@ -22,8 +22,7 @@ from typer.testing import CliRunner
 from semstab.backends import create
 from semstab.cli import app
 from semstab.config import Config
-from semstab.convert import convert, convert_scene
-from semstab.convert.folder import DepthFormat, depth_format, matrix_text, quantised
+from semstab.convert import DepthFormat, convert, convert_scene, depth_format, matrix_text, quantised
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Intrinsics

@@ -27,7 +27,7 @@ from image_files import (
     written,
 )
 
-from semstab.datasets.formats import arrays
+from semstab.datasets.formats import disk
 from semstab.datasets.formats.codecs import PNG_SIGNATURE
 from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
 from semstab.errors import DataError
@@ -148,7 +148,7 @@ def test_an_array_must_fit_its_file(tmp_path, shape, match):
 
 
 def test_an_archive_that_claims_too_much_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(arrays, "MAX_ARRAY_BYTES", 100)
+    monkeypatch.setattr(disk, "MAX_ARRAY_BYTES", 100)
     refused(read_depth, written(tmp_path / "d.npz", npz_bytes(depth=METRES)), match="claims 320 bytes")
 
 

@@ -17,19 +17,20 @@ from posed_config import configure
 from records import record, study, voxels
 
 import semstab
+from semstab.core.json_form import to_json
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.work.memory import Kind
 from semstab.errors import ConfigError
 from semstab.metrics import sbd
-from semstab.model.voxels import Events, VoxelTable
-from semstab.outputs.plots import figures
-from semstab.outputs.plots.maps import right_or_wrong
-from semstab.outputs.plots.statistics import DriftByOP, draw_intervals, draw_reliability
-from semstab.outputs.report import TOPICS, write_report
-from semstab.outputs.tables import tables
-from semstab.outputs.tables import to_json as table_content
-from semstab.outputs.terminal.summary import print_summary
-from semstab.runtime.json_form import to_json
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
+from semstab.report import TOPICS, write_report
+from semstab.report.figures import figures
+from semstab.report.figures.maps import right_or_wrong
+from semstab.report.figures.statistics import DriftByOP, draw_intervals, draw_reliability
+from semstab.report.tables import tables
+from semstab.report.tables.table import to_json as table_content
+from semstab.report.terminal import print_summary
 from semstab.statistics import Estimate, Looks, Reliability, Sample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 from semstab.statistics.steady import steady

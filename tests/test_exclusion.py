@@ -18,7 +18,7 @@ from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
-from semstab.pixels.exclusion import leave_out
+from semstab.pixels.preparation import leave_out
 from semstab.settings import load_config
 from semstab.task import read
 

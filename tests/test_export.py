@@ -23,11 +23,11 @@ from records import voxels as voxels_by_hand
 
 import semstab
 from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.exports import export, mesh
+from semstab.exports.las import codes
+from semstab.exports.raster import seen_from_above
+from semstab.exports.voxels import Column, Voxels
 from semstab.metrics import categories, dominant, vss
-from semstab.outputs.export import export, mesh
-from semstab.outputs.export.las import codes
-from semstab.outputs.export.raster import seen_from_above
-from semstab.outputs.export.voxels import Column, Voxels
 
 CRS, OFFSET = "EPSG:32615", (576714, 5188162, 200)
 CLASSES = ["wall", "door", "window"]
@@ -285,9 +285,9 @@ def ply_cloud(path, points, order="<"):
 
 
 def test_a_ply_cloud_is_classified_in_chunks(fused, table, points, monkeypatch):
-    from semstab.outputs.export import onto
+    from semstab.exports import join
 
-    monkeypatch.setattr(onto, "CHUNK", 7)
+    monkeypatch.setattr(join, "CHUNK", 7)
     for order in "<>":
         cloud = ply_cloud(fused / "cloud.ply", points, order)
         export(fused / "run", fused / "onto.ply", backbone="a", onto=cloud, measures=["vss"], radius=0.3)

@@ -7,9 +7,8 @@ import zipfile
 import numpy as np
 import pytest
 
+from semstab.core.files import atomic_path, keep_only, read_arrays, read_json, write_arrays, write_json, write_text
 from semstab.errors import DataError
-from semstab.runtime.array_files import read_arrays, write_arrays
-from semstab.runtime.files import atomic_path, keep_only, read_json, write_json, write_text
 
 
 def test_a_file_is_written_whole(tmp_path):

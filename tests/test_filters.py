@@ -14,9 +14,8 @@ from semstab.backends.shared.association import observe
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
-from semstab.pixels.carry import carry
-from semstab.predict.filters import REGISTRY, Shown, parse
-from semstab.predict.filters.filtered import Filtered
+from semstab.pixels.warp import carry
+from semstab.predict.filters import REGISTRY, Filtered, Shown, parse
 
 K = 4
 SHAPE = predicted_scene.HEIGHT, predicted_scene.WIDTH

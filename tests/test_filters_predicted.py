@@ -16,10 +16,9 @@ from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
-from semstab.predict.disk.sequence import SequenceOptions, predict_sequence
 from semstab.predict.filters import REGISTRY, parse
-from semstab.predict.kept import Kept
-from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, stored_labels
+from semstab.predict.predictor import Kept, PredictorConfig, load_predictor, parse_predictor, stored_labels
+from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import filtered_config, predicted_config, resolve
 
 MODEL = """

@@ -13,8 +13,8 @@ from wall_study import BACKBONES, wall_study
 
 from semstab.metrics import op, vss
 from semstab.model.statistics import BeyondCoin, Estimate, Interval
-from semstab.outputs.averages import ENOUGH, Level, describe, pooled
-from semstab.outputs.findings import (
+from semstab.report.averages import ENOUGH, Level, describe, pooled
+from semstab.report.findings import (
     HARDLY,
     VISIBLE_VSS,
     Answer,

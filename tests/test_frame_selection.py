@@ -15,7 +15,7 @@ from posed_config import configure, dataset_of
 
 from semstab.config import Config, FrameSelection, as_range
 from semstab.datasets import open_dataset
-from semstab.datasets.selection import select_frames
+from semstab.datasets.scene import select_frames
 from semstab.engine import run
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError

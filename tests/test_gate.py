@@ -21,10 +21,10 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
+from semstab.comparison import gate as judging
+from semstab.comparison import gate_report
+from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
 from semstab.errors import ConfigError, DataError
-from semstab.gating import gate, gate_config, judging, report
-from semstab.gating.results import GateResult, Judgement
-from semstab.gating.rules import parse
 from semstab.model.statistics import Interval
 from semstab.statistics.sampling import difference, influence_sums, value
 
@@ -160,7 +160,7 @@ def test_a_rule_of_each_class_shares_the_level(run):
 def test_a_class_that_is_nowhere_has_no_value():
     labels, truth = models()
     log = log_of(labels, K=3, index=grid(16))
-    found = judging.value(influence_sums(log.table(), log, truth), parse("class c: recall > 0.5").measure, 2, 0.05)
+    found = judging.rule_value(influence_sums(log.table(), log, truth), parse("class c: recall > 0.5").measure, 2, 0.05)
     assert "nothing that it is of was seen" in found.undecided
     assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
 
@@ -246,12 +246,12 @@ def test_reports_hold_whatever_names_are():
         "a|b`c", "", ("s|t",), 0.05, "fail", (Judgement(rule, "undecided", Interval(0.5, 0.4, 0.7), 0.5, math.nan),)
     )
     assert result.failed
-    case = ElementTree.fromstring(report.junit(result)).find("testcase")
+    case = ElementTree.fromstring(gate_report.junit(result)).find("testcase")
     assert case.get("name") == "class <a|b>&?: recall > 0.6"
     assert case.find("failure") is not None
-    assert "class <a\\|b>" in report.markdown(result)
+    assert "class <a\\|b>" in gate_report.markdown(result)
     assert not dataclasses.replace(result, undecided="pass").failed
-    assert "skipped" in report.junit(dataclasses.replace(result, undecided="pass"))
+    assert "skipped" in gate_report.junit(dataclasses.replace(result, undecided="pass"))
 
 
 def test_the_documented_workflow_is_yaml():

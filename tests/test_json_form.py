@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from semstab.core.files import read_json, write_json
+from semstab.core.json_form import INLINE, fields_of, from_json, to_json
 from semstab.errors import DataError
-from semstab.runtime.files import read_json, write_json
-from semstab.runtime.json_form import INLINE, fields_of, from_json, to_json
 
 
 @dataclass(frozen=True)

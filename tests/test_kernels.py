@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semstab.backends.shared.pixels import pixel_keys, tile_loops
-from semstab.backends.shared.pixels.keys import HALF
-from semstab.backends.shared.pixels.run_vectors import LANES, runs_of_eight
+from semstab.backends.shared import pixel_keys, tile_loops
+from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.tile_loops import LANES, runs_of_eight
 from semstab.model.labels import IGNORE_8BIT
 
 W = 300

@@ -25,6 +25,8 @@ import semstab
 from semstab import backends
 from semstab.comparison import pairing
 from semstab.comparison.comparing import find
+from semstab.comparison.gate_measures import calibrated
+from semstab.core.json_form import to_json
 from semstab.engine import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.tiling import stretches
@@ -32,15 +34,13 @@ from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError, OutgrownError
-from semstab.gating.calibration import calibrated
+from semstab.exports import export, raster
+from semstab.exports.relabel import Belief, relabel
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.voxels import VoxelTable
-from semstab.model.voxels.extent import Extent
-from semstab.model.voxels.parquet import Tile
-from semstab.outputs.export import export, raster
-from semstab.outputs.recording import Recording, Target
-from semstab.outputs.relabel import Belief, relabel
-from semstab.runtime.json_form import to_json
+from semstab.model.parquet import Tile
+from semstab.model.voxels import Extent, VoxelTable
+from semstab.recording.observer import Recording
+from semstab.recording.target import Target
 from semstab.statistics.sampling import InfluenceSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
@@ -408,8 +408,8 @@ def few_said(monkeypatch):
         found = look_at(*arguments)
         return dataclasses.replace(found, voxels=found.voxels / 20, observations=found.observations / 20)
 
-    monkeypatch.setattr("semstab.engine.survey.look_at", fewer)
-    monkeypatch.setattr("semstab.engine.work.room.resident_bytes", lambda: 0)
+    monkeypatch.setattr("semstab.engine.sizing.look_at", fewer)
+    monkeypatch.setattr("semstab.engine.work.memory.resident_bytes", lambda: 0)
 
 
 def test_parts_that_outgrow_the_memory_are_cut_in_two_and_nothing_finished_is_lost(

@@ -19,18 +19,16 @@ from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
 from semstab.model.measures import VSS, Measure, measures, register, registered
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.averages import describe, levels
-from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.outputs.plots.histograms import histograms
-from semstab.outputs.plots.judgement import statistics_figures
-from semstab.outputs.plots.maps import draw_stability
-from semstab.outputs.plots.sweeps import draw_sweep
-from semstab.outputs.plots.topdown import FromAbove
-from semstab.outputs.plots.views import Views
-from semstab.outputs.recording import Recording, looks
-from semstab.outputs.recording.maps.voxel_maps import defaults
-from semstab.outputs.tables import tables, to_csv
-from semstab.outputs.terminal.summary import print_summary
+from semstab.recording.observer import Recording
+from semstab.recording.voxel_maps import defaults, looks
+from semstab.report.averages import describe, levels
+from semstab.report.figures.distributions import draw_ecdf, draw_persistence, draw_sweep, histograms, informative
+from semstab.report.figures.judgement import statistics_figures
+from semstab.report.figures.maps import Views, draw_stability
+from semstab.report.figures.topdown import FromAbove
+from semstab.report.tables import tables
+from semstab.report.tables.table import to_csv
+from semstab.report.terminal import print_summary
 
 
 def second_largest(table):

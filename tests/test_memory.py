@@ -11,19 +11,18 @@ from posed_config import configure
 
 import semstab
 from semstab.backends import create, expected_bytes, frame_bytes
-from semstab.backends.shared import total
-from semstab.backends.shared.total import Change
+from semstab.backends.shared import observations
+from semstab.backends.shared.observations import Change
 from semstab.config import Config
+from semstab.core.process import available_bytes
 from semstab.engine import InProcess
 from semstab.engine.folder import Folder
-from semstab.engine.sizing import sized
-from semstab.engine.survey import Survey
+from semstab.engine.sizing import Survey, sized
 from semstab.engine.tiling.sights import look_at
 from semstab.engine.units import Plan, make_plan
 from semstab.engine.work import memory
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
-from semstab.runtime.memory import available_bytes
 
 FRAMES = 30
 
@@ -76,7 +75,7 @@ def test_what_does_not_fit_is_fused_in_tiles(root, tmp_path) -> None:
 
 def test_no_further_frame_is_read_where_there_is_ample_room(root, tmp_path, monkeypatch) -> None:
     plan, config = planned(root)
-    monkeypatch.setattr("semstab.engine.survey.look_at", lambda *_: pytest.fail("frames were read"))
+    monkeypatch.setattr("semstab.engine.sizing.look_at", lambda *_: pytest.fail("frames were read"))
     sizing = sized(config, plan.units, survey(config, tmp_path))
     assert not sizing.tilings
     assert not sizing.refused
@@ -139,7 +138,7 @@ def test_what_a_frame_does_to_a_map_is_the_same_bit_by_bit_in_pieces(monkeypatch
     before = rng.random((n, K)) * (rng.random((n, K)) < 0.2) * (op[:, None] > 1)
     after = before + rng.random((n, K)) * (rng.random((n, K)) < 0.1) + 1e-3
     whole = Change.between(before, after, op, pixels)
-    monkeypatch.setattr(total, "PIECE", 150 * K)
+    monkeypatch.setattr(observations, "PIECE", 150 * K)
     assert Change.between(before, after, op, pixels) == whole
 
 
@@ -154,4 +153,6 @@ def test_the_reference_with_many_classes_takes_little_more_than_its_map_for_a_fr
     voxels = reference.integrate(frame).voxels
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < expected_bytes("numpy", voxels, voxels, K) + frame_bytes("numpy", voxels, K) + 100 * total.PIECE
+    assert (
+        peak < expected_bytes("numpy", voxels, voxels, K) + frame_bytes("numpy", voxels, K) + 100 * observations.PIECE
+    )

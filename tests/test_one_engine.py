@@ -24,9 +24,10 @@ from semstab.engine.units import make_plan
 from semstab.engine.work import image_space
 from semstab.metrics import compare, compensated_flicker
 from semstab.model.records import Result
-from semstab.outputs.plots import Views, write_figures
-from semstab.outputs.plots.drawing import DrawingProcess
-from semstab.outputs.recording import Recording, Target
+from semstab.recording.observer import Recording
+from semstab.recording.target import Target
+from semstab.report.figures import DrawingProcess, write_figures
+from semstab.report.figures.maps import Views
 from semstab.settings import load_config, load_study
 from semstab.task import read as read_frame
 

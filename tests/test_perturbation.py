@@ -17,7 +17,7 @@ from semstab.config import Perturbation
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
-from semstab.pixels.perturbation import perturb
+from semstab.pixels.preparation import perturb
 from semstab.settings import load_config
 from semstab.task import read
 

@@ -15,6 +15,7 @@ from posed_config import configure
 
 import semstab
 from semstab import metrics
+from semstab.core.json_form import to_json
 from semstab.datasets.formats import disk
 from semstab.engine import Observer, load_result
 from semstab.engine.folder import Folder
@@ -22,7 +23,6 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.measures import ENTROPY, SBD, VSS
 from semstab.model.records import Result
 from semstab.model.results import STAGES, Unit
-from semstab.runtime.json_form import to_json
 from semstab.settings import load_config
 
 

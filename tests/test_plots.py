@@ -19,18 +19,27 @@ from wall_study import BACKBONES, drawn_walls, wall_study
 from semstab import backends
 from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
+from semstab.model.labels import palette
 from semstab.model.measures import SBD_MAX, VSS, measures
-from semstab.model.palette import palette
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.averages import ENOUGH, describe, levels
-from semstab.outputs.plots import figures, topdown
-from semstab.outputs.plots.distributions import draw_ecdf, draw_persistence, informative
-from semstab.outputs.plots.histograms import BINS, OP_BOUNDS, histograms, op_position, together
-from semstab.outputs.plots.maps import Overview, draw_overview, draw_stability, scale_length
-from semstab.outputs.plots.statistics import draw_agreement
-from semstab.outputs.plots.style import COLUMN, DPI, PAGE, legend_columns
-from semstab.outputs.plots.sweeps import LEAST_SPAN, draw_sweep
-from semstab.outputs.plots.topdown import EMPTY, FromAbove, level_axes, top_down
+from semstab.report.averages import ENOUGH, describe, levels
+from semstab.report.figures import figures, topdown
+from semstab.report.figures.distributions import (
+    BINS,
+    LEAST_SPAN,
+    OP_BOUNDS,
+    draw_ecdf,
+    draw_persistence,
+    draw_sweep,
+    histograms,
+    informative,
+    op_position,
+    together,
+)
+from semstab.report.figures.maps import Overview, draw_overview, draw_stability, scale_length
+from semstab.report.figures.statistics import draw_agreement
+from semstab.report.figures.style import COLUMN, DPI, PAGE, legend_columns
+from semstab.report.figures.topdown import EMPTY, FromAbove, level_axes, top_down
 from semstab.testing import SEQUENCES, as_frames, checks
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
@@ -392,7 +401,7 @@ def test_a_frame_file_without_palette_or_with_objects_is_refused(tmp_path):
 
 def test_matplotlib_is_imported_only_when_something_is_drawn():
     heavy = "{'matplotlib', 'jinja2', 'PIL'}"
-    code = f"import sys, semstab.outputs.plots, semstab.outputs.report; assert not {heavy} & set(sys.modules)"
+    code = f"import sys, semstab.report.figures, semstab.report; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

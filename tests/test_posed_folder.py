@@ -13,7 +13,7 @@ from posed_scene import H, W, fails, first_frame, opened, pose, save_image, writ
 from semstab.config import FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.disk import natural
-from semstab.datasets.selection import select_frames
+from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
 
 

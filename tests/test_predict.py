@@ -18,23 +18,22 @@ from PIL import Image
 from posed_config import configure, dataset_of
 
 from semstab.backbones import Backbone, Prediction, Streamed, create
-from semstab.backbones.class_names import InTaxonomy
-from semstab.backbones.outside.border import Checked
+from semstab.backbones.border import Checked
+from semstab.backbones.names import InTaxonomy
 from semstab.config import Config, DatasetConfig, FrameSelection
+from semstab.core.files import FolderLock
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
-from semstab.datasets.selection import select_frames
+from semstab.datasets.scene import select_frames
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import matched_region_flicker
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import ENTROPY
 from semstab.pixels.warp import warp
-from semstab.predict.disk.jobs import file_job, scene_jobs
-from semstab.predict.disk.sequence import PredictionObserver, SequenceOptions, predict_sequence
+from semstab.predict.command import ImageFiles, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
-from semstab.predict.sources import ImageFiles
-from semstab.runtime.files import FolderLock
+from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
 from semstab.settings import predicted_config
 
 CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}
@@ -162,7 +161,7 @@ def test_scores_that_are_many_go_to_disk_class_by_class(tmp_path, monkeypatch, d
     space = LabelSpace("two", ("ab", "c"), members=(("a", "b"), ()))
     stored = []
     for size in (1 << 28, 0):
-        monkeypatch.setattr("semstab.predict.disk.sequence.SCORE_BYTES", size)
+        monkeypatch.setattr("semstab.predict.sequence.SCORE_BYTES", size)
         inner = Streaming()
         model = InTaxonomy(Checked(inner, "mine"), space, "strict") if inside else Checked(inner, "mine")
         predict(folder, model, indices=[0], scores=True, name=f"x{size}", score_type="float32")
@@ -259,7 +258,7 @@ def test_predictions_killed_at_their_birth_go_on(scene, monkeypatch):
         raise KilledError
 
     with monkeypatch.context() as patch:
-        patch.setattr("semstab.predict.disk.folder.write_json", killed)
+        patch.setattr("semstab.predict.folder.write_json", killed)
         with pytest.raises(KilledError):
             predict(scene, Shifting())
     (scene / "labels/clusters/.semstab-ab12cd34.png").write_bytes(b"half")
@@ -772,8 +771,8 @@ def test_bad_input_is_one_line_and_exit_2(scene, tmp_path, arguments, message):
 def test_a_report_is_said_in_numbers():
     from rich.console import Console
 
-    from semstab.predict.disk.sequence import SequenceReport
-    from semstab.predict.terminal import print_report
+    from semstab.predict.command import print_report
+    from semstab.predict.sequence import SequenceReport
 
     report = SequenceReport("flight", (Path("labels/x"),), predicted=10, kept=2, model_seconds=2.0, seconds=4.0)
     console = Console(record=True, width=100, file=io.StringIO())

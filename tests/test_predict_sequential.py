@@ -12,16 +12,16 @@ from PIL import Image
 from posed_config import dataset_of
 
 from semstab.backbones import Backbone, Prediction
-from semstab.backbones.class_names import InTaxonomy
+from semstab.backbones.names import InTaxonomy
 from semstab.config import Config, FrameSelection
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import LabelSpace
-from semstab.predict.disk.sequence import SequenceOptions, predict_sequence
+from semstab.predict.command import ImageFiles
 from semstab.predict.predictor import PredictorConfig
-from semstab.predict.sources import ImageFiles
+from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import predicted_config, resolve
 
 
@@ -198,7 +198,7 @@ def test_whichever_frame_is_asked_for(scene, live):
 
 
 def test_frames_that_are_long_past_are_reached_again(scene, live, monkeypatch):
-    monkeypatch.setattr("semstab.predict.in_order.KEPT_BYTES", 0)
+    monkeypatch.setattr("semstab.predict.predictor.KEPT_BYTES", 0)
     opened, wanted = live(scene), expected(range(6))
     for k in (5, 0, 3):
         np.testing.assert_array_equal(opened.frame(k, "average").labels, wanted[k])

@@ -10,8 +10,8 @@ import weakref
 
 import pytest
 
+from semstab.core.prefetch import prefetch
 from semstab.errors import DataError
-from semstab.runtime.prefetch import prefetch
 
 
 def readers() -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 FAULTS = """
 import resource
 import numpy as np
-from semstab.runtime.process import settle
+from semstab.core.process import settle
 {call}
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -39,7 +39,7 @@ def test_memory_of_an_image_is_used_again() -> None:
 
 
 def test_a_choice_of_the_user_is_kept() -> None:
-    script = "import os; from semstab.runtime.process import settle; settle(); print(os.environ['OMP_WAIT_POLICY'])"
+    script = "import os; from semstab.core.process import settle; settle(); print(os.environ['OMP_WAIT_POLICY'])"
     for chosen, expected in ({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"):
         environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | chosen
         result = subprocess.run(

@@ -19,7 +19,7 @@ from semstab.config import read_yaml
 from semstab.datasets.formats.images import read_color, read_depth, read_labels
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import LabelSpace
-from semstab.predict.disk.folder import PredictionFolder
+from semstab.predict.folder import PredictionFolder
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
@@ -119,7 +119,7 @@ def test_aliases_that_save_writing_are_kept(tmp_path):
 
 
 def test_many_classes_are_no_bomb(tmp_path, monkeypatch):
-    monkeypatch.setattr("semstab.runtime.files.MAX_ALIASED", 10)
+    monkeypatch.setattr("semstab.core.files.MAX_ALIASED", 10)
     classes = "".join(f"- {{name: class {k}, id: {k}, color: [1, 2, 3]}}\n" for k in range(100))
     (tmp_path / "many.yaml").write_text(f"classes:\n{classes}")
     assert len(LabelSpace.load(tmp_path / "many.yaml")) == 100

@@ -11,9 +11,9 @@ import pytest
 from pydantic import ValidationError
 
 from semstab.config import Config
+from semstab.core.files import parse_yaml
 from semstab.datasets import REGISTRY, options_model
 from semstab.model.labels import shipped_taxonomies
-from semstab.runtime.files import parse_yaml
 
 TEXT = (Path(__file__).parents[1] / "docs/datasets.md").read_text()
 SECTIONS = {match[1]: match[2] for match in re.finditer(r"^## [^\n]*\(`(\w+)`\)\n(.*?)(?=^## |\Z)", TEXT, re.M | re.S)}

@@ -21,7 +21,7 @@ from dataset_writers import (
 
 from semstab.config import FrameSelection
 from semstab.datasets import open_dataset
-from semstab.datasets.selection import select_frames
+from semstab.datasets.scene import select_frames
 
 
 @pytest.fixture(params=FORMATS)

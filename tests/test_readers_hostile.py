@@ -19,11 +19,11 @@ from image_files import raw_png
 from posed_scene import fails
 
 from semstab.config import FrameSelection
-from semstab.datasets.formats.colmap_depth import read_depth_map
 from semstab.datasets.formats.colmap_model import read_model
-from semstab.datasets.formats.text_tables import read_table, records
+from semstab.datasets.formats.dense_depth import read_depth_map
+from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table
-from semstab.datasets.selection import select_frames
+from semstab.datasets.scene import select_frames
 from semstab.datasets.transforms_json import read_transforms
 from semstab.engine import run
 from semstab.errors import DataError, SemstabError

@@ -12,14 +12,12 @@ from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.frame_table import FrameTable
-from semstab.datasets.files.label_source import ScenePlace, find_sources
-from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.frame_source import FrameSource, FrameTable
+from semstab.datasets.files.labels import ScenePlace, find_sources
+from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.geometry.cameras import Camera
+from semstab.datasets.geometry.lenses import fit_labels, fit_scores
 from semstab.datasets.scannet import read_class_table
-from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.resampling import fit_labels, fit_scores
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Intrinsics
 

@@ -13,13 +13,12 @@ from dataset_writers import COUNT, FORMATS, numbers, opened, source, write_label
 from posed_scene import fails
 
 from semstab.config import FrameSelection
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.frame_table import FrameTable
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.frame_source import FrameSource, FrameTable
+from semstab.datasets.files.options import Folders
 from semstab.datasets.formats.disk import natural, naturally
-from semstab.datasets.selection import select_frames
-from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.lenses import Lens
+from semstab.datasets.geometry.cameras import Camera
+from semstab.datasets.geometry.lenses import Lens
+from semstab.datasets.scene import select_frames
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 

@@ -29,7 +29,7 @@ from posed_scene import fails
 
 from semstab.config import read_yaml
 from semstab.datasets import open_dataset
-from semstab.datasets.city.classes import uavid8
+from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.uavid3d import Uavid3dOptions
 from semstab.errors import ConfigError, DataError
 from semstab.settings import load_config, resolve

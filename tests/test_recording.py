@@ -32,12 +32,13 @@ from semstab.model.measures import SBD_MAX, measures
 from semstab.model.records import Record, Result, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import SERIES, Recording, Target, background, looks, scenes
-from semstab.outputs.recording.entities import Clock
-from semstab.outputs.recording.eye import Scenery, direction, fit
-from semstab.outputs.recording.maps import tracker, voxel_maps
-from semstab.outputs.recording.maps.legend import LINE, Legend
-from semstab.outputs.recording.series import OF_THE_BACKBONE
+from semstab.recording import background, flips, scenes, voxel_maps
+from semstab.recording.entities import LINE, Clock, Legend
+from semstab.recording.eye import Scenery, direction, fit
+from semstab.recording.observer import Recording
+from semstab.recording.series import OF_THE_BACKBONE, SERIES
+from semstab.recording.target import Target
+from semstab.recording.voxel_maps import looks
 from semstab.task import Task
 
 NANOSECONDS = 1_000_000_000
@@ -361,7 +362,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
 def test_a_map_of_the_run_is_followed_where_that_is_possible(tmp_path, monkeypatch, fused_by, own) -> None:
     """Else each backbone is fused a second time. The recorded drift is the same."""
     made = []
-    monkeypatch.setattr(tracker, "NumbaHash", lambda *settings, within: made.append(settings) or NumbaHash(*settings))
+    monkeypatch.setattr(flips, "NumbaHash", lambda *settings, within: made.append(settings) or NumbaHash(*settings))
     config = config_of(tiny_scene.write(tmp_path / "wall"), fused_by)
     semstab.run(config, observers=[Recording(tmp_path / "x.rrd")])
     assert len(made) == own

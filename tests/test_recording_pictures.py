@@ -24,25 +24,23 @@ from test_recording import config_of, grid, notes, read, read_blueprints, series
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
+from semstab.core.files import write_arrays
 from semstab.engine import InProcess
 from semstab.engine.tiling import stretches
 from semstab.engine.units import make_plan
 from semstab.engine.work.passes import run_job
 from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
+from semstab.model.labels import GLOW, LabelSpace
 from semstab.model.measures import SBD_MAX
-from semstab.model.palette import GLOW
 from semstab.model.records import RECORDING_PARTS
 from semstab.model.results import Unit
-from semstab.outputs.recording import Recording, camera
-from semstab.outputs.recording.drift_parts import DriftParts
-from semstab.outputs.recording.entities import Clock
-from semstab.outputs.recording.maps import drift_colors, flips, voxel_maps
-from semstab.outputs.recording.maps.flips import FlipLog
-from semstab.outputs.recording.maps.tracker import Tracker
-from semstab.outputs.recording.maps.voxel_maps import looks
-from semstab.runtime.array_files import write_arrays
+from semstab.recording import camera, flips, voxel_maps
+from semstab.recording.drift_parts import DriftParts
+from semstab.recording.entities import Clock
+from semstab.recording.flips import FlipLog, Tracker
+from semstab.recording.observer import Recording
+from semstab.recording.voxel_maps import looks
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 
@@ -107,24 +105,24 @@ def state(table: semstab.VoxelTable) -> tuple[list[list[int]], list[float]]:
 def level(drift: float | None) -> int:
     """By the definition of the levels: the k-th begins at SBD_MAX (k / LEVELS)^2."""
     if drift is None:
-        return drift_colors.FIRST_SEEN
+        return camera.FIRST_SEEN
     if drift < 1e-9:
-        return drift_colors.NO_DRIFT
-    level = int(drift_colors.LEVELS * (drift / SBD_MAX) ** 0.5 + 1e-9)
-    return drift_colors.NO_DRIFT + 1 + min(level, drift_colors.LEVELS - 1)
+        return camera.NO_DRIFT
+    level = int(camera.LEVELS * (drift / SBD_MAX) ** 0.5 + 1e-9)
+    return camera.NO_DRIFT + 1 + min(level, camera.LEVELS - 1)
 
 
 def test_no_class_wears_a_colour_of_drift(compared) -> None:
     """The legend is drawn in the colours of the pictures; red ones give way to a class that glows."""
     given = LabelSpace("many", tuple(f"c{k}" for k in range(150)))
-    assert drift_colors.ramp(given)[0].tolist() == list(GLOW[0])  # no class is given such a colour
-    assert min(np.linalg.norm(drift_colors.ramp(given) - c, axis=1).min() for c in given.colors) >= drift_colors.NEAR
+    assert camera.ramp(given)[0].tolist() == list(GLOW[0])  # no class is given such a colour
+    assert min(np.linalg.norm(camera.ramp(given) - c, axis=1).min() for c in given.colors) >= camera.NEAR
     fire = (230, 30, 0)
     for colors in ([(0, 0, 255), (128, 128, 128)], [fire, (0, 220, 240)], [fire, (0, 220, 240), (200, 0, 190)]):
         classes = LabelSpace("glowing", tuple("abc"[: len(colors)]), colors=tuple(colors))
-        shown = drift_colors.ramp(classes)
-        assert shown.shape == (drift_colors.LEVELS, 3)
-        assert min(np.linalg.norm(shown - color, axis=1).min() for color in colors) >= drift_colors.NEAR
+        shown = camera.ramp(classes)
+        assert shown.shape == (camera.LEVELS, 3)
+        assert min(np.linalg.norm(shown - color, axis=1).min() for color in colors) >= camera.NEAR
     rows = read(compared[1] / "recording.rrd")
     pictures, legend = (
         [row for row in rows[f"/wall/{at}"] if "AnnotationContext:context" in row]
@@ -133,8 +131,8 @@ def test_no_class_wears_a_colour_of_drift(compared) -> None:
     assert pictures[0]["AnnotationContext:context"] == legend[0]["AnnotationContext:context"]
     (levels,) = rows["/wall/drift_legend/levels"]
     shown = image(levels, "SegmentationImage").reshape(-1).tolist()
-    assert shown[0] == drift_colors.FIRST_SEEN
-    assert shown[2:] == [drift_colors.NO_DRIFT + 1 + level for level in range(drift_colors.LEVELS)]
+    assert shown[0] == camera.FIRST_SEEN
+    assert shown[2:] == [camera.NO_DRIFT + 1 + level for level in range(camera.LEVELS)]
 
 
 def test_labels_camera_and_colour_are_those_of_the_frames(compared) -> None:
@@ -486,7 +484,7 @@ def test_a_killed_run_leaves_a_recording_that_optimize_makes_whole(tmp_path) -> 
 import os, signal, time, semstab
 from semstab.engine import Observer
 from semstab.settings import load_config
-from semstab.outputs.recording import Recording
+from semstab.recording import Recording
 class Killing(Observer):
     def unit_finished(self, unit, table, summary):
         time.sleep(1)

@@ -25,7 +25,9 @@ from typer.testing import CliRunner
 import semstab
 from semstab import cli
 from semstab.errors import ConfigError
-from semstab.outputs.recording import Recording, Target, target
+from semstab.recording import target
+from semstab.recording.observer import Recording
+from semstab.recording.target import Target
 
 
 def test_what_rerun_may_say() -> None:

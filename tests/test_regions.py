@@ -118,7 +118,7 @@ REGION_MAPS = hnp.arrays(np.int64, (4, 5), elements=st.integers(0, 4))
 @checks
 @given(REGION_MAPS, REGION_MAPS)
 def test_the_matching_is_the_best_one(previous, current):
-    from semstab.metrics.regions import _Contingency
+    from semstab.metrics.flicker import _Contingency
 
     table = _Contingency.of(previous.ravel(), current.ravel())
     found = 0.0

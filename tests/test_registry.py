@@ -5,9 +5,9 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from semstab import backends
+from semstab.core import registry
+from semstab.core.registry import Entry, Registry
 from semstab.errors import ConfigError, MissingDependencyError, SemstabError
-from semstab.runtime import registry
-from semstab.runtime.registry import Entry, Registry
 
 SHAPES = Registry(
     "shape",
@@ -64,7 +64,7 @@ def test_an_import_that_fails_inside_is_a_missing_dependency(monkeypatch, error)
 
 def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
     from semstab import backbones
-    from semstab.cli.listing import list_
+    from semstab.cli.outputs import list_
 
     original = registry.importlib.import_module
 

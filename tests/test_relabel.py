@@ -17,12 +17,11 @@ from posed_scene import fails
 
 import semstab
 from semstab.errors import ConfigError, DataError
+from semstab.exports.relabel import UNSEEN, UNSTABLE, Belief, FusedLabels, relabel
 from semstab.metrics import CATEGORIES, categories
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
-from semstab.model.voxels.tiles import Tiles
-from semstab.outputs.relabel import Belief, relabel
-from semstab.outputs.relabel.fused_labels import UNSEEN, UNSTABLE, FusedLabels
+from semstab.model.tiles import Tiles
 from semstab.statistics import psa
 
 R, K = 0.25, 3

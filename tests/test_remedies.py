@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from semstab.cli import app
 from semstab.engine.folder import load_result
-from semstab.outputs.remedies import Remedies, Remedy, advice, remedies
+from semstab.report.remedies import Remedies, Remedy, advice, remedies
 
 NAN = float("nan")
 

@@ -18,12 +18,12 @@ from wall_study import BACKBONES, CLASSES, STEPS, drawn_walls, wall_study
 from semstab.config import BASE, SHARED
 from semstab.model.records import Failure, ImageSpace, Variation
 from semstab.model.results import Agreement, Unit
-from semstab.outputs.averages import ENOUGH, pooled
-from semstab.outputs.findings import findings
-from semstab.outputs.plots import figures
-from semstab.outputs.report import write_report
-from semstab.outputs.report.reading import reading, verdicts
-from semstab.outputs.tables import tables
+from semstab.report import write_report
+from semstab.report.averages import ENOUGH, pooled
+from semstab.report.figures import figures
+from semstab.report.findings import findings
+from semstab.report.narrative import reading, verdicts
+from semstab.report.tables import tables
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]
 EVIL = '<script>alert("x")</script> & "quoted"'

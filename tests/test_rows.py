@@ -9,9 +9,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from semstab.datasets.files.digests import Digests
-from semstab.runtime import rows, scratch
-from semstab.runtime.rows import Rows
+from semstab.core import rows
+from semstab.core.rows import Rows
+from semstab.datasets.files.scene import Digests
 
 
 @pytest.fixture
@@ -51,8 +51,8 @@ def test_rows_stay_in_memory_while_the_disk_is_full(monkeypatch, call) -> None:
     for k, row in enumerate(expected):
         with monkeypatch.context() as full:
             if 50 <= k < 80:
-                full.setattr(scratch.os, call, disk_is_full) if call == "pwrite" else full.setattr(
-                    scratch.tempfile, "TemporaryFile", disk_is_full
+                full.setattr(rows.os, call, disk_is_full) if call == "pwrite" else full.setattr(
+                    rows.tempfile, "TemporaryFile", disk_is_full
                 )
             found.append(row)
     np.testing.assert_array_equal(found.table(), expected)
@@ -72,9 +72,9 @@ def test_memory_does_not_grow_with_the_rows(monkeypatch) -> None:
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("small", [0, scratch.SMALL])
+@pytest.mark.parametrize("small", [0, rows.SMALL])
 def test_digests_are_there_for_files_that_were_read(monkeypatch, small) -> None:
-    monkeypatch.setattr(scratch, "SMALL", small)
+    monkeypatch.setattr(rows, "SMALL", small)
     digests = Digests(5)
     digests.keep(3, "depth", bytes(range(32)))
     digests.keep(4, "labels", bytes(range(1, 33)))
@@ -84,11 +84,11 @@ def test_digests_are_there_for_files_that_were_read(monkeypatch, small) -> None:
 
 
 def test_a_digest_that_finds_no_room_is_not_kept(monkeypatch) -> None:
-    monkeypatch.setattr(scratch, "SMALL", 0)
+    monkeypatch.setattr(rows, "SMALL", 0)
     digests = Digests(5)
     digests.keep(0, "depth", bytes(range(32)))
     with monkeypatch.context() as full:
-        full.setattr(scratch.os, "pwrite", disk_is_full)
+        full.setattr(rows.os, "pwrite", disk_is_full)
         digests.keep(1, "depth", bytes(range(32)))
     assert (digests.of(0, "depth"), digests.of(1, "depth")) == (bytes(range(32)), None)
 
@@ -96,7 +96,7 @@ def test_a_digest_that_finds_no_room_is_not_kept(monkeypatch) -> None:
 def test_what_is_large_is_where_tmpdir_says(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
-    monkeypatch.setattr(scratch, "SMALL", 0)
-    room = scratch.room_for(8)
+    monkeypatch.setattr(rows, "SMALL", 0)
+    room = rows.room_for(8)
     room.write(np.array([7.0]), 0)
     assert room.read(np.float64, 1, 0) == 7.0

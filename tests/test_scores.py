@@ -11,8 +11,8 @@ import pytest
 
 import semstab
 from semstab import backends
-from semstab.backends.shared.scores.belief_vectors import observe_eights
-from semstab.backends.shared.scores.vectors import LANES
+from semstab.backends.shared.beliefs import observe_eights
+from semstab.backends.shared.score_loops import LANES
 from semstab.errors import DataError
 from semstab.testing import EXACT, SUMS, assert_same_map
 

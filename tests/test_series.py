@@ -12,9 +12,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semstab.core.rows import BLOCK, Rows
 from semstab.engine.series import FRAME_COLUMNS, NUMBERS, FrameRow, Series
 from semstab.model.results import FrameReport
-from semstab.runtime.rows import BLOCK, Rows
 
 counts, numbers = st.integers(0, 2**53), st.floats()
 reports = st.builds(

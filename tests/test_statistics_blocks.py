@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter
 from simulated_events import grid
 
 from semstab.errors import DataError
-from semstab.metrics.matching import voxel_keys
+from semstab.metrics.agreement import voxel_keys
 from semstab.statistics import BlockBootstrap, spatial_blocks
 from semstab.statistics.agreement import alpha_columns, alpha_of, psa_columns, ratio_of
 from semstab.statistics.blocks import gradient_of, interval

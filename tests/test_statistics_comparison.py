@@ -12,7 +12,7 @@ from statsmodels.stats.multitest import multipletests
 
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import vss
-from semstab.metrics.matching import shared_rows
+from semstab.metrics.agreement import shared_rows
 from semstab.model.measures import VSS
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
 from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised

@@ -11,13 +11,7 @@ from sklearn.metrics import accuracy_score, jaccard_score
 
 from semstab.errors import DataError
 from semstab.model.information import normalise
-from semstab.statistics import (
-    correctness,
-    join_truth,
-    quadrants,
-    reliability,
-    stable_wrong,
-)
+from semstab.statistics import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correctness import by_stratum
 from semstab.statistics.sampling import Places
 from semstab.statistics.steady import steady

@@ -9,8 +9,8 @@ import pytest
 from simulated_events import grid, log_of
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
-from semstab.outputs.plots.looks import draw_correlogram
-from semstab.outputs.recording.maps.agreement import looks_report
+from semstab.recording.voxel_maps import looks_report
+from semstab.report.figures.statistics import draw_correlogram
 from semstab.statistics import Sample, Views, correlogram, describe, krippendorff_alpha
 
 SIDE = 20

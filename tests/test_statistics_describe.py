@@ -11,14 +11,14 @@ import pytest
 from compare_summaries import differences
 from simulated_events import grid, log_of
 
+from semstab.core.files import read_json, write_json
+from semstab.core.json_form import from_json, to_json
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
+from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, ClassReach, Interval, Judged, MapStatistics, Reach
-from semstab.model.statistics.comparison import BackboneComparison
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.terminal.statistics import comparison_lines, lines
-from semstab.runtime.files import read_json, write_json
-from semstab.runtime.json_form import from_json, to_json
+from semstab.report.terminal_statistics import comparison_lines, lines
 from semstab.statistics import analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
 from semstab.statistics.agreement import PSA
 

@@ -14,8 +14,8 @@ from simulated_events import log_of, log_of_evidence, soft
 
 from semstab.errors import ConfigError
 from semstab.metrics import sbd, vss
+from semstab.model.events import Events
 from semstab.model.information import js_divergence, normalise
-from semstab.model.voxels import Events
 from semstab.statistics import benjamini_hochberg, expected_sbd, flips, scene_drift, voxel_drift
 
 

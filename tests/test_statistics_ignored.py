@@ -12,8 +12,8 @@ from striped_floor import K, flight, sampler_of
 
 from semstab import backends
 from semstab.errors import DataError
-from semstab.model.statistics.comparison import CommonLooks
-from semstab.outputs.terminal.statistics import comparison_lines
+from semstab.model.contrast import CommonLooks
+from semstab.report.terminal_statistics import comparison_lines
 from semstab.statistics import Looks, compare_backbones, psa
 from semstab.statistics.looks.common import common, psa_bounds
 from semstab.statistics.versus.standard import Observed

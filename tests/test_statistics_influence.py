@@ -7,7 +7,7 @@ import pytest
 from simulated_events import grid, log_of, log_of_evidence, soft
 
 from semstab.errors import DataError
-from semstab.metrics.matching import rows_of
+from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
 from semstab.statistics.correctness import correctness

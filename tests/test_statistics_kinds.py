@@ -7,9 +7,10 @@ import pytest
 from compare_summaries import differences
 from simulated_events import grid, log_of_evidence
 
+from semstab.core.json_form import to_json
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.model.voxels import Events, VoxelTable
-from semstab.runtime.json_form import to_json
+from semstab.model.voxels import VoxelTable
 from semstab.statistics import analyse, join_truth, kinds, patterns
 from semstab.statistics.kinds import Kinds
 

@@ -15,7 +15,7 @@ from striped_floor import K, flight, sampler_of
 
 from semstab import backends
 from semstab.datasets import open_dataset
-from semstab.metrics.matching import shared_observations
+from semstab.metrics.agreement import shared_observations
 from semstab.statistics import (
     Sample,
     Sampler,

@@ -19,12 +19,12 @@ from semstab.check import check
 from semstab.config import read_yaml
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
-from semstab.metrics.matching import rows_of
+from semstab.metrics.agreement import rows_of
+from semstab.model.events import Events
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.voxels import Events
-from semstab.outputs.report.reading import reading
-from semstab.outputs.tables import tables
-from semstab.outputs.terminal.summary import print_summary
+from semstab.report.narrative import reading
+from semstab.report.tables import tables
+from semstab.report.terminal import print_summary
 from semstab.settings import load_config, resolve
 from semstab.testing.builders import assert_same_map, random_frames
 

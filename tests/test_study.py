@@ -16,6 +16,7 @@ from tiny_study import Counting, Interrupting, configure, summary
 
 import semstab
 from semstab.config import BACKENDS, Config
+from semstab.core.json_form import to_json
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
@@ -26,7 +27,6 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.model.records import Variation
 from semstab.model.results import Unit
-from semstab.runtime.json_form import to_json
 from semstab.settings import resolve
 from semstab.statistics import Looks, compare_backbones
 from semstab.task import read
@@ -129,7 +129,7 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
 
 
 def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("semstab.engine.work.room.resident_bytes", lambda: 0)  # what is estimated counts alone
+    monkeypatch.setattr("semstab.engine.work.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
     small = {"memory_gb": 0.00003, "tile_size": "off"}
     config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, **small)
     result = run_study(config, tmp_path / "out")

@@ -31,9 +31,8 @@ import semstab
 from semstab.check import check, quick_check
 from semstab.check.display import print_check
 from semstab.datasets import open_dataset
-from semstab.datasets.surfaces import surface as surfaces
-from semstab.datasets.surfaces.casting import View
-from semstab.datasets.surfaces.surface import Surface
+from semstab.datasets.files import surfaces
+from semstab.datasets.files.surfaces import Surface, View
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.model.frames import Intrinsics
 from semstab.model.georeference import Georeference, wkt

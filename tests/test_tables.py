@@ -21,12 +21,13 @@ from records import record, study, voxels
 from wall_study import BACKBONES, STEPS, wall_study
 
 from semstab.config import BACKENDS, SHARED
+from semstab.core.files import write_text
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.model.measures import SBD, VSS
 from semstab.model.records import ImageSpace, RegionFlicker, Result
-from semstab.outputs.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
-from semstab.outputs.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
-from semstab.runtime.files import write_text
+from semstab.report.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.report.tables import tables, write_tables
+from semstab.report.tables.table import Column, Group, Table, to_csv, to_json, to_latex, to_markdown
 from semstab.statistics import Estimate
 from semstab.testing import checks
 

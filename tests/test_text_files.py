@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from posed_scene import fails, first_frame, opened, pose, say, write_scene
 
-from semstab.datasets.formats.text_files import read_intrinsics, read_pose
+from semstab.datasets.formats.disk import read_intrinsics, read_pose
 from semstab.errors import DataError
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import semstab
 from semstab import backends
-from semstab.backends.shared.pixels.tile_loops import NEAR
+from semstab.backends.shared.tile_loops import NEAR
 
 INTEGERS = ("ix", "iy", "iz", "op", "pixels", "first_frame", "last_frame")
 

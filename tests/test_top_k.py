@@ -14,7 +14,7 @@ from posed_scene import write_scene
 import semstab
 from semstab import backends
 from semstab.metrics import vss
-from semstab.pixels.top_k import keep_largest
+from semstab.pixels.preparation import keep_largest
 
 K = 12
 

@@ -22,24 +22,13 @@ RUNS_TRITON = importlib.util.find_spec("triton") is not None and (
 )
 
 from semstab import backends  # noqa: E402
+from semstab.backends import torch_eager, torch_map, torch_storage  # noqa: E402
 from semstab.backends.shared.association import back_project  # noqa: E402
-from semstab.backends.torch_map import TorchMap  # noqa: E402
-from semstab.backends.torch_parts import devices, eager, maps, storage, views  # noqa: E402
-from semstab.backends.torch_parts.maps import TorchMaps  # noqa: E402
-from semstab.backends.torch_parts.storage import EMPTY, MapGrid, VoxelHash, slots_for  # noqa: E402
-from semstab.backends.torch_parts.views import DepthView, TensorPrediction  # noqa: E402
+from semstab.backends.torch_map import TorchMap, TorchMaps  # noqa: E402
+from semstab.backends.torch_storage import EMPTY, DepthView, MapGrid, TensorPrediction, VoxelHash, slots_for  # noqa: E402
 from semstab.errors import ConfigError, DataError, MissingDependencyError  # noqa: E402
 from semstab.model.frames import Frame, Intrinsics  # noqa: E402
-from semstab.testing import (  # noqa: E402
-    EXACT,
-    SUMS,
-    BackendConformance,
-    assert_same_map,
-    checks,
-    random_frames,
-    sight_line,
-    voxels,
-)
+from semstab.testing import EXACT, SUMS, BackendConformance, assert_same_map, checks, random_frames, sight_line, voxels  # noqa: E402
 
 CPU = torch.device("cpu")
 K = 4
@@ -116,7 +105,7 @@ def survey(seed, camera=(4.5e5, 5.5e6, 80.0), shape=(90, 160)):
 def voxel_of_pixels(frame, dtype):
     """(H, W, 3) voxel indices from the map's origin, as the kernels find them."""
     origin = tuple(int(x) for x in np.floor(frame.T_wc[:3, 3] / 0.2))
-    seen = eager.Associator()(DepthView.of_frame(frame, CPU), MapGrid(0.2, origin, dtype))
+    seen = torch_eager.Associator()(DepthView.of_frame(frame, CPU), MapGrid(0.2, origin, dtype))
     key = seen.keys[seen.voxel.to(torch.int64)].numpy()
     return np.stack([key >> 42, (key >> 21) & (2**21 - 1), key & (2**21 - 1)], axis=-1) - 2**20 + origin
 
@@ -154,7 +143,7 @@ def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
     frames = [*random_frames(3, count=4), survey(0, camera=(0, 0, 80), shape=(20, 30))]
     whole = fused(frames)
     for size in (50, 333):
-        monkeypatch.setattr(eager, "chunk_of", lambda device, size=size: size)
+        monkeypatch.setattr(torch_eager, "chunk_of", lambda device, size=size: size)
         assert_equal(fused(frames), whole)
 
 
@@ -165,9 +154,9 @@ def test_the_same_frames_give_the_same_bits():
 
 def test_sums_of_scores_are_as_fine_as_they_say():
     """10^5 pixels of share 1/3 in one voxel, in units of 2^-45 (17 bits count the pixels), each rounded to nearest."""
-    seen = eager.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
+    seen = torch_eager.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
     values = torch.tensor([[1.0], [2.0]]).expand(2, 10**5)
-    evidence = eager.sum_scores(seen, views.Scores(values, softmax=False), 2)
+    evidence = torch_eager.sum_scores(seen, torch_storage.Scores(values, softmax=False), 2)
     assert evidence.scale == 2.0**45
     s_bar = evidence.sums[:, 0].to(torch.float64) / (evidence.scale * evidence.pixels)
     assert s_bar.tolist() == pytest.approx([1 / 3, 2 / 3], abs=2.0**-46)
@@ -330,7 +319,7 @@ def test_maps_of_several_backbones_are_as_if_made_alone():
     """Each ignores other pixels, one has other classes, and one is silent at times."""
     frames = random_frames(8, count=5)
     rng = np.random.default_rng(0)
-    maps = TorchMaps(0.4, {"a": K, "b": K, "c": 9}, device="CPU:0")
+    torch_map = TorchMaps(0.4, {"a": K, "b": K, "c": 9}, device="CPU:0")
     alone = {"a": new_map(), "b": new_map(), "c": new_map(num_classes=9)}
     for frame in frames:
         labels = {
@@ -341,7 +330,7 @@ def test_maps_of_several_backbones_are_as_if_made_alone():
         if frame.index == 3:
             del labels["c"]
         said = {name: TensorPrediction(labels=image) for name, image in labels.items()}
-        reports = maps.integrate_tensors(frame.depth, frame.intrinsics, frame.T_wc, said, index=frame.index)
+        reports = torch_map.integrate_tensors(frame.depth, frame.intrinsics, frame.T_wc, said, index=frame.index)
         assert list(reports) == list(labels)
         for name, report in reports.items():
             expected = alone[name].integrate(dataclasses.replace(frame, labels=labels[name], scores=None))
@@ -349,21 +338,21 @@ def test_maps_of_several_backbones_are_as_if_made_alone():
                 assert getattr(report, count) == getattr(expected, count), (name, count)
             assert report.map_vss == pytest.approx(expected.map_vss, abs=1e-12)
     for name, backend in alone.items():
-        assert_equal(maps.table(name), backend.table())
+        assert_equal(torch_map.table(name), backend.table())
 
 
 def test_one_backbone_that_cannot_be_fused_leaves_all_maps_as_they_were():
     frame = random_frames(9, count=1)[0]
-    maps = TorchMaps(0.4, {"good": K, "bad": 2}, device="CPU:0")
+    torch_map = TorchMaps(0.4, {"good": K, "bad": 2}, device="CPU:0")
     view = (frame.depth, frame.intrinsics, frame.T_wc)
     said = {name: TensorPrediction(labels=frame.labels) for name in ("good", "bad")}
     with pytest.raises(DataError, match="frame 0, labels of 'bad': label id 3 is outside 0 to 1"):
-        maps.integrate_tensors(*view, said, index=0)
-    assert len(maps.table("good")) == len(maps.table("bad")) == 0
+        torch_map.integrate_tensors(*view, said, index=0)
+    assert len(torch_map.table("good")) == len(torch_map.table("bad")) == 0
     with pytest.raises(ConfigError, match="no map of 'other'; there is good, bad"):
-        maps.integrate_tensors(*view, {"other": said["good"]}, index=0)
+        torch_map.integrate_tensors(*view, {"other": said["good"]}, index=0)
     with pytest.raises(ConfigError, match="no map of 'other'"):
-        maps.table("other")
+        torch_map.table("other")
     with pytest.raises(ConfigError, match="names no backbone"):
         TorchMaps(0.4, {})
 
@@ -379,7 +368,7 @@ def column_of(count, index=0, along="z"):
 @pytest.fixture
 def small(monkeypatch):
     """New maps have room for 8 voxels."""
-    monkeypatch.setattr(maps, "FIRST_ROWS", 8)
+    monkeypatch.setattr(torch_map, "FIRST_ROWS", 8)
 
 
 @pytest.mark.usefixtures("small")
@@ -420,7 +409,7 @@ def test_a_device_that_is_full_says_so(monkeypatch):
     def full(*arguments, **options):
         raise RuntimeError("out of memory\nand advice")
 
-    monkeypatch.setattr(storage.Columns, "grow", full)
+    monkeypatch.setattr(torch_storage.Columns, "grow", full)
     with pytest.raises(DataError, match=r"frame 1: the device cpu has no room for \d+ voxels \(out of memory") as error:
         backend.integrate(column_of(100, index=1))
     assert "\n" not in str(error.value)
@@ -452,7 +441,7 @@ KEYS = st.sets(st.integers(0, 2**63 - 1) | st.integers(0, 40), max_size=300)
 @checks
 @given(KEYS)
 def test_keys_are_mixed_as_splitmix64_does(keys):
-    mixed = eager.mix(torch.tensor(sorted(keys), dtype=torch.int64))
+    mixed = torch_eager.mix(torch.tensor(sorted(keys), dtype=torch.int64))
     assert [m % 2**64 for m in mixed.tolist()] == [splitmix64(key) for key in sorted(keys)]
 
 
@@ -462,11 +451,11 @@ def test_the_hash_finds_what_was_put_in(known, asked):
     table = VoxelHash(slots_for(300), CPU)
     keys = torch.tensor(list(known), dtype=torch.int64)
     rows = torch.arange(len(known))
-    eager.insert(table, keys[:100], rows[:100])
-    eager.insert(table, keys, rows, first=100)
+    torch_eager.insert(table, keys[:100], rows[:100])
+    torch_eager.insert(table, keys, rows, first=100)
     row_of = dict(zip(known, range(len(known)), strict=True))
     wanted = [*known, *asked]
-    found = eager.find(table, torch.tensor(wanted, dtype=torch.int64)).tolist()
+    found = torch_eager.find(table, torch.tensor(wanted, dtype=torch.int64)).tolist()
     assert found == [row_of.get(key, EMPTY) for key in wanted]
     assert int((table.keys != EMPTY).sum()) == len(known)
 
@@ -492,14 +481,14 @@ def test_options_that_cannot_be_used_are_refused(options, message):
 
 
 def test_triton_that_is_not_installed_is_left_out_or_asked_for(monkeypatch):
-    monkeypatch.setitem(sys.modules, "semstab.backends.torch_parts.triton_launch", None)
-    assert devices.kernels_for("auto", torch.device("cuda", 0)) is eager
+    monkeypatch.setitem(sys.modules, "semstab.backends.triton_launch", None)
+    assert torch_map.kernels_for("auto", torch.device("cuda", 0)) is torch_eager
     with pytest.raises(MissingDependencyError, match="pip install triton"):
         new_map(kernels="triton")
 
 
 def test_a_map_on_a_cpu_takes_plain_torch():
-    assert devices.kernels_for("auto", CPU) is eager
+    assert torch_map.kernels_for("auto", CPU) is torch_eager
     assert backends.takes_option("torch", "device")
 
 
@@ -518,7 +507,7 @@ DEVICE = "CUDA:0" if HAS_CUDA else "CPU:0"
 @pytest.fixture
 def triton_kernels(monkeypatch):
     """The module, with a hash so small that it overflows."""
-    from semstab.backends.torch_parts import triton_launch
+    from semstab.backends import triton_launch
 
     monkeypatch.setattr(triton_launch, "FIRST_SLOTS", 1 << 8)
     return triton_launch
@@ -596,8 +585,8 @@ COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from semstab.backends.torch_parts.triton_launch import SEPARATE
-from semstab.backends.torch_parts.triton_kernels import insert_pixels as kernel
+from semstab.backends.triton_launch import SEPARATE
+from semstab.backends.triton_kernels import insert_pixels as kernel
 
 types = dict.fromkeys(kernel.arg_names, "i32")
 types |= {"depth": "*fp32", "overflow": "*i32", "PROBES": "constexpr", "BLOCK": "constexpr"}

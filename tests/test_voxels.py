@@ -15,7 +15,8 @@ from hypothesis.extra import numpy as hnp
 from semstab import backends
 from semstab.errors import DataError
 from semstab.metrics import entropy, vss
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
 from semstab.testing import (
     EXACT,
     HITS,

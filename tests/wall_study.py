@@ -13,7 +13,7 @@ from posed_writer import write_posed
 from semstab.engine import run_study
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.records import Result
-from semstab.outputs.plots import write_figures
+from semstab.report.figures import write_figures
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
 STEPS = {"often": 0.25, "rarely": 1.0}

@@ -5,15 +5,24 @@ Paper, Semantic Evidence and World-Space Association, and Persistent Voxel Evide
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.errors import ConfigError, DataError
+from semstab.model.events import Events
 from semstab.model.frames import Frame
+from semstab.model.results import FrameReport
+from semstab.model.voxels import Extent, VoxelTable
+
+if TYPE_CHECKING:
+    from semstab.backends import FusionBackend
+
 
 INDEX_LIMIT = 2**31
 """Voxel indices are int32."""
@@ -26,10 +35,6 @@ FAR, DISTINCT = 100.0, 8
 
 FEW = 1 << 15
 """Pixels that are looked at together, about: what is computed of them stays in a core's cache."""
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +89,7 @@ def check_depth(frame: Frame) -> None:
         )
 
 
-def _whole_millimetres(depth: npt.NDArray[np.float32]) -> bool:
+def _whole_millimetres(depth: Float32) -> bool:
     """Whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
     if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
         return False
@@ -185,3 +190,36 @@ def _sums_of_evidence(frame: Frame, num_classes: int, chosen: Mask, voxel: Int64
     s_sum = np.zeros((voxels, num_classes))
     np.add.at(s_sum, voxel, s / s.sum(axis=1, keepdims=True))
     return s_sum
+
+
+# Any backend restricted to columns of voxels: of each frame it is shown the pixels that fall into them.
+
+
+class Restricted:
+    """A backend that has no restriction of its own, and associates pixel by pixel."""
+
+    def __init__(self, backend: FusionBackend, voxel_size: float, within: Extent) -> None:
+        self._backend = backend
+        self._voxel_size = voxel_size
+        self._within = within
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Fuse what the frame shows of the columns."""
+        depth = np.where(falling_into(self._within, frame, self._voxel_size), frame.depth, np.float32(0))
+        return self._backend.integrate(dataclasses.replace(frame, depth=depth))
+
+    def table(self) -> VoxelTable:
+        """The voxels of the columns; a map in single precision may have put a pixel one voxel beyond."""
+        table = self._backend.table()
+        inside = self._within.holds(table.index.T)
+        return table if inside.all() else table.rows(inside)
+
+    def events(self) -> Events | None:
+        """The log, where the backend keeps one."""
+        return self._backend.events()
+
+
+def falling_into(within: Extent, frame: Frame, voxel_size: float) -> Mask:
+    """The pixels (H, W) with depth whose voxels are in the extent."""
+    there: Mask = np.isfinite(frame.depth) & (frame.depth > 0)
+    return pixels_held(frame, there, voxel_size, within.holds)

@@ -1,16 +1,17 @@
 """Does a dataset make sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
-from semstab.check.advice import advise, with_voxel_size
 from semstab.check.geometry import Verdict
 from semstab.check.scene_check import (
     SCHEMA,
     SceneCheck,
+    advise,
     check,
     check_scene,
     quick_check,
     quick_look,
     refuse_unsound,
     require_sound,
+    with_voxel_size,
 )
 
 __all__ = [

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from semstab.datasets import Scene
-from semstab.datasets.views.poses import CAMERA_AXES
+from semstab.datasets.geometry.cameras import CAMERA_AXES
 from semstab.model.frames import Frame
 
 Size = tuple[int, int]

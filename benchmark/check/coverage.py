@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import create
-from semstab.check.reprojection import Sample
-from semstab.check.views import Float64, Pair, View
+from semstab.check.reprojection import Pair, Sample, View
+from semstab.core.types import Float64, Int64, Mask
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT
 
@@ -111,7 +111,7 @@ class Seen:
     offset: Float64
     first: Float64
     second: Float64
-    agree: npt.NDArray[np.bool_]
+    agree: Mask
 
 
 class Coverage:
@@ -182,7 +182,7 @@ class Coverage:
         )
 
 
-def world_points(view: View, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]) -> Float64:
+def world_points(view: View, u: Int64, v: Int64) -> Float64:
     """(N, 3) world coordinates of kept pixels, metres."""
     K = view.camera.every(view.stride)
     depth = view.depth[v, u].astype(np.float64)

@@ -17,7 +17,7 @@ import numpy as np
 
 from semstab.check.conventions import Convention, Reading, alternatives
 from semstab.check.reprojection import Sample, median_of_seen
-from semstab.check.views import Float64
+from semstab.core.types import Float64
 
 DECADES: Float64 = np.power(10.0, np.arange(-5, 6))
 FINE: Float64 = np.power(10.0, np.arange(-30, 31) / 6)

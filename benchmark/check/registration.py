@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from semstab.check.conventions import OPTION, Reading
+from semstab.check.geometry import Verdict
+from semstab.check.reprojection import Pair, View, evenly
+from semstab.core.types import Float32, Float64, Mask, UInt8
+from semstab.datasets import Scene
+from semstab.errors import DataError
+from semstab.model.frames import Intrinsics
 
 JUMP = 0.05
 """An edge of depth is where it changes by this share from pixel to pixel."""
@@ -34,9 +42,8 @@ MOST = 0.75
 
 LEAST_FRAMES = 4
 
-Map = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-Edges = tuple[npt.NDArray[np.float32], Mask]
+Map = Float64
+Edges = tuple[Float32, Mask]
 """Depth (H, W), and edges (H, W) of labels or of the image."""
 
 
@@ -80,7 +87,7 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
     return Offset(float(SCALES[best[0]]), shift, float(whole[best]), float(whole[here]))
 
 
-def depth_edges(depth: npt.NDArray[np.float32]) -> Mask:
+def depth_edges(depth: Float32) -> Mask:
     """(H, W) where neighbouring pixels lie on different surfaces.
 
     Small gaps are closed with the farthest depth around them: beside an edge sensors miss what lies behind it.
@@ -100,9 +107,9 @@ def label_edges(labels: npt.NDArray[Any], ignore: int) -> Mask:
     return _changes(labels, lambda a, b: (a != b) & (a != ignore) & (b != ignore))
 
 
-def grey_levels(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def grey_levels(color: UInt8) -> UInt8:
     """(H, W) brightness of colour (H, W, 3) from 0 to 254, so that it can be brought to the depth like labels."""
-    grey: npt.NDArray[np.uint8] = (color.mean(axis=2) * (254 / 255)).astype(np.uint8)
+    grey: UInt8 = (color.mean(axis=2) * (254 / 255)).astype(np.uint8)
     return grey
 
 
@@ -164,3 +171,235 @@ def _distance(one: tuple[int, ...], other: tuple[int, ...], shape: tuple[int, ..
     scale = abs(SCALES[one[0]] - SCALES[other[0]])
     x, y = (abs(one[k] - other[k]) / W for k in (2, 1))
     return float(max(x + scale / 2, y + scale / 2 * H / W))
+
+
+# Do a surface and the poses fit the images? Neighbouring photographs, compared where depth and pose carry them.
+#
+# Depth that is cast at a surface agrees between frames wherever the surface lies; the photographs do not.
+
+CHANGES = np.linspace(-0.3, 0.3, 241)
+"""By which shares of it depth is made larger."""
+
+LONGEST_SIDE = 800
+"""Pixels of the images that are compared: a step of depth then moves them by a pixel or so."""
+
+POINTS = 1500
+LEAST_POINTS = 100
+MOST_PAIRS = 6
+
+CLEARLY_BETTER = 0.15
+MATCHING = 0.35
+"""Correlations: of another depth over that of the present one, and of images that do show the same."""
+
+
+@dataclass(frozen=True)
+class ImageMatch:
+    """How neighbouring images match: correlation of grey values, mean over pairs.
+
+    now     with depth as it is
+    best    with depth larger by the share `change`, which is `metres` of the median depth
+    """
+
+    now: float
+    best: float
+    change: float
+    metres: float
+    pairs: int
+
+
+def match_images(scene: Scene, views: Mapping[int, View], pairs: Sequence[Pair]) -> ImageMatch | None:
+    """Compare the images of neighbouring frames; None where there are none, or they have too little in common."""
+    near = sorted((abs(a - b), a, b) for a, b in pairs if a < b)
+    closest = [(a, b) for _, a, b in near[:MOST_PAIRS]]
+    images = {at: _image(scene, views[at]) for at in {at for pair in closest for at in pair}}
+    curves: list[Float64] = []
+    depths: list[Float32] = []
+    for a, b in closest:
+        first, second = images[a], images[b]
+        if first is not None and second is not None:
+            curves.append(_correlations(views[a], first, views[b], second))
+            depths.append(views[a].depth[views[a].v, views[a].u])
+    present = int(np.abs(CHANGES).argmin())
+    together = [np.nan_to_num(curve) for curve in curves if np.isfinite(curve[present])]
+    if not together:
+        return None
+    mean = np.mean(together, axis=0)
+    at, now = int(mean.argmax()), float(mean[present])
+    change = float(CHANGES[at])
+    return ImageMatch(now, float(mean[at]), change, change * float(np.median(np.concatenate(depths))), len(together))
+
+
+def judge_surface(match: ImageMatch | None, frames: int) -> Verdict:
+    """What the images say of a surface and the poses."""
+    if match is None:
+        return Verdict(
+            "unclear",
+            "depth is cast at a surface and so agrees between frames whatever the poses are; without images of"
+            " overlapping frames nothing tells whether they fit",
+            frames=frames,
+        )
+    if match.best >= MATCHING and match.best - match.now > CLEARLY_BETTER:
+        side = "further from the cameras" if match.change > 0 else "nearer to the cameras"
+        return Verdict(
+            "unsound",
+            f"neighbouring images match where the surface lies {abs(match.metres):.3g} m {side} (correlation"
+            f" {match.best:.2f}, as it is {match.now:.2f}): surface and poses lie in other heights or scales; bring"
+            " them to the same coordinates",
+            frames=frames,
+            pairs=match.pairs,
+        )
+    if match.now < MATCHING:
+        return Verdict(
+            "unclear",
+            f"neighbouring images hardly match (correlation {match.now:.2f})",
+            frames=frames,
+            pairs=match.pairs,
+        )
+    return Verdict(
+        "sound",
+        f"neighbouring images match where surface and poses carry them (correlation {match.now:.2f}; best"
+        f" {match.best:.2f}, with the surface {abs(match.metres):.2g} m away)",
+        frames=frames,
+        pairs=match.pairs,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """Grey values (h, w) float32 of a view's colour image, and its intrinsics."""
+
+    grey: Float32
+    camera: Intrinsics
+
+
+def _image(scene: Scene, view: View) -> _Image | None:
+    import cv2
+
+    color = scene.color(view.index)
+    if color is None:
+        return None
+    W, H = view.size
+    factor = min(1.0, LONGEST_SIDE / max(W, H))
+    size = max(1, round(W * factor)), max(1, round(H * factor))
+    grey = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    return _Image(np.asarray(smooth, dtype=np.float32), view.camera.resized((W, H), size))
+
+
+def _correlations(a: View, image_a: _Image, b: View, image_b: _Image) -> Float64:
+    """(changes,) correlation of the first image's grey values with those that they meet in the second."""
+    v, u = np.nonzero((a.depth > 0) & (a.depth < np.inf))
+    if len(u) < LEAST_POINTS:
+        return np.full(len(CHANGES), np.nan)
+    if len(u) > POINTS:
+        chosen = np.random.default_rng(a.index).choice(len(u), POINTS, replace=False)
+        v, u = v[chosen], u[chosen]
+    K = a.camera.every(a.stride)
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(len(u))])
+    motion = np.linalg.inv(b.T_wc) @ a.T_wc
+    turned = motion[:3, :3] @ (rays * a.depth[v, u])
+    x, y, z = (turned[axis] * (1 + CHANGES[:, None]) + motion[axis, 3] for axis in range(3))
+    with np.errstate(all="ignore"):
+        column, row = image_b.camera.fx * x / z + image_b.camera.cx, image_b.camera.fy * y / z + image_b.camera.cy
+    h, w = image_b.grey.shape
+    seen = (z > 0) & (column >= 0) & (column <= w - 1) & (row >= 0) & (row <= h - 1)
+    met = _at(image_b.grey, np.where(seen, column, 0), np.where(seen, row, 0))
+    K = image_a.camera
+    (own,) = _at(image_a.grey, K.fx * rays[:1] + K.cx, K.fy * rays[1:2] + K.cy)
+    return np.array([_correlation(own[one], met[k][one]) for k, one in enumerate(seen)])
+
+
+def _at(image: Float32, column: Float64, row: Float64) -> Float32:
+    import cv2
+
+    return np.asarray(cv2.remap(image, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR))
+
+
+def _correlation(a: Float32, b: Float32) -> float:
+    if len(a) < LEAST_POINTS or a.std() == 0 or b.std() == 0:
+        return np.nan
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+# Stored values that mean 'no depth', where they are taken for metres: 65535 of 16 bits is 65 m away.
+
+FULL = 65535.0
+"""What 16 bits hold at most: hardly ever a distance."""
+
+LEAST_SHARE = 1e-3
+"""Of the pixels with depth that have one and the same value, the largest of all."""
+
+GAP = 2.0
+"""A value marks pixels where it is so many times the largest depth below it."""
+
+
+@dataclass(frozen=True)
+class Sentinel:
+    """A value that stands alone at the far end of the depths.
+
+    value   as it is stored
+    metres  what it is read as
+    share   of the pixels with depth
+    next    the largest depth below it, metres
+    """
+
+    value: float
+    metres: float
+    share: float
+    next: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.share:.1%} of the pixels with depth have the value {self.value:.15g} ({self.metres:.4g} m), and"
+            f" nothing lies between it and {self.next:.4g} m: it means 'no depth'"
+        )
+
+
+def find_sentinel(depths: Iterable[Float32], scale: float) -> Sentinel | None:
+    """The value of which `depths` (metres, `scale` stored units each) have many at the far end, and none near it."""
+    valid = [depth[(depth > 0) & (depth < np.inf)] for depth in depths]
+    pixels = sum(values.size for values in valid)
+    largest = max((values.max() for values in valid if values.size), default=np.float32(0))
+    below = max((rest.max() for values in valid if (rest := values[values < largest]).size), default=np.float32(0))
+    share = sum(np.count_nonzero(values == largest) for values in valid) / max(1, pixels)
+    value = float(f"{float(largest) * scale:.6g}")
+    stands_alone = largest >= GAP * below or value == FULL
+    if below == 0 or share < LEAST_SHARE or not stands_alone:
+        return None
+    return Sentinel(value, float(largest), share, float(below))
+
+
+# What looks wrong in a scene, but may be right: values that mean 'no depth', labels off the edges of depth.
+
+REGISTERED_FRAMES = 16
+"""Frames in which the edges of labels are compared with those of depth."""
+
+
+def remarks(scene: Scene, views: Sequence[View], how: Reading, backbone: str) -> Iterator[str]:
+    """One line each; the views have the labels of `backbone`, or none."""
+    if how.convention.depth == "planar" and (
+        found := find_sentinel((view.depth for view in views), how.depth_scale or 1)
+    ):
+        values = [*how.said.get("invalid_depth", ()), found.value]
+        yield f"{found}; set {how.change('invalid_depth', '[' + ', '.join(f'{value:.15g}' for value in values) + ']')}"
+    some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
+    if (offset := find_offset(list(_edges(scene, some)))) is not None:
+        what = "the images" if some[0].labels is None else f"labels of {backbone}"
+        mend = "register them to the depth"
+        if "color_intrinsics" in scene.settings:
+            mend = f"set {OPTION}color_intrinsics: [fx, fy, cx, cy], or {mend}"
+        yield f"{what} look as if they were not registered to the depth: {offset}; {mend}"
+
+
+def _edges(scene: Scene, views: Sequence[View]) -> Iterator[Edges]:
+    """Depth and edges of the labels, or without labels of the images, of views."""
+    for view in views:
+        if view.labels is not None:
+            yield view.depth, label_edges(view.labels, view.ignore_id)
+            continue
+        try:
+            grey = scene.predicted(view.index, labels=grey_levels(scene.image(view.index))).labels
+        except DataError:  # no image of the depth's view: whoever needs it says so
+            continue
+        if grey is not None:
+            yield view.depth, image_edges(grey[:: view.stride, :: view.stride])

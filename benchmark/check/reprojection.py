@@ -2,15 +2,120 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.check.conventions import Convention
-from semstab.check.views import Float64, Int64, Pair, View
+from semstab.core.types import Float32, Float64, Int64, Mask
+from semstab.datasets import GROUND_TRUTH, Scene
+from semstab.datasets.geometry.cameras import CAMERA_AXES, ray_lengths
+from semstab.model.frames import Frame, Intrinsics
+
+# Which frames and pixels a check looks at, and what it keeps of them: bounded at any length and image size.
+
+MAX_PIXELS = 2**20
+"""Of a larger image only every n-th pixel of each axis is kept."""
+
+STEPS = (0, 1, 2, 8, 27)
+"""Frames of a cluster, counted from its first one: their pairs lie 1 to 27 selected frames apart."""
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What is kept of a frame: every stride-th pixel, and of those a sample.
+
+    depth   (H, W) planar, metres, as configured
+    camera  intrinsics of the whole image, whose (width, height) is `size`
+    T_wc    (4, 4) camera-to-world, OpenCV axes, as configured
+    labels  (H, W) class ids, or None where the scene has no labels
+    u, v    (N,) the sample: kept pixels with valid depth
+    """
+
+    index: int
+    depth: Float32
+    camera: Intrinsics
+    size: tuple[int, int]
+    stride: int
+    T_wc: Float64
+    labels: npt.NDArray[Any] | None
+    ignore_id: int
+    u: Int64
+    v: Int64
+
+    @classmethod
+    def of(cls, frame: Frame, points: int, labelled: bool = True) -> View:
+        """Thin a frame. The sample is drawn at random by the frame's index: the same one each time."""
+        H, W = frame.shape
+        stride = max(1, math.ceil(math.sqrt(H * W / MAX_PIXELS)))
+        pick = (slice(None, None, stride), slice(None, None, stride))
+        depth = np.ascontiguousarray(frame.depth[pick])
+        valid = np.flatnonzero((depth > 0) & (depth < np.inf))
+        if len(valid) > points:
+            valid = np.random.default_rng(frame.index).choice(valid, points, replace=False)
+        v, u = np.unravel_index(valid, depth.shape)
+        labels = np.ascontiguousarray(frame.predicted[pick]) if labelled else None
+        return cls(frame.index, depth, frame.intrinsics, (W, H), stride, frame.T_wc, labels, frame.ignore_id, u, v)
+
+    def pose(self, convention: Convention, configured: Convention) -> Float64:
+        """(4, 4) camera-to-world, OpenCV axes, were the file read by that convention."""
+        pose = self.T_wc.copy()
+        pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[configured.axes].T
+        if convention.pose != configured.pose:
+            pose = np.linalg.inv(pose).astype(np.float64)
+        pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[convention.axes]
+        return pose
+
+    def kept_camera(self, convention: Convention) -> Intrinsics:
+        """Intrinsics of the kept pixels."""
+        width, height = self.size
+        made_for = (width * convention.ratio[0], height * convention.ratio[1])
+        return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)
+
+    def planar(self, u: Int64, v: Int64, convention: Convention, configured: Convention) -> Float64:
+        """Planar depth at kept pixels, were the file read by that convention, but for its factor."""
+        depth: Float64 = self.depth[v, u].astype(np.float64)
+        if convention.depth == configured.depth:
+            return depth
+        if configured.depth == "ray":
+            return depth * ray_lengths(self.kept_camera(configured), u, v)
+        return depth / ray_lengths(self.kept_camera(convention), u, v)
+
+
+def clusters(length: int, count: int) -> list[list[int]]:
+    """Positions of neighbouring frames to compare: `count` clusters, evenly spaced over a sequence of that length."""
+    steps = [step for step in STEPS if step <= min(length - 1, max(1, 0.75 * (length - 1)))]
+    room = length - 1 - steps[-1]
+    starts = {int(room * (k + 0.5) / count) for k in range(count)}
+    return [[start + step for step in steps] for start in sorted(starts)]
+
+
+def evenly(length: int, count: int) -> list[int]:
+    """At most `count` positions of a sequence, evenly spaced, the first and the last among them."""
+    return sorted({round(position) for position in np.linspace(0, length - 1, min(length, count)).tolist()})
+
+
+def pairs_within(groups: Sequence[Sequence[int]]) -> list[Pair]:
+    """Every ordered pair of two positions of one cluster, each once."""
+    return sorted({(a, b) for group in groups for a in group for b in group if a != b})
+
+
+def label_source(scene: Scene) -> str | None:
+    """The backbone with which frames are read where none is named; the ground truth where there is no other."""
+    return scene.backbones[0] if scene.backbones else GROUND_TRUTH if scene.ground_truth else None
+
+
+def reader(scene: Scene, backbone: str | None, *, color: bool = False) -> Callable[[int], Frame]:
+    """How a frame is read: with a backbone's labels, or where there are none, with all pixels class 0."""
+    if backbone is None:
+        return lambda index: scene.geometry(index, color=color)
+    return lambda index: scene.frame(index, backbone, color=color)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +169,7 @@ class Matches:
     v: Int64
     z: Float64
     depth: Float64
-    inside: npt.NDArray[np.bool_]
+    inside: Mask
     error: Float64
 
 

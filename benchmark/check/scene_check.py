@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,21 +23,107 @@ from semstab.check.coverage import (
     fused_stride,
     persistence,
     suggest,
+    suggested_size,
 )
 from semstab.check.geometry import Verdict, judge, shifts_and_turns
-from semstab.check.histogram import Histogram, Tally
-from semstab.check.photometry import judge_surface, match_images
-from semstab.check.remarks import remarks
-from semstab.check.reprojection import Sample
-from semstab.check.views import View, clusters, evenly, label_source, pairs_within, reader
+from semstab.check.registration import judge_surface, match_images, remarks
+from semstab.check.reprojection import Sample, View, clusters, evenly, label_source, pairs_within, reader
 from semstab.config import Config
+from semstab.core.json_form import to_json
+from semstab.core.prefetch import prefetch
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.errors import DataError
 from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace
-from semstab.runtime.json_form import to_json
-from semstab.runtime.prefetch import prefetch
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.model.results import VoxelAdvice
 from semstab.task import frame_indices, selected
+
+# Which classes a label source predicts, how often, and which ids no class has.
+
+MOST_IDS = 5
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """The labels of a backbone in some frames.
+
+    space     its taxonomy's name, or None where none is known
+    pixels    looked at
+    classes   share of them by class, in the taxonomy's order; by id where no taxonomy is known
+    ignored   share with the ignore id, or without usable scores
+    unknown   share by id that no class has
+    problem   what is wrong, or None
+    """
+
+    backbone: str
+    space: str | None
+    pixels: int
+    classes: Mapping[str, float]
+    ignored: float
+    unknown: Mapping[int, float]
+    problem: str | None
+
+
+class Tally:
+    """Counts the labels of a backbone, frame by frame."""
+
+    def __init__(self, backbone: str) -> None:
+        self.backbone = backbone
+        self._ids: Counter[int] = Counter()
+        self._ignored = 0
+        self._widths: set[int] = set()
+
+    def add(self, frame: Frame) -> None:
+        """Count a frame's labels, or the classes of its largest scores."""
+        counts = np.bincount(frame.predicted.ravel())
+        found = {int(i): int(counts[i]) for i in np.flatnonzero(counts)}
+        self._ignored += found.pop(frame.ignore_id, 0)
+        self._ids.update(found)
+        if frame.scores is not None:
+            self._widths.add(frame.scores.shape[2])
+
+    def histogram(self, space: LabelSpace | None, missing: str | None = None) -> Histogram:
+        """The shares, with what is wrong about them; `missing` says why there is no taxonomy."""
+        ids = self._named(space)
+        total = max(1, self._ignored + ids.total())
+        if space is None:
+            classes, unknown = {str(i): n / total for i, n in sorted(ids.items())}, {}
+        else:
+            classes = {name: ids[i] / total for name, i in zip(space.classes, space.ids, strict=True)}
+            unknown = {i: n / total for i, n in sorted(ids.items()) if i not in space.ids}
+        return Histogram(
+            backbone=self.backbone,
+            space=None if space is None else space.name,
+            pixels=self._ignored + ids.total(),
+            classes=classes,
+            ignored=self._ignored / total,
+            unknown=unknown,
+            problem=missing or self._problem(space, unknown, ids.total()),
+        )
+
+    def _named(self, space: LabelSpace | None) -> Counter[int]:
+        """The counts by the taxonomy's ids: scores count in its order, and 255 in a 16-bit map may mean 'ignore'."""
+        if space is None:
+            return self._ids
+        if self._widths:
+            rows = dict(enumerate(space.ids))
+            return Counter({rows.get(row, IGNORE_16BIT + row): n for row, n in self._ids.items()})
+        if max(space.ids) < IGNORE_8BIT and IGNORE_8BIT in self._ids:
+            self._ignored += self._ids.pop(IGNORE_8BIT)
+        return self._ids
+
+    def _problem(self, space: LabelSpace | None, unknown: Mapping[int, float], labelled: int) -> str | None:
+        if space is not None and self._widths - {len(space)}:
+            widths = ", ".join(map(str, sorted(self._widths)))
+            return f"scores of {self.backbone} hold {widths} classes, {space.name} has {len(space)}"
+        if space is not None and unknown:
+            listed = ", ".join(map(str, list(unknown)[:MOST_IDS])) + (", ..." if len(unknown) > MOST_IDS else "")
+            return (
+                f"labels of {self.backbone}: id {listed} ({sum(unknown.values()):.2%} of the pixels) is outside the"
+                f" taxonomy {space.name} (ids {min(space.ids)} to {max(space.ids)})"
+            )
+        return None if labelled else f"labels of {self.backbone}: no pixel has a label"
+
 
 SCHEMA = 1
 """Version of the file that --json writes."""
@@ -322,3 +411,51 @@ def _labels(scene: Scene, backbone: str, indices: Sequence[int], config: Config,
     if config.taxonomy is not None:
         space.mapping_to(LabelSpace.load(config.taxonomy))
     return tally.histogram(space)
+
+
+# Which voxel size suits the data, and where a given one lies.
+
+SCENES = 3
+"""Of more scenes some are looked at; the largest size suits all of them."""
+
+MADE = "city"
+"""The dataset that is made, not measured: nothing is to be told of its voxels."""
+
+
+def with_voxel_size(config: Config) -> tuple[Config, dict[str, VoxelAdvice]]:
+    """The configuration, with the voxel size that `check` suggests for data of files where it says none.
+
+    And why, scene by scene. Raises ConfigError or DataError where there is no such scene.
+    """
+    if config.sets_voxel_size or config.dataset.name == MADE:
+        return config, {}
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
+    some = [names[k] for k in evenly(len(names), SCENES)]
+    seen = {name: found for name in some if (found := _coverage(config, dataset.scene(name))) is not None}
+    sizes = [size for found in seen.values() if (size := suggested_size(found)) is not None]
+    if not sizes:
+        return config, {}
+    size = max(sizes)
+    advice = {name: VoxelAdvice(size, found.stays(size), size, chosen=True) for name, found in seen.items()}
+    return config.model_copy(update={"voxel_size": size}), advice
+
+
+def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
+    """Where the configured voxel size lies; None where nothing can be told of it."""
+    if sample is None or not sample.pairs or config.dataset.name == MADE:
+        return None
+    coverage = Coverage(sample)
+    stays = coverage.stays(config.voxel_size)
+    return None if math.isnan(stays) else VoxelAdvice(config.voxel_size, stays, suggested_size(coverage), chosen=False)
+
+
+def _coverage(config: Config, scene: Scene) -> Coverage | None:
+    """What a scene's frames share; None where they cannot be read: whoever needs them says so."""
+    extra = (GROUND_TRUTH,) if scene.ground_truth else ()
+    backbones = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
+    with contextlib.suppress(DataError):
+        indices = frame_indices(scene, config, backbones)
+        look = Look(scene, indices, None, clusters(len(indices), CLUSTERS), POINTS, passing_over=True)
+        return Coverage(look.sample(config.dataset.options)) if len(look.views) > 1 else None
+    return None

@@ -2,27 +2,58 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
-from semstab.cli.comparing import compare
-from semstab.cli.conforming import conform
+from semstab.cli.comparing import commit, compare, conform, gate
 from semstab.cli.data import check, convert, predict
-from semstab.cli.exporting import export, relabel
-from semstab.cli.gating import commit, gate
-from semstab.cli.interrupt import interruptible
-from semstab.cli.listing import list_
 from semstab.cli.options import say
-from semstab.cli.remedying import remedies
-from semstab.cli.running import run, study, view
+from semstab.cli.outputs import export, list_, relabel
+from semstab.cli.running import remedies, run, study, view
+from semstab.core.process import settle
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
-from semstab.runtime.process import settle
+
+# Ctrl-C, which may come in the midst of anything: an import, a callback from compiled code.
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, whatever it is taken for on its way out of the block.
+
+    An import that it hits may fail in another way, and what a callback raises is printed and forgotten: the first
+    becomes the interruption that it was, of the second nothing is printed.
+    """
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        yield
+        return
+    came: list[int] = []
+
+    def interrupt(number: int, _frame: Any) -> None:
+        came.append(number)
+        sys.unraisablehook = lambda _: None
+        raise KeyboardInterrupt
+
+    before, hook = signal.signal(signal.SIGINT, interrupt), sys.unraisablehook
+    try:
+        yield
+    except Exception as error:
+        if came:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = hook
+
 
 INTERRUPTED = 130
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from semstab.cli import completion
+from semstab.cli import options as completion
 from semstab.cli.options import (
     Backbones,
     Classes,
@@ -133,7 +133,7 @@ def check(
     from semstab.check import SCHEMA
     from semstab.check import check as check_scenes
     from semstab.check.display import print_check
-    from semstab.runtime.files import write_json
+    from semstab.core.files import write_json
 
     named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
     console, found = Console(quiet=quiet), []
@@ -165,8 +165,7 @@ def convert(
     """Write any dataset as posed folders. Goes on where it was."""
     from rich.console import Console
 
-    from semstab.convert import convert
-    from semstab.convert.display import frame_bar, print_converted
+    from semstab.convert import convert, frame_bar, print_converted
 
     chosen = selection(
         config, {"scenes": scene, "backbones": backbone}, with_options(settings, options), dataset, data, frames

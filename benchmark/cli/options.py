@@ -2,16 +2,96 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semstab.cli import completion
-from semstab.errors import ConfigError, told
+from semstab.errors import ConfigError, SemstabError, told
 
 if TYPE_CHECKING:
     from semstab.config import Config
+
+
+# What the shell completes: names of backends, datasets, backbones, taxonomies, studies, scenes and label sources.
+
+Complete = Callable[[Any, str], list[str]]
+
+
+def _beginning(names: Callable[[Any], Iterable[str]]) -> Complete:
+    def complete(ctx: Any, incomplete: str) -> list[str]:
+        try:
+            return sorted(name for name in names(ctx) if name.startswith(incomplete))
+        except (SemstabError, OSError):
+            return []  # what is wrong is said when the command runs
+
+    return complete
+
+
+def _backends(_: Any) -> Iterable[str]:
+    from semstab import backends
+
+    return backends.REGISTRY.entries()
+
+
+def _datasets(_: Any) -> Iterable[str]:
+    from semstab import datasets
+
+    return datasets.REGISTRY.entries()
+
+
+def _models(_: Any) -> Iterable[str]:
+    from semstab import backbones
+
+    return backbones.REGISTRY.entries()
+
+
+def _filters(_: Any) -> Iterable[str]:
+    from semstab.predict.filters import REGISTRY
+
+    return REGISTRY.entries()
+
+
+def _taxonomies(_: Any) -> Iterable[str]:
+    from semstab.model.labels import shipped_taxonomies
+
+    return shipped_taxonomies()
+
+
+def _studies(_: Any) -> Iterable[str]:
+    from semstab.settings import shipped_studies
+
+    return shipped_studies()
+
+
+def _opened(ctx: Any) -> Any:
+    """The dataset that the options before select."""
+    from semstab.datasets import open_dataset
+    from semstab.settings import load_config, resolve
+
+    data, name = ctx.params.get("data"), ctx.params.get("dataset")
+    dataset = {"name": name or ("posed_folder" if data else None), "options": {"root": str(data)} if data else None}
+    said = {key: value for key, value in dataset.items() if value is not None}
+    config = resolve(load_config(ctx.params.get("config"), {"dataset": said} if said else {}))
+    return open_dataset(config.dataset.name, config.dataset.options)
+
+
+def _scenes(ctx: Any) -> Iterable[str]:
+    return [*_opened(ctx).scenes, "all"]
+
+
+def _sources(ctx: Any) -> Iterable[str]:
+    opened = _opened(ctx)
+    scenes = [opened.scene(name) for name in opened.scenes[:1]]
+    return [*(name for scene in scenes for name in scene.backbones), "gt", "all"]
+
+
+backends, datasets, models = _beginning(_backends), _beginning(_datasets), _beginning(_models)
+filters = _beginning(_filters)
+taxonomies, studies = _beginning(_taxonomies), _beginning(_studies)
+scenes, label_sources = _beginning(_scenes), _beginning(_sources)
+
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")]
 DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
@@ -30,14 +110,12 @@ DatasetName = Annotated[
     typer.Option(
         help="Dataset, as named by `semstab-bench list`.",
         show_default="posed_folder with --data, else city",
-        autocompletion=completion.datasets,
+        autocompletion=datasets,
     ),
 ]
 Scenes = Annotated[
     list[str] | None,
-    typer.Option(
-        "--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=completion.scenes
-    ),
+    typer.Option("--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=scenes),
 ]
 Backbones = Annotated[
     list[str] | None,
@@ -46,7 +124,7 @@ Backbones = Annotated[
         "-m",
         help="Label source; repeatable; or 'all'; 'gt': truth.",
         show_default="all",
-        autocompletion=completion.label_sources,
+        autocompletion=label_sources,
     ),
 ]
 Classes = Annotated[
@@ -59,7 +137,7 @@ Filters = Annotated[
         "--filter",
         metavar="NAME:NUMBER",
         help="What steadies the labels: ema:0.6, vote:5, ... (`list`); repeatable, in this order.",
-        autocompletion=completion.filters,
+        autocompletion=filters,
     ),
 ]
 VoxelSize = Annotated[
@@ -133,7 +211,7 @@ def with_options(settings: list[str] | None, options: list[str] | None) -> list[
 
 def overrides(named: dict[str, Any], settings: list[str]) -> dict[str, Any]:
     """The settings given as options, those of --set last."""
-    from semstab.runtime.files import parse_yaml
+    from semstab.core.files import parse_yaml
 
     content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}
     for setting in settings:
@@ -169,7 +247,7 @@ def select_dataset(overrides: dict[str, Any], name: str | None, data: Path | Non
 
 def slice_of(text: str) -> dict[str, int]:
     """'START:STOP:STRIDE' as settings; each part may be empty."""
-    from semstab.config.selection import slice_of
+    from semstab.config.settings import slice_of
 
     try:
         return slice_of(text)

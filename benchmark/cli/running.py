@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semstab.cli import completion
+from semstab.cli import options as completion
 from semstab.cli.options import (
     Backbones,
     Classes,
@@ -18,6 +18,7 @@ from semstab.cli.options import (
     DataFolder,
     DatasetName,
     DatasetOptions,
+    DatasetSettings,
     Filters,
     Frames,
     Jobs,
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine import Executor, Observer
     from semstab.model.records import Result
-    from semstab.outputs.recording import Recording
+    from semstab.recording.observer import Recording
 
 
 DISAGREE = 3
@@ -186,7 +187,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     """Open a run's recording in the rerun viewer."""
     import subprocess
 
-    from semstab.outputs.recording.target import viewer_command
+    from semstab.recording.target import viewer_command
 
     recording = run / "recording.rrd" if run.is_dir() else run
     if not recording.is_file():
@@ -209,10 +210,8 @@ def execute(config: Config, out: Path, executor: Executor, rerun: str | None, re
     from rich.console import Console
 
     from semstab.api import run_study
-    from semstab.outputs.remedies import remedies
-    from semstab.outputs.terminal.progress import ProgressBar, failure_lines
-    from semstab.outputs.terminal.remedies import print_remedies
-    from semstab.outputs.terminal.summary import print_summary
+    from semstab.report.remedies import remedies
+    from semstab.report.terminal import ProgressBar, failure_lines, print_remedies, print_summary
 
     if report not in ("on", "off"):
         raise ConfigError(f"--report {report}: write on or off")
@@ -247,7 +246,8 @@ def execute(config: Config, out: Path, executor: Executor, rerun: str | None, re
 def _recording(rerun: str | None, out: Path) -> list[Recording]:
     if rerun == "off":
         return []
-    from semstab.outputs.recording import Recording, Target
+    from semstab.recording.observer import Recording
+    from semstab.recording.target import Target
 
     return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
 
@@ -312,3 +312,44 @@ def _default_out() -> Path:
     from datetime import datetime
 
     return Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+
+
+# The command remedies.
+
+
+def remedies(
+    data: DataFolder = None,
+    dataset: DatasetName = None,
+    scene: Scenes = None,
+    backbone: Backbones = None,
+    predict: Models = None,
+    classes: Classes = None,
+    filters: Filters = None,
+    frames: Frames = None,
+    voxel_size: VoxelSize = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and judge in: a name or a file.")] = None,
+    settings: DatasetSettings = None,
+    options: DatasetOptions = None,
+    trust_geometry: TrustGeometry = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Study folder.")] = Path("studies/remedies"),
+    report: Report = "on",
+    jobs: Jobs = 1,
+    quiet: Quiet = False,
+) -> None:
+    """What would steady this model: filters over it, how right, how late, at what price. Goes on where it was.
+
+    --filter tries others than the usual ones; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
+    """
+    from semstab.predict.predictor import parse_predictor
+    from semstab.remedies import remedies_config
+
+    named: dict[str, Any] = {"scenes": scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
+    named["check_geometry"] = False if trust_geometry else None
+    models = [parse_predictor(text, {} if classes is None else {"classes": classes}) for text in predict or []]
+    content = chosen(named, with_options(settings, options), dataset, data, frames)
+    config, left_out = remedies_config(
+        models, backbone or [], filters or [], content, kept=out.absolute() / "predictions"
+    )
+    for line in left_out if not quiet else ():
+        say(line)
+    execute(config, out, executor_of(jobs, None), "off", report, quiet)

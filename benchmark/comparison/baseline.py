@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from semstab.core.files import atomic_path, parse_json, read_limited
+from semstab.core.json_form import from_json, to_json
 from semstab.errors import DataError, one_line
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace
 from semstab.model.results import UnitSummary
-from semstab.runtime.files import atomic_path, parse_json, read_limited
-from semstab.runtime.json_form import from_json, to_json
 from semstab.statistics.sampling import InfluenceSums
 
 SCHEMA, KIND = 1, "semstab small summary"

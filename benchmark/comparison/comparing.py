@@ -12,8 +12,8 @@ from semstab.comparison.opening import Contender, open_contenders, shared_scenes
 from semstab.comparison.pairing import Common, pair
 from semstab.comparison.places import Changes, worse_places
 from semstab.errors import ConfigError
+from semstab.model.contrast import Against, Compared, RunComparison, SceneComparison
 from semstab.model.results import slug
-from semstab.model.statistics.contrast import Against, Compared, RunComparison, SceneComparison
 
 SCHEMA = 1
 COLUMNS = "columns"

@@ -7,11 +7,10 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.comparison.opening import Entry, Flicker
 from semstab.comparison.pairing import Common
-from semstab.comparison.quantities import (
+from semstab.comparison.tables import (
     BY_CLASS,
     COVERAGE,
     FLICKER,
@@ -24,10 +23,11 @@ from semstab.comparison.quantities import (
     RECALL,
     quantities,
 )
+from semstab.core.types import Int64
 from semstab.metrics import macro_mean
+from semstab.model.contrast import Contrast
 from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
-from semstab.model.statistics.contrast import Contrast
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
 from semstab.statistics.correctness import ACCURACY, MIOU
@@ -244,16 +244,16 @@ def _of_places(common: Common, names: Sequence[str], number: int) -> Iterator[Co
             yield from _row(quantity, sums[0], sums[number], common, of=name)
 
 
-def class_of_places(common: Common) -> npt.NDArray[np.int64]:
+def class_of_places(common: Common) -> Int64:
     """The class (n,) of each common place: the true one, or what all runs together say; -1 where it is not known."""
     return common.label if common.label is not None else joint_class(common.tables)
 
 
-def joint_class(tables: Iterable[VoxelTable]) -> npt.NDArray[np.int64]:
+def joint_class(tables: Iterable[VoxelTable]) -> Int64:
     """The dominant class (n,) of the same voxels in several maps, each counting alike."""
     first, *others = tables
     beliefs = first.evidence[:] / first.op[:, None]
     for other in others:
         beliefs = beliefs + other.evidence[:] / other.op[:, None]
-    label: npt.NDArray[np.int64] = beliefs.round(9).argmax(axis=1)
+    label: Int64 = beliefs.round(9).argmax(axis=1)
     return label

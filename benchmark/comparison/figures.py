@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 
 from semstab.comparison.comparing import Found
 from semstab.comparison.places import Changes
-from semstab.comparison.quantities import HEADLINES, IOU, by_key
-from semstab.comparison.tables import ALL_SCENES, IN_CLASSES, scopes
+from semstab.comparison.tables import ALL_SCENES, HEADLINES, IN_CLASSES, IOU, by_key, scopes
+from semstab.model.contrast import Against, RunComparison
 from semstab.model.results import slug
 from semstab.model.statistics import Estimate
-from semstab.model.statistics.contrast import Against, RunComparison
-from semstab.outputs.plots.changes import Panel, draw_changes
-from semstab.outputs.plots.statistics import draw_intervals
-from semstab.outputs.plots.style import Figure
+from semstab.report.figures.maps import Panel, draw_changes
+from semstab.report.figures.statistics import draw_intervals
+from semstab.report.figures.style import Figure
 from semstab.statistics.agreement import PSA
 from semstab.statistics.correctness import MIOU
 from semstab.statistics.sampling import LEAST_FRAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
+
 
 Panels = dict[str, dict[str, dict[str, Estimate]]]
 """By measure, by scene or class, by run."""

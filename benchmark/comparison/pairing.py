@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.comparison.opening import Entry
-from semstab.metrics.matching import observations, rows_of, shared_rows
+from semstab.core.types import Int64, Mask
+from semstab.metrics.agreement import observations, rows_of, shared_rows
+from semstab.model.contrast import Basis, CommonLooks, MapCoverage
+from semstab.model.events import Events
 from semstab.model.measures import sbd
 from semstab.model.records import Record
-from semstab.model.statistics.comparison import CommonLooks, MapCoverage
-from semstab.model.statistics.contrast import Basis
-from semstab.model.voxels import Events, VoxelTable
-from semstab.model.voxels.tiles import Tiles, side_by_side
+from semstab.model.tiles import Tiles, side_by_side
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.looks import Looks
 from semstab.statistics.looks.ignored import common_looks
@@ -26,8 +26,6 @@ from semstab.statistics.order.drift import expected_sbd, streams
 from semstab.statistics.sampling import InfluenceSums, influence_sums
 from semstab.statistics.versus.backbones import Region, Regions, truth_at
 from semstab.statistics.versus.comparison import coverage_of, held, repeated_rows
-
-Int64 = npt.NDArray[np.int64]
 
 NEAR = 1e-3
 """Metres within which cameras of the same frame lie."""
@@ -85,7 +83,7 @@ class Common:
     frames_differ: bool = False
     shown: float = 1.0
 
-    def among(self, where: npt.NDArray[np.bool_]) -> tuple[InfluenceSums, ...]:
+    def among(self, where: Mask) -> tuple[InfluenceSums, ...]:
         """The sums of some of the common places (n,)."""
         return tuple(
             _sums(rows_of(table, where), _some(log, where), None if self.label is None else self.label[where])
@@ -142,11 +140,11 @@ def share_of(voxels: int) -> float:
     return 1.0 if voxels <= MOST else 2.0 ** -math.ceil(math.log2(voxels / MOST))
 
 
-def in_share(table: VoxelTable, share: float) -> npt.NDArray[np.bool_]:
+def in_share(table: VoxelTable, share: float) -> Mask:
     """(n,) which voxels are in the sample that is so large a part of all, by a hash of their index."""
     if share >= 1:
         return np.ones(len(table), np.bool_)
-    drawn: npt.NDArray[np.bool_] = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
+    drawn: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
     return drawn
 
 
@@ -214,7 +212,7 @@ def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> Influen
     return influence_sums(table, log, label, sbd_excess=sbd(table) - expected_sbd(table))
 
 
-def _some(log: Events | None, where: npt.NDArray[np.bool_]) -> Events | None:
+def _some(log: Events | None, where: Mask) -> Events | None:
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
 
 

@@ -16,15 +16,14 @@ import numpy.typing as npt
 
 from semstab.comparison.contrasts import joint_class
 from semstab.comparison.pairing import Common, in_share
-from semstab.metrics.matching import shared_rows, voxel_keys
+from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.metrics.agreement import shared_rows, voxel_keys
+from semstab.model.contrast import Blame, Place
+from semstab.model.events import Events
 from semstab.model.measures import dominant
-from semstab.model.statistics.contrast import Blame, Place
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 WORSE = 0.2
 """A voxel got worse where so much of its agreement is lost: of ten looks, one turned to another class."""
@@ -71,12 +70,12 @@ class Changed:
         return cls(base, between[0] - between[1], joint_class((base, other)), true, right)
 
     @property
-    def matters(self) -> npt.NDArray[np.bool_]:
+    def matters(self) -> Mask:
         """(n,) which may be part of a place, or of its rivals."""
-        much: npt.NDArray[np.bool_] = np.abs(self.change) >= WORSE
+        much: Mask = np.abs(self.change) >= WORSE
         return much if self.right is None else much | (self.right != 0)
 
-    def rows(self, where: npt.NDArray[np.bool_]) -> Changed:
+    def rows(self, where: Mask) -> Changed:
         """Some of them (n,)."""
         true, right = (None if own is None else own[where] for own in (self.true, self.right))
         return Changed(self.table.rows(where), self.change[where], self.label[where], true, right)
@@ -191,16 +190,14 @@ def _columns(own: Changed, place: Int64, wrong_place: Int64 | None) -> dict[str,
 # --- Places -----------------------------------------------------------------------------------------------------------
 
 
-def _clusters(index: npt.NDArray[np.int32], label: Int64, loss: Float64, least: float) -> tuple[Int64, Int64]:
+def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[Int64, Int64]:
     """The number (n,) of each voxel's place, the largest loss first, 0 in none; and the rivals of each place (m,)."""
     place, mass = _connected(index, label, loss, loss >= least)
     _, others = _connected(index, label, -loss, loss <= -least)
     return place, np.array([np.count_nonzero(others >= own - 1e-9) for own in mass], dtype=np.int64)
 
 
-def _connected(
-    index: npt.NDArray[np.int32], label: Int64, loss: Float64, where: npt.NDArray[np.bool_]
-) -> tuple[Int64, Float64]:
+def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
     """The places that voxels of one class make which touch each other, and the loss that each sums up to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -221,7 +218,7 @@ def _connected(
     return number, mass[kept]
 
 
-def _touching(index: npt.NDArray[np.int32], label: Int64) -> tuple[Int64, Int64]:
+def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
     """Pairs of voxels of one class that share a face, an edge or a corner."""
     low, size = index.min(axis=0).astype(np.int64) - 1, np.ptp(index, axis=0).astype(np.int64) + 3
     x, y, z = (index.astype(np.int64) - low).T
@@ -241,7 +238,7 @@ def _places(
     number: Int64,
     rivals: Int64,
     loss: Float64,
-    index: npt.NDArray[np.int32],
+    index: Int32,
     voxel_size: float,
     label: Int64,
     names: Sequence[str],
@@ -287,7 +284,7 @@ class Looks:
     base: Float64
     other: Float64
 
-    def among(self, where: npt.NDArray[np.bool_], label: Int64) -> Seen:
+    def among(self, where: Mask, label: Int64) -> Seen:
         """Those at some of the voxels (n,), whose classes (n,) are what the looks should say."""
         rows = where[self.voxel]
         k = label[self.voxel[rows]][:, None]
@@ -323,7 +320,7 @@ def _blamed(seen: Seen) -> tuple[Blame, ...]:
     return tuple(Blame(int(frames[k]), float(part)) for k, part in zip(order[:enough], share[:enough], strict=True))
 
 
-def _looks(common: Common, number: int, index: npt.NDArray[np.int32]) -> Looks | None:
+def _looks(common: Common, number: int, index: Int32) -> Looks | None:
     """The common looks at the voxels (n, 3), in one order; None where they were not kept."""
     if not common.logs:
         return None
@@ -332,7 +329,7 @@ def _looks(common: Common, number: int, index: npt.NDArray[np.int32]) -> Looks |
     return Looks(base[0][there], base[1][there], base[2][there], other[2][there])
 
 
-def _rows_of(log: Events, index: npt.NDArray[np.int32]) -> tuple[Int64, Int64, Float64]:
+def _rows_of(log: Events, index: Int32) -> tuple[Int64, Int64, Float64]:
     """Of each look the row of its voxel, -1 where that is not among them, its frame, and what it says."""
     own, wanted = voxel_keys(np.stack([log.ix, log.iy, log.iz], axis=1), index)
     at = np.minimum(np.searchsorted(wanted, own), max(len(wanted) - 1, 0))

@@ -8,17 +8,17 @@ from typing import Any
 
 from semstab.comparison.comparing import Found, Progress, find
 from semstab.comparison.figures import figures
-from semstab.comparison.reading import sentences
+from semstab.comparison.narrative import sentences
 from semstab.comparison.tables import heading, tables
+from semstab.core.files import keep_only, read_json, write_json, write_text
+from semstab.core.json_form import from_json
 from semstab.errors import ConfigError
-from semstab.model.statistics.contrast import RunComparison
-from semstab.model.voxels import parquet
-from semstab.outputs.plots.style import Figure
-from semstab.outputs.report.page import blocks, filled
-from semstab.outputs.tables import Table, save_tables, to_markdown
-from semstab.outputs.tables.writers import relations
-from semstab.runtime.files import keep_only, read_json, write_json, write_text
-from semstab.runtime.json_form import from_json
+from semstab.model import parquet
+from semstab.model.contrast import RunComparison
+from semstab.report import blocks, filled
+from semstab.report.figures.style import Figure
+from semstab.report.tables import save_tables
+from semstab.report.tables.table import Table, relations, to_markdown
 
 CONTENT, PAGE, REPORT, RECORDING = "comparison.json", "comparison.md", "report.html", "recording.rrd"
 KIND = "Changes"
@@ -60,7 +60,7 @@ def write(found: Found, out: str | Path) -> None:
     _write_columns(found, folder)
     write_text(folder / REPORT, page(found.result, made, drawn, folder))
     if found.changes:
-        from semstab.outputs.recording.maps.changes import record_changes
+        from semstab.recording.changes import record_changes
 
         record_changes(folder / RECORDING, dict(_recorded(found)), found.up, sentences(found.result))
 

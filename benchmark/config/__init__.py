@@ -10,9 +10,21 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from semstab.config.selection import FrameSelection, as_range
-from semstab.config.settings import Settings, explain, merge, read_yaml, validated
-from semstab.config.sweeps import Counts, Deviation, Lengths, Noise, Part, Sweeps
+from semstab.config.settings import (
+    Counts,
+    Deviation,
+    FrameSelection,
+    Lengths,
+    Noise,
+    Part,
+    Settings,
+    Sweeps,
+    as_range,
+    explain,
+    merge,
+    read_yaml,
+    validated,
+)
 from semstab.errors import ConfigError
 
 __all__ = [
@@ -71,7 +83,7 @@ class BackendConfig(Part):
 
 
 class Perturbation(Settings):
-    """Noise on depth and poses, to see what geometry alone does to the numbers; see `semstab.pixels.perturbation`.
+    """Noise on depth and poses, to see what geometry alone does to the numbers; see `semstab.pixels.preparation`.
 
     Standard deviations, of each axis where there are three. 0 adds nothing.
     """
@@ -90,7 +102,7 @@ class Perturbation(Settings):
 
 
 class Exclusion(Settings):
-    """What is left out of fusion because it moves; see `semstab.pixels.exclusion`."""
+    """What is left out of fusion because it moves; see `semstab.pixels.preparation`."""
 
     classes: tuple[str, ...] = Field((), description="classes, by their name in a backbone's or in the run's taxonomy")
     masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, BackboneComparison, Looks, Sample, analyse
 from semstab.statistics.versus.backbones import Regions, compare_regions
 from semstab.task import Task

@@ -12,24 +12,20 @@ from pathlib import Path
 
 from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
 from semstab.config import Config
+from semstab.core.process import Stopwatch, give_back
 from semstab.engine.folder import Folder, require_file_names
-from semstab.engine.found import Found, advice_of, result_of
-from semstab.engine.in_tiles import InTiles
-from semstab.engine.manifest import manifest
 from semstab.engine.observer import Observer, Observers
-from semstab.engine.sizing import Sizing, sized
-from semstab.engine.survey import Survey
+from semstab.engine.results import Found, advice_of, manifest, result_of
+from semstab.engine.sizing import Sizing, Survey, sized
+from semstab.engine.tiled_units import InTiles, Waiting
 from semstab.engine.tiling.partition import Tiling
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
-from semstab.engine.waiting import Waiting
 from semstab.engine.work.executors import Executor, InProcess
 from semstab.engine.work.jobs import Outcome
 from semstab.engine.work.passes import lend
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result, UnitContent
 from semstab.model.results import VoxelAdvice
-from semstab.runtime.process import give_back
-from semstab.runtime.stopwatch import Stopwatch
 from semstab.settings import resolve
 
 

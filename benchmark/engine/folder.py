@@ -17,6 +17,8 @@ from typing import Any
 import yaml
 
 from semstab.config import Config, read_yaml
+from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
+from semstab.core.json_form import from_json, to_json
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.tiling.portion import PORTIONS, Finished
 from semstab.engine.tiling.sights import SIGHTS
@@ -40,16 +42,6 @@ from semstab.model.records import (
     UnitContent,
 )
 from semstab.model.results import SCHEMA, Unit, slug
-from semstab.runtime.files import (
-    TEMPORARY,
-    FolderLock,
-    atomic_path,
-    read_json,
-    remove_leftovers,
-    write_json,
-    write_text,
-)
-from semstab.runtime.json_form import from_json, to_json
 
 logger = logging.getLogger("semstab")
 

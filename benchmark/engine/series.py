@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.files import atomic_path
+from semstab.core.rows import Rows
+from semstab.core.types import Float64
 from semstab.model.results import STAGES, FrameReport
-from semstab.runtime.files import atomic_path
-from semstab.runtime.rows import Rows
 
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
@@ -82,20 +82,20 @@ class Series(Sequence[FrameRow]):
         self._rows = Rows(len(NUMBERS)) if numbers is None else numbers
 
     @property
-    def numbers(self) -> npt.NDArray[np.float64]:
+    def numbers(self) -> Float64:
         """(F, C) the NUMBERS of each row."""
         return self._rows.table()
 
-    def column(self, name: str) -> npt.NDArray[np.float64]:
+    def column(self, name: str) -> Float64:
         """(F,) one of the NUMBERS."""
         return self._rows.column(NUMBERS.index(name))
 
     @property
-    def drift(self) -> npt.NDArray[np.float64]:
+    def drift(self) -> Float64:
         """(F,) mean drift of each frame's updates; see `FrameReport.drift`."""
         updated = self.column("voxels") - self.column("new_voxels")
         with np.errstate(invalid="ignore"):
-            drift: npt.NDArray[np.float64] = np.where(updated, self.column("drift_sum"), np.nan) / updated
+            drift: Float64 = np.where(updated, self.column("drift_sum"), np.nan) / updated
         return drift
 
     def append(self, row: FrameRow) -> None:

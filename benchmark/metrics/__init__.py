@@ -1,12 +1,28 @@
 """The paper's measures as pure functions of a voxel table, and what follows from them."""
 
 from semstab.metrics.agreement import compare
-from semstab.metrics.category import CATEGORIES, CATEGORY_COLORS, CategoryThresholds, categories, category_shares
-from semstab.metrics.flicker import CompensatedFlicker, compensated_flicker, flicker_percent
+from semstab.metrics.flicker import (
+    CompensatedFlicker,
+    RegionChange,
+    SelfConsistency,
+    VideoConsistency,
+    compensated_flicker,
+    flicker_percent,
+    matched_region_flicker,
+)
 from semstab.metrics.frame_quality import FrameJudge
-from semstab.metrics.regions import RegionChange, matched_region_flicker
-from semstab.metrics.summary import macro_mean, pool, split_last, strata, summarise
-from semstab.metrics.video import SelfConsistency, VideoConsistency
+from semstab.metrics.summary import (
+    CATEGORIES,
+    CATEGORY_COLORS,
+    CategoryThresholds,
+    categories,
+    category_shares,
+    macro_mean,
+    pool,
+    split_last,
+    strata,
+    summarise,
+)
 from semstab.model.measures import dominant, entropy, op, sbd, vss
 
 __all__ = [

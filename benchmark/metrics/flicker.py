@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from semstab.errors import DataError
+from semstab.core.types import Int64, Mask
+from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
+from semstab.model.information import entropy_bits
 from semstab.model.labels import flat
 from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
@@ -24,7 +28,7 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
         raise DataError(
             f"{current.where('depth')}: frames {previous.index} and {current.index} differ in size ({sizes})"
         )
-    from semstab.model.pixel_kernel import count_changed
+    from semstab.model.kernels import count_changed
 
     images = (previous.valid, previous.predicted, current.valid, current.predicted)
     both, changed = count_changed(*(flat(image) for image in images))
@@ -54,7 +58,7 @@ def compensated_flicker(
 
     Raises ConfigError where depth_tolerance is not above 0 and below 1.
     """
-    from semstab.model.pixel_kernel import count_changed_at
+    from semstab.model.kernels import count_changed_at
 
     seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel
     images = (seen, current.valid, current.predicted, previous.valid, previous.predicted)
@@ -63,3 +67,236 @@ def compensated_flicker(
         100.0 * changed / covisible if covisible else math.nan,
         covisible / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
     )
+
+
+# Video consistency: how many pixels keep their label over clips of n frames (Miao et al. 2021, CVPR, VSPW).
+
+Labels = npt.NDArray[np.integer[Any]]
+
+
+class VideoConsistency:
+    """VC_n with ground truth, as in VSPW: 1 is a prediction that never changes where the truth does not.
+
+    Of the pixels whose ground truth is the same in all n frames of a clip, the share whose prediction is the same in
+    all of them, right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
+    Frames are added one by one and none is kept. Clips do not reach across a change of the image size.
+
+    n  frames a clip, at least 2; VSPW reports 8 and 16
+    """
+
+    def __init__(self, n: int) -> None:
+        self._prediction = _Run(n)
+        self._truth = _Run(n)
+        self._clips = _Clips(n)
+
+    def add(self, labels: Labels, valid: Mask, truth: Labels) -> float:
+        """Add the next frame; return the consistency of the clip that ends with it, NaN where none does.
+
+        labels  (H, W) predicted ids
+        valid   (H, W) pixels that count: neither prediction nor truth is to be ignored; a pixel counts in a clip where
+                it counts in all of its frames
+        truth   (H, W) ground truth ids
+
+        Raises DataError where the sizes differ.
+        """
+        return self._clips.add(self._prediction.add(labels, valid), self._truth.add(truth, valid))
+
+    def skip(self) -> float:
+        """The next frame has no ground truth, and is in no clip: where its truth stays the same is not known. NaN."""
+        self._prediction.end()
+        self._truth.end()
+        return math.nan
+
+    @property
+    def value(self) -> float:
+        """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
+        return self._clips.mean
+
+
+class SelfConsistency:
+    """VC_n without ground truth: the share of the pixels that are valid in all n frames whose prediction is constant.
+
+    It counts objects and cameras that move as inconsistency, as flicker does. See `VideoConsistency` for the rest.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._prediction = _Run(n)
+        self._valid = _Run(n)
+        self._clips = _Clips(n)
+
+    def add(self, labels: Labels, valid: Mask) -> float:
+        """Add the next frame's ids (H, W) and its pixels that count; return its clip's consistency, NaN for none.
+
+        Raises DataError where the sizes differ.
+        """
+        return self._clips.add(self._prediction.add(labels, valid), self._valid.add(valid.view(np.uint8), valid))
+
+    @property
+    def value(self) -> float:
+        """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
+        return self._clips.mean
+
+
+class _Run:
+    """For how many frames, up to n, each pixel has counted and kept its label."""
+
+    def __init__(self, n: int) -> None:
+        if not 2 <= n <= np.iinfo(np.int16).max:
+            raise ConfigError(f"a clip of {n} frames: use 2 to {np.iinfo(np.int16).max}")
+        self.n = n
+        self.end()
+
+    def end(self) -> None:
+        """The next frame does not follow those before it."""
+        self._length: npt.NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
+        self._labels: Labels = np.zeros((0, 0), dtype=np.uint8)
+
+    def add(self, labels: Labels, valid: Mask) -> npt.NDArray[np.int16]:
+        """Take the next frame in; of each pixel for how many frames its label has been the same and has counted."""
+        from semstab.pixels.kernels import lengthen
+
+        if labels.shape != valid.shape:
+            sizes = " and ".join(f"{W}x{H}" for H, W in (labels.shape, valid.shape))
+            raise DataError(f"labels and the mask of what counts differ in size ({sizes})")
+        if labels.shape != self._labels.shape:
+            self._length, self._labels = np.zeros(labels.shape, np.int16), np.zeros_like(labels)
+        lengthen(flat(labels), flat(self._labels), flat(valid), self.n, self._length.reshape(-1))
+        self._labels = labels.copy()
+        return self._length
+
+
+class _Clips:
+    """The mean over clips of n frames."""
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+        self._sum = 0.0
+        self._count = 0
+
+    def add(self, constant: npt.NDArray[np.int16], counted: npt.NDArray[np.int16]) -> float:
+        """Of the pixels that have counted for n frames, the share whose prediction has been constant as long."""
+        from semstab.pixels.kernels import count_long
+
+        pixels, consistent = count_long(flat(counted), flat(constant), self.n)
+        if not pixels:
+            return math.nan
+        value: float = consistent / pixels
+        self._sum += value
+        self._count += 1
+        return value
+
+    @property
+    def mean(self) -> float:
+        return self._sum / self._count if self._count else math.nan
+
+
+# Regions without classes: how much of a segmentation changes between two frames, whatever its ids are.
+
+Regions = npt.NDArray[np.integer[Any]]
+
+UNASSIGNED = 0
+"""The id of a pixel that belongs to no region."""
+
+IOU_THRESHOLD = 0.25
+"""Two regions can be one where their IoU is larger. Below 1/2, so that half of a region that is split stays it."""
+
+
+@dataclass(frozen=True)
+class RegionChange:
+    """What happened between two frames.
+
+    flicker_percent           of the pixels valid in both, those that left their region; NaN where there are none
+    matched                   regions found again
+    births, deaths            regions of the current frame that are new, of the previous one that are gone
+    variation_of_information  between the two partitions, bits, the unassigned pixels being one part; NaN likewise
+    """
+
+    flicker_percent: float
+    matched: int
+    births: int
+    deaths: int
+    variation_of_information: float
+
+
+def matched_region_flicker(
+    previous: Regions,
+    current: Regions,
+    valid: Mask | None = None,
+    *,
+    iou_threshold: float = IOU_THRESHOLD,
+) -> RegionChange:
+    """Flicker of region maps whose ids mean nothing across frames, such as Segment Anything's proposals.
+
+    previous, current  (H, W) region ids, 0 for a pixel without a region
+    valid              (H, W) pixels that count; all where not given
+
+    Regions are matched one to one so that the sum of their IoUs over the valid pixels is largest (Hungarian method);
+    pairs with an IoU of at most iou_threshold come apart again. flicker = 1 - (pixels in both regions of a pair +
+    pixels unassigned in both) / valid pixels. To leave out camera motion, warp the previous map first
+    (`semstab.pixels.warp.warp`) and count where that is defined.
+
+    Raises DataError where the maps differ in size, ConfigError for a threshold that is not from 0 to below 1.
+    """
+    if not 0 <= iou_threshold < 1:
+        raise ConfigError(f"iou_threshold = {iou_threshold:g}: use a share from 0 to below 1")
+    if previous.shape != current.shape:
+        sizes = " and ".join(f"{W}x{H}" for H, W in (previous.shape, current.shape))
+        raise DataError(f"region maps differ in size ({sizes}); bring them to one")
+    counted = slice(None) if valid is None else valid
+    table = _Contingency.of(previous[counted].ravel(), current[counted].ravel())
+    pairs = table.pairs(iou_threshold)
+    stayed = table.both_unassigned + sum(int(table.shared[pair]) for pair in pairs)
+    return RegionChange(
+        flicker_percent=100 * (1 - stayed / table.pixels) if table.pixels else math.nan,
+        matched=len(pairs),
+        births=int(np.count_nonzero(table.current_ids)) - len(pairs),
+        deaths=int(np.count_nonzero(table.previous_ids)) - len(pairs),
+        variation_of_information=table.variation_of_information(),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Contingency:
+    """(P, Q) pixels that the p-th region of the previous and the q-th of the current map share, 0 being one of them."""
+
+    previous_ids: Regions
+    current_ids: Regions
+    shared: Int64
+
+    @classmethod
+    def of(cls, previous: Regions, current: Regions) -> _Contingency:
+        previous_ids, p = np.unique(previous, return_inverse=True)
+        current_ids, q = np.unique(current, return_inverse=True)
+        shape = (len(previous_ids), len(current_ids))
+        shared = np.bincount(p * shape[1] + q, minlength=shape[0] * shape[1]).reshape(shape)
+        return cls(previous_ids, current_ids, shared)
+
+    @property
+    def pixels(self) -> int:
+        return int(self.shared.sum())
+
+    @property
+    def both_unassigned(self) -> int:
+        p, q = self.previous_ids == UNASSIGNED, self.current_ids == UNASSIGNED
+        return int(self.shared[np.ix_(p, q)].sum())
+
+    def pairs(self, iou_threshold: float) -> list[tuple[int, int]]:
+        """Rows and columns of the regions that are one."""
+        from scipy.optimize import linear_sum_assignment
+
+        rows, columns = np.flatnonzero(self.previous_ids), np.flatnonzero(self.current_ids)
+        shared = self.shared[np.ix_(rows, columns)]
+        either = self.shared.sum(axis=1)[rows, None] + self.shared.sum(axis=0)[None, columns] - shared
+        iou = shared / np.maximum(either, 1)
+        matched = zip(*linear_sum_assignment(iou, maximize=True), strict=True)
+        return [(int(rows[i]), int(columns[j])) for i, j in matched if iou[i, j] > iou_threshold]
+
+    def variation_of_information(self) -> float:
+        """H(previous | current) + H(current | previous) = 2 H(both) - H(previous) - H(current); Meila 2007, JMVA 98."""
+        if not self.pixels:
+            return math.nan
+        joint, before, after = (
+            float(entropy_bits(part / self.pixels))
+            for part in (self.shared.ravel(), self.shared.sum(axis=1), self.shared.sum(axis=0))
+        )
+        return max(0.0, 2 * joint - before - after)

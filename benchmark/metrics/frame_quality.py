@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Mask
 from semstab.model.frames import Frame
 from semstab.model.records import FrameQuality
 from semstab.pixels.warp import Correspondence, correspond
@@ -15,7 +16,6 @@ from semstab.pixels.warp import Correspondence, correspond
 HORIZON = 8
 """Frames after a change over which lag is counted."""
 
-Mask = npt.NDArray[np.bool_]
 NONE = -1
 
 

@@ -10,10 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from semstab.model.concentration import Concentration
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from semstab.core.types import Float64, Int64, UInt16
+from semstab.model.information import Concentration
 
 CHUNK_VALUES = 1 << 18
 """Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
@@ -48,7 +46,7 @@ class Evidence(NDArrayOperatorsMixin):
     """
 
     starts: Int64
-    label: npt.NDArray[np.uint16]
+    label: UInt16
     weight: Float64
     K: int
     known: Concentration | None = field(default=None, kw_only=True)
@@ -91,7 +89,7 @@ class Evidence(NDArrayOperatorsMixin):
         return self.starts.nbytes + self.label.nbytes + self.weight.nbytes
 
     @property
-    def entries(self) -> tuple[Int64, npt.NDArray[np.uint16], Float64]:
+    def entries(self) -> tuple[Int64, UInt16, Float64]:
         """starts, label and weight, as compiled loops take them."""
         return self.starts, self.label, self.weight
 
@@ -121,7 +119,7 @@ class Evidence(NDArrayOperatorsMixin):
             starts = self.starts[first : max(first, last) + 1]
             entries = slice(starts[0], starts[-1])
             return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K, known=known)
-        from semstab.model.row_kernel import copy_rows
+        from semstab.model.kernels import copy_rows
 
         first, end = self.starts[:-1][rows], self.starts[1:][rows]
         starts = np.concatenate([[0], np.cumsum(end - first)])
@@ -129,7 +127,7 @@ class Evidence(NDArrayOperatorsMixin):
         copy_rows(first, *self.entries[1:], starts, label, weight)
         return Evidence(starts, label, weight, self.K, known=known)
 
-    def only(self, labels: npt.NDArray[np.uint16]) -> Evidence:
+    def only(self, labels: UInt16) -> Evidence:
         """Of these classes (k,), ascending, among which are all that have an entry: they become 0 to k - 1."""
         label = np.searchsorted(labels, self.label).astype(np.uint16)
         return Evidence(self.starts, label, self.weight, len(labels))

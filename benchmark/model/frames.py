@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
 from semstab.errors import DataError
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 
@@ -46,7 +47,7 @@ class Intrinsics:
         return cls(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
 
     @property
-    def matrix(self) -> npt.NDArray[np.float64]:
+    def matrix(self) -> Float64:
         """The 3x3 camera matrix."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
@@ -64,7 +65,7 @@ class Intrinsics:
 class LeftOut:
     """The share of a pixel's scores that `top_k` left out: the mean over pixels, and the most of any.
 
-    No voxel's belief (in total variation) or VSS changes by more than the most: see `semstab.pixels.top_k`.
+    No voxel's belief (in total variation) or VSS changes by more than the most: see `semstab.pixels.preparation`.
     """
 
     mean: float
@@ -82,7 +83,7 @@ class Frame:
     labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one; or
     scores      (H, W, K) float, non-negative; normalised per pixel where they are used
     color       (H, W, 3) uint8 RGB, optional
-    mask        (H, W) bool, True where a thing moves that is not to be fused, optional; see `semstab.pixels.exclusion`
+    mask        (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`
     left_out    (H, W) bool, the pixels that were left out of fusion for what they show, optional
     scores_left_out  what was left out of the scores, where only the largest are kept
     timestamp   seconds, optional
@@ -92,14 +93,14 @@ class Frame:
     """
 
     index: int
-    depth: npt.NDArray[np.float32]
+    depth: Float32
     intrinsics: Intrinsics
-    T_wc: npt.NDArray[np.float64]
-    labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | None = None
+    T_wc: Float64
+    labels: UInt8 | UInt16 | None = None
     scores: npt.NDArray[np.floating[Any]] | None = None
-    color: npt.NDArray[np.uint8] | None = None
-    mask: npt.NDArray[np.bool_] | None = None
-    left_out: npt.NDArray[np.bool_] | None = None
+    color: UInt8 | None = None
+    mask: Mask | None = None
+    left_out: Mask | None = None
     scores_left_out: LeftOut | None = None
     timestamp: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
@@ -121,10 +122,10 @@ class Frame:
                 self._set(name, self._checked_mask(name, np.asarray(marked)))
 
     @cached_property
-    def valid(self) -> npt.NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """(H, W): depth is valid, and the label is not ignored or the scores are finite and sum to more than 0."""
         if self.labels is not None:
-            from semstab.model.pixel_kernel import mark_valid
+            from semstab.model.kernels import mark_valid
 
             valid = np.empty(self.shape, dtype=np.bool_)
             mark_valid(flat(self.depth), flat(self.labels), self.ignore_id, valid.reshape(-1))
@@ -134,7 +135,7 @@ class Frame:
         return valid
 
     @cached_property
-    def predicted(self) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    def predicted(self) -> UInt8 | UInt16:
         """(H, W) class ids: the labels, or the class of the largest score (ignored where scores are unusable)."""
         if self.labels is not None:
             return self.labels
@@ -191,7 +192,7 @@ class Frame:
         value.setflags(write=False)
         object.__setattr__(self, name, value)
 
-    def _checked_depth(self) -> npt.NDArray[np.float32]:
+    def _checked_depth(self) -> Float32:
         depth = np.asarray(self.depth)
         if depth.ndim != 2 or depth.size == 0:
             raise DataError(f"{self.where('depth')}: depth must be (H, W), got shape {depth.shape}")
@@ -201,7 +202,7 @@ class Frame:
             )
         return depth.astype(np.float32, copy=False)
 
-    def _checked_pose(self) -> npt.NDArray[np.float64]:
+    def _checked_pose(self) -> Float64:
         where = self.where("pose")
         T = np.array(self.T_wc, dtype=np.float64)
         if T.shape != (4, 4):
@@ -219,7 +220,7 @@ class Frame:
             raise DataError(f"{where}: the rotation mirrors (determinant -1), {_in_line(R)}; check camera_axes")
         return T
 
-    def _checked_mask(self, name: str, mask: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    def _checked_mask(self, name: str, mask: npt.NDArray[Any]) -> Mask:
         if mask.dtype != np.bool_:
             raise DataError(f"{self.where(name)}: the {name} is {mask.dtype}; use bool, True where pixels are left out")
         self._same_size(name, mask.shape)
@@ -279,13 +280,13 @@ def _intrinsics(given: Any, where: str) -> Intrinsics:
         raise DataError(f"{where}: {reason}; give Intrinsics(fx, fy, cx, cy) or a camera matrix") from error
 
 
-def _in_line(matrix: npt.NDArray[np.float64]) -> str:
+def _in_line(matrix: Float64) -> str:
     """A matrix in one line, as an error message shows it."""
     return "[" + "; ".join(" ".join(f"{value:.4g}" for value in row) for row in matrix) + "]"
 
 
-def _usable_scores(scores: npt.NDArray[Any] | None) -> npt.NDArray[np.bool_]:
+def _usable_scores(scores: npt.NDArray[Any] | None) -> Mask:
     assert scores is not None
     total = scores.sum(axis=2, dtype=np.float64)
-    usable: npt.NDArray[np.bool_] = np.isfinite(total) & (total > 0)
+    usable: Mask = np.isfinite(total) & (total > 0)
     return usable

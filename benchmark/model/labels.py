@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib.resources
 import reprlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,93 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited, write_text
+from semstab.core.types import Float64, Int32, Mask, UInt8, UInt16
 from semstab.errors import ConfigError, DataError
-from semstab.model.palette import Color, palette
-from semstab.runtime.files import MAX_YAML_BYTES, parse_yaml, read_limited, write_text
+
+# Colours of classes: as many as there are, each unlike the others, for any colour vision.
+
+Color = tuple[int, int, int]
+
+# Paul Tol's 'bright' and 'muted' schemes: distinguishable with any colour vision.
+PALETTE: tuple[Color, ...] = (
+    (68, 119, 170), (238, 102, 119), (34, 136, 51), (204, 187, 68), (102, 204, 238), (170, 51, 119), (187, 187, 187),
+    (51, 34, 136), (136, 204, 238), (68, 170, 153), (17, 119, 51), (153, 153, 51), (221, 204, 119), (204, 102, 119),
+    (136, 34, 85), (170, 68, 153),
+)  # fmt: skip
+
+GLOW: tuple[Color, ...] = ((150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230))
+"""What the recording shows drift in, from little to much: no class is given a colour of this fire."""
+
+CLEAR = 45.0
+"""Distance in RGB that classes keep from it; Tol's colours do."""
+
+LEVELS = tuple(range(0, 256, 17))
+"""Of each channel of the colours that are chosen from."""
+
+LIGHTNESS = (0.3, 0.92)
+"""Of these colours, in OKLab: neither ink nor paper."""
+
+TO_LMS = np.array(
+    [[0.41222147, 0.53633254, 0.05144599], [0.2119035, 0.6806995, 0.107397], [0.0883025, 0.2817188, 0.6299787]]
+)
+TO_LAB = np.array(
+    [[0.21045426, 0.79361779, -0.00407205], [1.9779985, -2.4285922, 0.4505937], [0.0259040, 0.7827718, -0.8086758]]
+)
+"""From linear RGB to OKLab (Ottosson 2020, A perceptual color space for image processing)."""
+
+DEUTAN = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]])
+"""What linear RGB looks like without green cones (Vienot, Brettel, Mollon 1999, Color Research and Application)."""
+
+
+@functools.cache
+def palette(K: int) -> tuple[Color, ...]:
+    """K colours: Tol's, and of those that are left the one farthest from all before, each by itself.
+
+    >>> len(set(palette(150)))
+    150
+    """
+    chosen = [*PALETTE[:K]]
+    grid = np.stack(np.meshgrid(LEVELS, LEVELS, LEVELS, indexing="ij"), axis=-1).reshape(-1, 3)
+    candidates, places = grid, _places(grid)
+    fit = (places[:, 0] >= LIGHTNESS[0]) & (places[:, 0] <= LIGHTNESS[1])
+    fit &= np.linalg.norm(grid[:, None] - between(GLOW, 4 * len(GLOW)), axis=2).min(axis=1) >= CLEAR
+    candidates, places = candidates[fit], places[fit]
+    if len(chosen) < K:
+        own = _places(np.array(chosen))
+        nearest = np.min([_distance(places, one) for one in own], axis=0)
+    while len(chosen) < K:
+        best = int(nearest.argmax())
+        chosen.append((int(candidates[best, 0]), int(candidates[best, 1]), int(candidates[best, 2])))
+        nearest = np.minimum(nearest, _distance(places, places[best]))
+    return tuple(chosen)
+
+
+def between(colors: Sequence[Color], n: int) -> Float64:
+    """(n, 3) colours from the first to the last, evenly along the line through all of them."""
+    at = np.linspace(0, len(colors) - 1, n)
+    return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in np.transpose(colors)], axis=1)
+
+
+def _places(colors: npt.NDArray[np.integer]) -> Float64:
+    """(n, 6) OKLab of colours (n, 3), as they are and without green cones."""
+    share = colors / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([_oklab(linear), _oklab(np.clip(linear @ DEUTAN.T, 0, 1))], axis=1)
+
+
+def _oklab(linear: Float64) -> Float64:
+    found: Float64 = np.cbrt(linear @ TO_LMS.T) @ TO_LAB.T
+    return found
+
+
+def _distance(places: Float64, one: Float64) -> Float64:
+    """(n,) how far colours look from one: to all eyes, and half as much to those without green cones."""
+    difference = places - one
+    seen = np.linalg.norm(difference[:, :3], axis=1) + 0.5 * np.linalg.norm(difference[:, 3:], axis=1)
+    found: Float64 = seen
+    return found
+
 
 IGNORE_8BIT = 255
 IGNORE_16BIT = 65535
@@ -158,9 +243,7 @@ class LabelMapping:
         pairs = zip(self.source.classes, self.rows, strict=True)
         return tuple(k for k, (name, row) in enumerate(pairs) if name_key(name) in wanted or row in rows)
 
-    def labels(
-        self, labels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], where: str
-    ) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    def labels(self, labels: UInt8 | UInt16, where: str) -> UInt8 | UInt16:
         """Map a label map of any shape; the ignore id stays one.
 
         Raises DataError with `where` (the file) for an id that the source space does not have.
@@ -181,7 +264,7 @@ class LabelMapping:
 
     def _keeps(self, labels: npt.NDArray[Any]) -> bool:
         """Whether the map stays as it is: 8-bit ids that are the rows already, and none but those and the ignore id."""
-        from semstab.model.pixel_kernel import has_other
+        from semstab.model.kernels import has_other
 
         K = len(self.target)
         same = self.source.ids == self.rows == tuple(range(K)) and labels.dtype == np.uint8 and K < IGNORE_8BIT
@@ -208,7 +291,7 @@ class LabelMapping:
             mapped[ignored[scores.argmax(axis=2)]] = 0
         return mapped
 
-    def _table(self, itemsize: int) -> npt.NDArray[np.int32]:
+    def _table(self, itemsize: int) -> Int32:
         """Target row for each id a map can hold; the target's ignore id for ignored ones, UNKNOWN for the rest."""
         ignore = IGNORE_8BIT if len(self.target) <= IGNORE_8BIT else IGNORE_16BIT
         table = np.full(1 << (8 * itemsize), UNKNOWN, dtype=np.int32)
@@ -245,7 +328,7 @@ def flat(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return values
 
 
-def _present(labels: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+def _present(labels: npt.NDArray[Any]) -> Mask:
     """For each id that the type can hold, whether the map has it."""
     if labels.dtype == np.uint8 and labels.ndim == 2 and labels.size:
         import cv2

@@ -15,14 +15,12 @@ from typing import Any, Literal, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.json_form import fields_of
+from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.errors import ConfigError
-from semstab.model.concentration import Concentration
 from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.information import entropy_bits, normalise
-from semstab.runtime.json_form import fields_of
+from semstab.model.information import Concentration, entropy_bits, normalise
 
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
 Values = TypeVar("Values", bound=npt.NDArray[Any])
 
 
@@ -212,9 +210,9 @@ def margin(table: Rows) -> Float64:
 
 
 @by_row(lambda found: found.label.astype(np.int64))
-def dominant(table: Rows) -> npt.NDArray[np.int64]:
+def dominant(table: Rows) -> Int64:
     """Dominant class (n,): argmax_k e_k, the lowest on ties."""
-    label: npt.NDArray[np.int64] = table.evidence.argmax(axis=1)
+    label: Int64 = table.evidence.argmax(axis=1)
     return label
 
 
@@ -282,7 +280,7 @@ class MeasureMeans:
     voxels: Mapping[str, int]
 
     @classmethod
-    def over(cls, values: Mapping[Measure, Float64], op: Int32, where: npt.NDArray[np.bool_]) -> MeasureMeans:
+    def over(cls, values: Mapping[Measure, Float64], op: Int32, where: Mask) -> MeasureMeans:
         """Of values (n,) of each measure over the voxels for which `where` (n,) holds."""
         rare = {m.key: int(np.count_nonzero(where & (op >= m.lowest_op))) for m in values if m.lowest_op > 1}
         return cls({measure.key: mean(value[where]) for measure, value in values.items()}, rare)

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semstab.config import BACKENDS, BASE, nearest
+from semstab.core.json_form import INLINE
 from semstab.errors import ConfigError
+from semstab.model import voxels
+from semstab.model.contrast import BackboneComparison
 from semstab.model.georeference import Georeference
 from semstab.model.measures import measures
 from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
 from semstab.model.statistics import MapStatistics
-from semstab.model.statistics.comparison import BackboneComparison
-from semstab.model.voxels import VoxelTable, tabular
-from semstab.runtime.json_form import INLINE
+from semstab.model.voxels import VoxelTable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -336,11 +337,11 @@ class Result:
 
     def to_arrow(self) -> pa.Table:
         """One row a unit: what it is, how much there is, the mean of every measure, of recurrent voxels too."""
-        return tabular.to_arrow(self._columns())
+        return voxels.to_arrow(self._columns())
 
     def to_pandas(self) -> pd.DataFrame:
         """The same as a data frame. Raises MissingDependencyError without pandas."""
-        return tabular.to_pandas(self._columns())
+        return voxels.to_pandas(self._columns())
 
     def _columns(self) -> dict[str, Any]:
         rows = [run.row() for run in self.runs]
@@ -348,16 +349,16 @@ class Result:
 
     def _repr_html_(self) -> str:
         """The summary table and the verdicts, in a notebook."""
-        rows: list[list[tabular.Cell]] = []
+        rows: list[list[voxels.Cell]] = []
         for run in self.runs:
             table, unit = run.table, run.unit
-            means = (tabular.number(table[measure], measure.digits[0]) for measure in measures())
-            seen = tabular.number(table.mean_op, 2), *means, tabular.number(100 * table.recurrent.share, 2)
+            means = (voxels.number(table[measure], measure.digits[0]) for measure in measures())
+            seen = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
             verdict = "" if run.statistics is None else run.statistics.verdict.level
             rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen, verdict])
         titles = [measure.title for measure in measures()]
         headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
-        return tabular.as_html(self.name, headers, rows)
+        return voxels.as_html(self.name, headers, rows)
 
     @property
     def agrees(self) -> bool:

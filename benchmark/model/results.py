@@ -8,10 +8,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from semstab.core.json_form import INLINE
 from semstab.model.frames import LeftOut
 from semstab.model.measures import Measure, MeasureMeans
 from semstab.model.statistics import MapStatistics
-from semstab.runtime.json_form import INLINE
 
 SCHEMA = 2
 """Version of summary.json."""

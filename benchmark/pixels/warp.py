@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float32, Float64, Int32, Mask
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
@@ -24,10 +25,10 @@ class Correspondence:
     pixel  (H, W) int32 flat index into the other view's images, -1 where it does not see the point
     """
 
-    pixel: npt.NDArray[np.int32]
+    pixel: Int32
 
     @property
-    def visible(self) -> npt.NDArray[np.bool_]:
+    def visible(self) -> Mask:
         """(H, W): the point is in the other view's image, in front of it and not occluded."""
         return self.pixel >= 0
 
@@ -49,7 +50,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 
     Raises ConfigError where the tolerance is not above 0 and below 1, and not infinity.
     """
-    from semstab.pixels.warp_kernel import look_up
+    from semstab.pixels.kernels import look_up
 
     if not 0 < depth_tolerance < 1 and depth_tolerance != math.inf:
         raise ConfigError(f"depth_tolerance = {depth_tolerance:g}: use a share of the distance, above 0 and below 1")
@@ -66,7 +67,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 
 def warp(
     values: npt.NDArray[Any], source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, fill: Any = 0
-) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+) -> tuple[npt.NDArray[Any], Mask]:
     """Values (H', W', ...) of the source's pixels as the target sees them, (H, W, ...), and where it does, (H, W).
 
     Labels, scores, colours: the nearest pixel's value, never a mixture. See `correspond`.
@@ -75,13 +76,36 @@ def warp(
     return found.bring(values, fill), found.visible
 
 
-def motion(frame: Frame, other: Frame) -> npt.NDArray[np.float64]:
+def motion(frame: Frame, other: Frame) -> Float64:
     """(3, 4) from the frame's camera axes to the other's; exact for large coordinates, which cancel first."""
     R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
     t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]
     return np.column_stack([R @ frame.T_wc[:3, :3], R @ t])
 
 
-def by_rows(matrix: npt.NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+def by_rows(matrix: Float64) -> tuple[tuple[float, ...], ...]:
     """A matrix as tuples, which compiled loops keep in registers."""
     return tuple(tuple(row) for row in matrix.tolist())
+
+
+# What was believed of one view's pixels, carried into the next view by depth and pose.
+
+
+def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Float32:
+    """Beliefs (H', W', K) of the source's pixels as the target's pixels see them (H, W, K), 0 where none is.
+
+    Backward warping, linear between those of the four nearest pixels that see the same surface: their depth differs
+    from the point's distance z by at most depth_tolerance * z, and they say something. Nearest pixels, carried on from
+    frame to frame, would stay behind a camera that moves by less than half a pixel.
+    """
+    from semstab.pixels.kernels import blend
+
+    H, W = target.shape
+    K, camera = target.intrinsics, source.intrinsics
+    rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
+    carried = np.zeros((H, W, belief.shape[2]), dtype=np.float32)
+    blend(
+        fixed(target.depth), rays, by_rows(motion(target, source)), fixed(source.depth),
+        (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, np.ascontiguousarray(belief), carried,
+    )  # fmt: skip
+    return carried

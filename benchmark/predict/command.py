@@ -3,25 +3,213 @@
 from __future__ import annotations
 
 import functools
+import glob
 import json
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from semstab.backbones import Backbone
+from semstab.backbones import Backbone, Image
 from semstab.config import DatasetConfig, FrameSelection, validated
-from semstab.datasets import Scene, options_model
-from semstab.errors import ConfigError
-from semstab.predict.disk.jobs import Job, file_job, scene_jobs
-from semstab.predict.disk.sequence import SequenceOptions, SequenceReport, predict_sequence
+from semstab.datasets import Scene, open_dataset, options_model
+from semstab.datasets.formats.disk import natural
+from semstab.datasets.formats.images import COLOR_SUFFIXES, read_color
+from semstab.datasets.geometry.lenses import Labels, Scores
+from semstab.datasets.scene import select_frames
+from semstab.errors import ConfigError, DataError
+from semstab.model.frames import Frame
 from semstab.predict.images import ImageSequence
+from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels
-from semstab.predict.stored import NAME as STORED
-from semstab.predict.terminal import PredictionBar, print_report
+from semstab.predict.sequence import PredictionObserver, SequenceOptions, SequenceReport, predict_sequence
+
+# Image files to predict on, and which scenes of a dataset.
+
+
+class ImageFiles:
+    """Image files by a pattern such as 'flight/*.png', in natural order.
+
+    Raises DataError where none fits, or two have one name.
+    """
+
+    labels_like_depth = False
+
+    def __init__(self, pattern: str) -> None:
+        found = [Path(path) for path in glob.glob(str(Path(pattern).expanduser()), recursive=True)]  # noqa: PTH207
+        files = sorted((path for path in found if path.suffix.lower() in COLOR_SUFFIXES), key=lambda p: natural(str(p)))
+        if not files:
+            raise DataError(f"{pattern}: no image of {', '.join(COLOR_SUFFIXES)} fits; quote the pattern in the shell")
+        stems = [path.stem for path in files]
+        if repeated := [path for path in files if stems.count(path.stem) > 1]:
+            raise DataError(f"{repeated[0]}: {repeated[1]} has the same name; predict them one folder after the other")
+        self.name = files[0].parent.resolve().name
+        self._files = files
+
+    def __len__(self) -> int:
+        """Number of files."""
+        return len(self._files)
+
+    def image(self, index: int) -> Image:
+        """(H, W, 3) uint8 RGB. Raises DataError that names the file."""
+        return read_color(self._files[index])
+
+    def image_name(self, index: int) -> str:
+        """The file's name without suffix."""
+        return self._files[index].stem
+
+    def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
+        """Nothing: what is missing was not found."""
+        return []
+
+    def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
+        """None: single images have no depth."""
+        return None
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame | None:
+        """None: single images have no depth."""
+        return None
+
+
+def chosen(names: Sequence[str] | None, known: Sequence[str], where: str) -> Sequence[str]:
+    """The named scenes, all where none are named. Raises ConfigError for one that is not there."""
+    if lost := [name for name in names or () if name not in known]:
+        raise ConfigError(f"{where}: no scene '{lost[0]}'; there is {', '.join(known)}")
+    return list(dict.fromkeys(names)) if names is not None else known
+
+
+# What a prediction command does: which images of which sequence, and where their predictions go.
+
+IMAGES: Mapping[str, Any] = {"color": True}
+"""What of a frame must be there where a model looks at images."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One sequence: which of its images, and the folder above labels/, scores/ and regions/."""
+
+    sequence: ImageSequence
+    indices: list[int]
+    out: Path
+
+
+def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
+    """Images by a pattern. Raises ConfigError without `out`, or where no image is selected."""
+    if out is None:
+        raise ConfigError("--images: predictions of single images need a place; name it with --out")
+    files = ImageFiles(pattern)
+    return Job(files, _some(frames.indices(len(files)), files), out)
+
+
+def scene_jobs(
+    dataset: DatasetConfig,
+    scenes: Sequence[str] | None,
+    frames: FrameSelection,
+    out: Path | None,
+    looks_at: Mapping[str, Any] = IMAGES,
+) -> list[Job]:
+    """The scenes of a dataset; predictions go into the scene's own folder, into `out`, or of several into out/SCENE.
+
+    `looks_at` says what of a frame must be there, as for `select_frames`.
+
+    Raises ConfigError for a dataset without folders of its own where there is no `out`, and for a scene or frames that
+    are not there.
+    """
+    opened = open_dataset(dataset.name, dataset.options)
+    names = chosen(scenes, opened.scenes, dataset.name)
+    jobs = []
+    for name in names:
+        scene = opened.scene(name)
+        indices = _some(select_frames(scene, frames, **looks_at).indices, scene)
+        jobs.append(Job(scene, indices, _place(scene, out if out is None or len(names) == 1 else out / name)))
+    return jobs
+
+
+def _place(scene: Scene, out: Path | None) -> Path:
+    place = out or scene.folder
+    if place is None:
+        raise ConfigError(f"{scene.name}: has no folder of its own; say with --out where its predictions go")
+    return place
+
+
+def _some(indices: list[int], sequence: ImageSequence) -> list[int]:
+    if not indices:
+        raise ConfigError(f"{sequence.name}: the selection of frames leaves none of its {len(sequence)}; mend --frames")
+    return indices
+
+
+# A prediction in the terminal: progress with frames a second and time left, and at the end what lies where.
+
+
+class PredictionBar(PredictionObserver):
+    """One bar a sequence. Speed and time left count frames that the model saw, not those kept from before."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames"),
+        )
+        self._bar = Progress(*columns, TextColumn("{task.fields[speed]}"), console=console, transient=True)
+        self._work = self._bar.add_task("starting", total=None, speed="")
+        self._left = self._predicted = 0
+        self._started = time.monotonic()
+
+    def sequence_started(self, name: str, frames: int) -> None:
+        """Show the bar."""
+        self._left, self._predicted, self._started = frames, 0, time.monotonic()
+        self._bar.reset(self._work, total=frames, description=name, speed="")
+        self._bar.start()
+
+    def frame_done(self, kept: bool) -> None:
+        """One frame further."""
+        self._left -= 1
+        if kept and not self._predicted:
+            self._started = time.monotonic()
+        self._predicted += not kept
+        speed = speed_text(self._predicted, time.monotonic() - self._started, self._left)
+        self._bar.update(self._work, advance=1, speed=speed)
+
+    def close(self) -> None:
+        """Take the bar away, also after an interruption."""
+        self._bar.stop()
+
+
+def speed_text(frames: int, seconds: float, left: int) -> str:
+    """Speed and time left.
+
+    >>> speed_text(10, 20.0, 30)
+    '0.50 frames/s, 0:01:00 left'
+    """
+    if not frames or seconds <= 0:
+        return ""
+    remaining = int(left * seconds / frames)
+    clock = f"{remaining // 3600}:{remaining // 60 % 60:02d}:{remaining % 60:02d}"
+    return f"{frames / seconds:.2f} frames/s, {clock} left"
+
+
+def print_report(report: SequenceReport, console: Console) -> None:
+    """One sequence: how many frames, how fast, where; of regions, how much they change."""
+    kept = f", {report.kept} kept from before" if report.kept else ""
+    speed = ""
+    if report.predicted:
+        model = 1e3 * report.model_seconds / report.predicted
+        speed = f", {report.frames_per_second:.2f} frames/s (model {model:.0f} ms a frame)"
+    console.print(f"{report.sequence}: {report.predicted} frames predicted{kept}{speed}", soft_wrap=True)
+    for folder in report.folders:
+        console.print(f"  {folder}", soft_wrap=True)
+    if report.regions is not None:
+        line = f"  flicker of matched regions {report.regions.flicker_percent:.2f} %"
+        if report.regions.compensated:
+            line += f", camera motion taken out {report.regions.compensated_flicker_percent:.2f} %"
+        console.print(line, soft_wrap=True)
 
 
 def run(

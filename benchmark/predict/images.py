@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from semstab.backbones import Backbone, Image, image_digest
-from semstab.datasets.views.resampling import Labels, Scores
+from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 

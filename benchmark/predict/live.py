@@ -12,24 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field, field_validator
 
 from semstab.backbones import Backbone, Image, Prediction, ask, create
 from semstab.config import DatasetConfig, FrameSelection, Settings
+from semstab.core.types import Float64, UInt8
 from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
-from semstab.datasets.selection import select_frames
-from semstab.datasets.views.resampling import Labels, Scores
+from semstab.datasets.geometry.lenses import Labels, Scores
+from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
-from semstab.predict.filters import parse
-from semstab.predict.filters.filtered import Filtered
+from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, first_images, geometry_of
-from semstab.predict.in_order import InOrder, size_of
-from semstab.predict.predictor import PredictorConfig, completed, stored_labels
-from semstab.predict.stored import NAME as STORED
-from semstab.predict.stored import StoredSequence
+from semstab.predict.predictor import NAME as STORED
+from semstab.predict.predictor import InOrder, PredictorConfig, StoredSequence, completed, size_of, stored_labels
 
 NAME = "predicted"
 
@@ -166,7 +163,7 @@ class PredictedScene(Scene):
         return len(self._inner)
 
     @property
-    def timestamps(self) -> npt.NDArray[np.float64] | None:
+    def timestamps(self) -> Float64 | None:
         """The inner scene's, where it has any."""
         return self._inner.timestamps
 
@@ -213,7 +210,7 @@ class PredictedScene(Scene):
         """The frame but for its labels; nothing is predicted for it."""
         return self._inner.geometry(index, color=color)
 
-    def color(self, index: int) -> npt.NDArray[np.uint8] | None:
+    def color(self, index: int) -> UInt8 | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none."""
         return self._inner.color(index)
 
@@ -339,7 +336,7 @@ def _with_remedies(options: PredictedOptions) -> Iterator[PredictorConfig]:
             yield predictor.model_copy(update={"filters": [*predictor.filters, *filters], "name": name})
 
 
-def _digest(image: npt.NDArray[np.uint8], frame: Frame) -> bytes:
+def _digest(image: UInt8, frame: Frame) -> bytes:
     """Of all that a frame holds but its labels."""
     digest = hashlib.blake2b(repr((image.shape, frame.shape, frame.intrinsics)).encode(), digest_size=16)
     for array in (image, frame.depth, frame.T_wc):

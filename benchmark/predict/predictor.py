@@ -2,29 +2,190 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from semstab.backbones import Backbone, create, options_model
-from semstab.backbones.class_names import InTaxonomy
-from semstab.backbones.outside.border import Checked
-from semstab.backbones.outside.code import absolute
-from semstab.backbones.outside.network import is_network
-from semstab.backbones.outside.own import is_path
+from semstab.backbones import Backbone, Image, Labels, Prediction, ask, create, image_digest, narrowed, options_model
+from semstab.backbones.border import Checked, Wrapped
+from semstab.backbones.custom import absolute, is_path
+from semstab.backbones.names import InTaxonomy
+from semstab.backbones.network import is_network
 from semstab.config import Settings, validated
+from semstab.core.files import content_key, parse_yaml, read_arrays, write_arrays
 from semstab.datasets import GROUND_TRUTH, Scene
+from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
-from semstab.model.labels import LabelSpace
-from semstab.predict.filters import parse
-from semstab.predict.filters.filtered import Filtered
-from semstab.predict.kept import Kept
-from semstab.predict.stored import NAME as STORED
-from semstab.predict.stored import Stored, StoredOptions, StoredSequence
-from semstab.runtime.files import parse_yaml
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace, ignore_id
+from semstab.predict.filters import Filtered, parse
+from semstab.predict.images import ImageSequence, geometry_of, shown_digest
+
+# What a model said, kept on disk: several filters over one model let it look at each image once.
+
+
+class Kept(Wrapped):
+    """A backbone that looks its predictions up in a folder, by its identity and the image, and leaves new ones there.
+
+    It has no memory of images before (`sequential`). Files of one folder may be read and written by several processes.
+    """
+
+    def __init__(self, inner: Backbone, folder: Path) -> None:
+        super().__init__(inner)
+        self._folder = folder
+        self._fitted_to: list[str] = []
+
+    def fit(self, images: Sequence[Image]) -> Self:
+        """See `Backbone`."""
+        fitted = super().fit(images)
+        fitted._fitted_to = [image_digest(image) for image in images]
+        return fitted
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`."""
+        frames = [[frame] for frame in geometry] or [[]] * len(images)
+        return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
+
+    def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
+        """Scores are kept wherever there are some: whoever asks later may want them."""
+        file = self._folder / f"{self._key(image, frame)}.npz"
+        there = read_arrays(file)
+        if there is None:
+            (prediction,) = self.ask([image], self.gives_scores, frame)
+            held: dict[str, Any] = {"labels": prediction.labels}
+            held |= {"scores": prediction.scores} if self.gives_scores else {}
+            write_arrays(file, held, packed=False)
+            return prediction if scores else Prediction(prediction.labels)
+        return Prediction(there["labels"], there["scores"] if scores else None)
+
+    def _key(self, image: Image, frame: Sequence[Frame]) -> str:
+        seen = {"fitted": self._fitted_to, "shown": shown_digest(image, frame)}
+        return content_key({"model": self.identity(), **seen})
+
+
+# Labels that a scene has already, as a model: what filters take where nothing is to be predicted.
+
+NAME = "stored"
+
+NEAR = 4
+"""Frames that are at hand: each is asked for its image, its geometry and its labels."""
+
+
+class StoredOptions(Settings):
+    """Which labels."""
+
+    source: str = Field(min_length=1, description="a label source of the scene: a folder of labels/, NAME-scores, ...")
+
+
+class Stored(Backbone):
+    """Says of each frame what the scene's labels or scores of it say; its images are shown by `StoredSequence`.
+
+    gives_scores is that of the scene's first frame that has such labels. Raises ConfigError where there are none.
+    """
+
+    Options = StoredOptions
+    wants_geometry = True
+
+    def __init__(self, options: StoredOptions, sequence: StoredSequence | None = None) -> None:
+        if sequence is None:
+            raise ConfigError(f"backbone '{NAME}' takes the labels of a scene; choose one with --data or --dataset")
+        self.label_space = sequence.scene.label_space(options.source)
+        self.gives_scores = sequence.has_scores
+        self._source = options.source
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`."""
+        return [Prediction(self._labels(frame), shares(frame) if scores else None) for frame in geometry]
+
+    def _labels(self, frame: Frame) -> Labels:
+        """Class ids; of scores the likeliest class's."""
+        if frame.labels is not None:
+            return frame.labels
+        assert self.label_space is not None
+        ids = narrowed(np.array(self.label_space.ids), max(self.label_space.ids) + 1)
+        ignored = frame.predicted == frame.ignore_id
+        labels: Labels = ids[np.where(ignored, 0, frame.predicted)]
+        labels[ignored] = ignore_id(labels)
+        return labels
+
+    def identity(self) -> dict[str, Any]:
+        """Where the labels are from; what they are is in the digest of each frame."""
+        assert self.label_space is not None
+        return {NAME: self._source, "classes": self.label_space.to_dict()}
+
+
+class StoredSequence:
+    """A scene's frames at the pixels of the depth, with labels of one source; colour only where it is looked at."""
+
+    labels_like_depth = True
+
+    def __init__(self, scene: Scene, source: str, color: bool) -> None:
+        if source not in (*scene.backbones, *((GROUND_TRUTH,) if scene.ground_truth else ())):
+            known = ", ".join(scene.backbones) or "none"
+            raise ConfigError(f"{scene.name}: there are no labels '{source}' for filters to take; there is {known}")
+        self.scene, self.source, self.name, self._color = scene, source, scene.name, color
+        self._frame = functools.lru_cache(maxsize=NEAR)(partial(scene.frame, backbone=source, color=False))
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    @property
+    def has_scores(self) -> bool:
+        """Whether the first frame that has these labels has scores."""
+        first = next((index for index in range(len(self)) if not self.missing(index)), 0)
+        return self.scene.frame(first, self.source, color=False).scores is not None
+
+    def image(self, index: int) -> Image:
+        """(H, W, 3) uint8 RGB at the depth's pixels; black where nobody looks at it."""
+        import cv2
+
+        if not self._color:
+            return np.zeros((*self._frame(index).shape, 3), dtype=np.uint8)
+        image, shape = self.scene.color(index), self._frame(index).shape
+        if image is None:
+            raise ConfigError(f"{self.name}, {self.image_name(index)}: has no colour, which a filter looks at")
+        require_same_view(
+            image.shape, shape, f"{self.name}, {self.image_name(index)}", "the image is {} but depth is {}"
+        )
+        if image.shape[:2] == shape:
+            return image
+        return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def image_name(self, index: int) -> str:
+        """What the frame's files are called."""
+        return self.scene.image_name(index)
+
+    def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
+        """Files that the frame lacks, its labels among them."""
+        return self.scene.missing(index, [*sources, self.source], color=self._color)
+
+    def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
+        """The frame with other labels or scores."""
+        return dataclasses.replace(self._frame(index), labels=labels, scores=scores)
+
+    def view(self, index: int, shape: tuple[int, int]) -> Frame:
+        """The frame, with its labels."""
+        return self._frame(index)
+
+
+def shares(frame: Frame) -> Any:
+    """Scores (H, W, K) float32 that sum to 1 where they can be used, else to 0; None of labels."""
+    if frame.scores is None:
+        return None
+    said = (frame.predicted != ignore_id(frame.predicted))[..., None]
+    scores = np.where(said, frame.scores, 0).astype(np.float32)
+    return np.divide(scores, scores.sum(axis=2, keepdims=True), out=scores, where=said)
 
 
 class PredictorConfig(Settings):
@@ -67,7 +228,7 @@ class PredictorConfig(Settings):
         if self.name is not None:
             return self.name
         stem = Path(self.backbone).stem if is_network(self.backbone) else self.backbone.rpartition(":")[2]
-        if self.backbone == STORED:
+        if self.backbone == NAME:
             source = str(self.options.get("source", stem))
             stem = source.removesuffix("-scores") if self.scores else source
         return "-".join([stem, *(text.replace(":", "-") for text in self.filters)])
@@ -90,7 +251,7 @@ class PredictorConfig(Settings):
     @property
     def looks_at(self) -> dict[str, Any]:
         """What of a scene's frames must be there, as `select_frames` takes it."""
-        stored = self.backbone == STORED
+        stored = self.backbone == NAME
         return {"sources": [self.options["source"]] if stored else [], "color": not stored or self.wants_color}
 
     def resolved(self) -> PredictorConfig:
@@ -166,3 +327,74 @@ def _absolute(options: BaseModel) -> BaseModel:
     if isinstance(model, str) and Path(model).expanduser().is_dir():
         paths["model"] = str(Path(model).expanduser().absolute())
     return options.model_copy(update=paths)
+
+
+# A sequential backbone inside a run: whichever frame is asked for, it has seen the sequence up to it.
+
+KEPT_BYTES = 1 << 28
+"""Memory for the latest predictions: frames are asked for nearly, not quite in order."""
+
+LEAST_KEPT = 4
+
+
+class InOrder:
+    """What a sequential backbone says of each frame of a sequence, shown to it in order, whatever is asked for when.
+
+    indices  the frames that it is shown
+    claim    is told whose the backbone is now, and says whether it was somebody else's: then it begins again
+    Where a prediction is no longer at hand, the backbone is shown the sequence from its first frame again.
+    """
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        sequence: ImageSequence,
+        indices: Sequence[int],
+        scores: bool,
+        claim: Callable[[InOrder], bool],
+    ) -> None:
+        self.indices = indices
+        self._backbone, self._sequence, self._scores, self._claim = backbone, sequence, scores, claim
+        self._place = {index: place for place, index in enumerate(indices)}
+        self._next = 0
+        self._kept: dict[int, Prediction] = {}
+
+    def at(self, index: int) -> Prediction:
+        """Raises ConfigError for a frame that the backbone is not shown."""
+        place = self._placed(index)
+        if index not in self._kept:
+            if self._claim(self) or place < self._next:
+                self._backbone.reset()
+                self._next = 0
+            for shown in self.indices[self._next : place + 1]:
+                self._show(shown)
+        return self._kept[index]
+
+    def shown_for(self, indices: Sequence[int]) -> list[int]:
+        """The frames that the backbone is shown for the sake of these: its labels depend on all of them.
+
+        Raises ConfigError for a frame that is not among them.
+        """
+        return list(self.indices[: max(map(self._placed, indices), default=-1) + 1])
+
+    def _placed(self, index: int) -> int:
+        if index not in self._place:
+            raise ConfigError(
+                f"{self._sequence.name}: frame {index} is not among the {len(self.indices)} frames that a sequential"
+                " backbone is shown; its labels depend on these, so a sweep can only leave some of them out"
+            )
+        return self._place[index]
+
+    def _show(self, index: int) -> None:
+        image = self._sequence.image(index)
+        geometry = geometry_of(self._sequence, index, image, self._backbone)
+        (prediction,) = ask(self._backbone, [image], scores=self._scores, geometry=geometry)
+        self._kept[index] = prediction
+        self._next += 1
+        while len(self._kept) > LEAST_KEPT and sum(map(size_of, self._kept.values())) > KEPT_BYTES:
+            del self._kept[next(iter(self._kept))]
+
+
+def size_of(prediction: Prediction) -> int:
+    """Bytes that a prediction keeps in memory."""
+    return prediction.labels.nbytes + (0 if prediction.scores is None else prediction.scores.nbytes)

@@ -4,6 +4,7 @@ Pure functions of a VoxelTable and its Events. `describe` says everything about 
 several; docs/metrics.md derives each measure.
 """
 
+from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import (
     ClassAgreement,
     Correctness,
@@ -14,39 +15,25 @@ from semstab.model.statistics import (
     Reliability,
     StabilityVerdict,
 )
-from semstab.model.statistics.comparison import BackboneComparison
 from semstab.statistics.agreement import (
+    Uncertainty,
     alpha_between,
     class_agreement,
+    decompose,
     disagreement,
     fleiss_kappa,
     krippendorff_alpha,
     psa,
 )
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
-from semstab.statistics.correctness import (
-    Truth,
-    correctness,
-    join_truth,
-    quadrants,
-    reliability,
-    stable_wrong,
-)
+from semstab.statistics.correctness import Truth, correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.judging.ceiling import ceiling, losses, rendered
-from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import Looks, Sample, Sampler, Views, correlogram, reach_of
-from semstab.statistics.order.drift import (
-    Flips,
-    VoxelDrift,
-    expected_sbd,
-    flips,
-    voxel_drift,
-)
+from semstab.statistics.order.drift import Flips, VoxelDrift, expected_sbd, flips, voxel_drift
 from semstab.statistics.order.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.order.p_values import benjamini_hochberg
 from semstab.statistics.scene_drift import SceneDrift, scene_drift
-from semstab.statistics.uncertainty import Uncertainty, decompose
+from semstab.statistics.verdict import ceiling, losses, rendered, verdict
 from semstab.statistics.versus.backbones import compare_backbones
 from semstab.statistics.versus.comparison import coverage, paired
 from semstab.statistics.versus.differences import claimed_together

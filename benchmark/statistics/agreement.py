@@ -7,17 +7,18 @@ probability that a class drawn from s_t equals one drawn from s_u.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.model.measures import Quantity
+from semstab.core.types import Float64, Mask
+from semstab.model.events import Events
+from semstab.model.measures import Quantity, entropy
 from semstab.model.statistics import ClassAgreement
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.observed import Log
-
-Float64 = npt.NDArray[np.float64]
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
@@ -213,7 +214,7 @@ def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[Clas
     return tuple(ClassAgreement(name, *(float(value) for value in values)) for name, *values in rows)
 
 
-def one_hot_where(table: VoxelTable, where: npt.NDArray[np.bool_]) -> bool:
+def one_hot_where(table: VoxelTable, where: Mask) -> bool:
     """Whether all observations are one-hot of the voxels for which `where` (n,) holds."""
     return bool((np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[where].all())
 
@@ -224,3 +225,30 @@ def _beyond_chance(observed: Float64, expected: Float64) -> Float64:
         ratio = (1 - observed) / (1 - expected)
     beyond: Float64 = np.where(1 - expected.real > ONE_HOT, 1 - ratio, np.nan)
     return beyond
+
+
+# Where the entropy of a voxel's belief comes from: from within each frame, or from disagreement between frames.
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Normalised entropy of each voxel (n,) as a sum of two parts, all in units of log K, in [0, 1].
+
+    within   mean entropy of the frames' own evidence: class borders, voxels larger than things, unsure scores
+    between  generalised Jensen-Shannon divergence of the frames' evidence: their disagreement in time
+    total    within + between, the entropy of the belief
+    """
+
+    within: Float64
+    between: Float64
+    total: Float64
+
+
+def decompose(table: VoxelTable) -> Uncertainty:
+    """Split the entropy: H(mean_t s_t) = mean_t H(s_t) + JSD(s_1, ..., s_T) (Lin 1991, IEEE TIT 37, equal weights).
+
+    Between-frame entropy is 0 at OP = 1 and grows with OP for the very same predictions: compare it within a stratum.
+    """
+    total = entropy(table)
+    within = table.frame_entropy_sum / table.op / math.log2(table.K)
+    return Uncertainty(np.minimum(within, total), np.maximum(total - within, 0.0), total)

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.metrics.matching import voxel_keys
+from semstab.core.types import Float64, Int64
+from semstab.metrics.agreement import voxel_keys
 from semstab.model.evidence import row_chunks
 from semstab.model.statistics import Estimate
 from semstab.model.voxels import VoxelTable
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Statistic = Callable[[Float64], Float64]
 """From sums over voxels (..., C) to a value (...,); the same when all sums are doubled, and a formula of which complex
 sums make sense: its slopes are found with them (`slope`), so that it compares `.real` only."""

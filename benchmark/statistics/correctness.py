@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.metrics import strata
-from semstab.metrics.matching import require_same_grid, same_voxels, shared_rows
+from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
-from semstab.model.concentration import blockwise, by_group
 from semstab.model.evidence import Evidence
+from semstab.model.information import blockwise, by_group
 from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
@@ -22,9 +22,6 @@ from semstab.statistics.agreement import STABLE, ratio_of
 from semstab.statistics.order.fusion_rules import Fused
 from semstab.statistics.sampling.places import Places, PlaceSums
 from semstab.statistics.steady import LIKELY, steady
-
-Float64 = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
@@ -47,7 +44,7 @@ class Truth:
     """
 
     known: Mask
-    label: npt.NDArray[np.int64]
+    label: Int64
 
 
 def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
@@ -78,15 +75,15 @@ class Judged:
     K                 number of classes
     """
 
-    label: npt.NDArray[np.int64]
-    predicted: npt.NDArray[np.int64]
+    label: Int64
+    predicted: Int64
     confidence: Float64
     error: Float64
     voxels: Float64
     K: int
 
     @classmethod
-    def of(cls, evidence: Float64 | Evidence, label: npt.NDArray[np.int64], voxels: Float64 | None = None) -> Judged:
+    def of(cls, evidence: Float64 | Evidence, label: Int64, voxels: Float64 | None = None) -> Judged:
         """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing.
 
         Each is of so many voxels (n,), of one where that is not given.
@@ -106,7 +103,7 @@ class Judged:
         return same
 
 
-def correctness(belief: Float64 | Evidence, label: npt.NDArray[np.int64], name: str = "all") -> Correctness:
+def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> Correctness:
     """Of beliefs (n, K) and true classes (n,)."""
     return _correctness(Judged.of(belief, label), name)
 
@@ -130,7 +127,7 @@ def judged_where(judged: Judged, where: Mask) -> Float64:
     return sums
 
 
-def _judged_by_group(judged: Judged, group: npt.NDArray[np.int64], groups: int) -> Float64:
+def _judged_by_group(judged: Judged, group: Int64, groups: int) -> Float64:
     """(G, ...) `judged_sums` of each group; -1 is none."""
     from semstab.statistics.loops.rows import add_judged
 
@@ -197,7 +194,7 @@ def rule_means_of(sums: Float64) -> RuleMeans:
     return RuleMeans(means, right.accuracy, right.miou, right.ece, right.brier)
 
 
-def reliability(belief: Float64 | Evidence, label: npt.NDArray[np.int64]) -> tuple[Reliability, ...]:
+def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:
     """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
     return reliability_of(judged_sums(Judged.of(belief, label)))
 
@@ -212,7 +209,7 @@ def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float
     return judged_strata(Judged.of(table.evidence, truth.label, table.voxels), table.op, truth.known, edges)
 
 
-def judged_strata(judged: Judged, op: npt.NDArray[np.int32], known: Mask, edges: Sequence[int]) -> Float64:
+def judged_strata(judged: Judged, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:
     """The same of what is judged already, by OP (n,) and where a true class is known (n,)."""
     group = np.where(known, groups_of(op, edges), -1)
     sums = _judged_by_group(judged, group, len(edges) + 1)

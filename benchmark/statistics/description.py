@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.metrics.matching import require_same_map
+from semstab.core.types import Float64
+from semstab.metrics.agreement import require_same_map
 from semstab.metrics.summary import STRATA
+from semstab.model.events import Events
 from semstab.model.results import TableSummary
 from semstab.model.statistics import (
     BeyondCoin,
@@ -32,19 +33,17 @@ from semstab.model.statistics import (
     Repeated,
     StratumStatistics,
 )
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import alpha_of, between_of, class_agreement_of, kappa_of, ratio_of
 from semstab.statistics.correctness import join_truth, quadrants_of, reliability_of, strata_of
-from semstab.statistics.judging.ceiling import losses_of
-from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.kinds import Kinds, spread
 from semstab.statistics.looks import Sample, correlogram, reach_by, reach_from
 from semstab.statistics.map_sums import BY_STRATUM, Maps, maps_of
 from semstab.statistics.sampling import InfluenceSums, Mean, PlaceSums, answered, judged_by, with_sample
 from semstab.statistics.sums import SecondSums, Whole, first_look, second_look
+from semstab.statistics.verdict import losses_of, verdict
 
 SCHEMA = 1
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

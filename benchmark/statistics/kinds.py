@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.voxels import Events, VoxelTable
+from semstab.core.types import Int32, Int64
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import Truth
 from semstab.statistics.observed import Observed
 from semstab.statistics.patterns import Patterns
@@ -33,7 +35,7 @@ class Known:
     places: Places
 
     @property
-    def label(self) -> npt.NDArray[np.int64] | None:
+    def label(self) -> Int64 | None:
         """(n,) the true class, -1 where it is not known."""
         return None if self.truth is None else self.truth.label
 
@@ -52,7 +54,7 @@ class Kinds:
     every: Known
     one: Known
     patterns: Patterns
-    of: npt.NDArray[np.int32] | None = None
+    of: Int32 | None = None
 
     @classmethod
     def found(cls, table: VoxelTable, events: Events | None = None, truth: Truth | None = None) -> Kinds:
@@ -96,6 +98,6 @@ class Kinds:
         return replace(self, one=replace(self.one, table=table), patterns=patterns)
 
 
-def spread(maps: Mapping[str, npt.NDArray[Any]], of: npt.NDArray[np.int32] | None) -> dict[str, npt.NDArray[Any]]:
+def spread(maps: Mapping[str, npt.NDArray[Any]], of: Int32 | None) -> dict[str, npt.NDArray[Any]]:
     """Values (n,) by name of all voxels, from those (k,) of one of each kind, and which one stands for each of them."""
     return {name: values if of is None else values[of] for name, values in maps.items()}

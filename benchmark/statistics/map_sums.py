@@ -11,19 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64
 from semstab.metrics.summary import STRATA, TableSums, groups_of
-from semstab.model.concentration import by_group
 from semstab.model.evidence import stretches
+from semstab.model.information import by_group
 from semstab.model.measures import sbd, vss
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import class_sums, disagreement, psa
+from semstab.statistics.agreement import class_sums, decompose, disagreement, psa
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.drift import expected_sbd
 from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums, merged
 from semstab.statistics.sampling.collect import FrameGroups, of_log, of_table, with_places
-from semstab.statistics.uncertainty import decompose
 
-Float64 = npt.NDArray[np.float64]
 Maps = dict[str, npt.NDArray[Any]]
 
 BY_STRATUM = ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_between")

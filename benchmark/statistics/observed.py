@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
+from semstab.core.types import Int32, Int64
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.model.voxels import Events
-
-Int64 = npt.NDArray[np.int64]
 
 
 class Log(Protocol):
@@ -22,7 +18,7 @@ class Log(Protocol):
     @property
     def ends(self) -> Int64: ...  # noqa: D102
     @property
-    def frame(self) -> npt.NDArray[np.int32]: ...  # noqa: D102
+    def frame(self) -> Int32: ...  # noqa: D102
     @property
     def evidence(self) -> Evidence: ...  # noqa: D102
     @property
@@ -55,7 +51,7 @@ class Observed:
         return Observed(self.events, self.starts[rows], self.ends[rows])
 
     @property
-    def frame(self) -> npt.NDArray[np.int32]:
+    def frame(self) -> Int32:
         """(m,) of all observations of the larger log, as its evidence is."""
         return self.events.frame
 

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.concentration import BLOCK, Concentration
+from semstab.core.types import Float64, Int32, Int64
 from semstab.model.evidence import Evidence
+from semstab.model.information import BLOCK, Concentration
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import BINS
 from semstab.statistics.observed import Observed
 from semstab.statistics.order.fusion_rules import FLOOR
-
-Int64 = npt.NDArray[np.int64]
 
 LEAST = 2 * FLOOR
 """Where a look gives a class less than this, a rule of fusion may take it for one that was never seen."""
@@ -35,7 +34,7 @@ class Patterns:
 
     table: VoxelTable
     log: Observed | None
-    of: npt.NDArray[np.int32] | None = None
+    of: Int32 | None = None
 
     @classmethod
     def found(cls, table: VoxelTable, log: Observed | None) -> Patterns:
@@ -83,9 +82,7 @@ class Patterns:
         return values if self.of is None else values[self.of]
 
 
-def judged_alike(
-    beliefs: Sequence[Evidence], at: npt.NDArray[np.int32], table: VoxelTable, rows: Int64, truth: Int64
-) -> npt.NDArray[np.float64]:
+def judged_alike(beliefs: Sequence[Evidence], at: Int32, table: VoxelTable, rows: Int64, truth: Int64) -> Float64:
     """(R, C) `judged_sums` of some rows (n,) of a table with true classes (n,), where these are known.
 
     Each of R beliefs (p, K) is that of patterns, all by the same classes; `at` (n,) is which of these voxels have.

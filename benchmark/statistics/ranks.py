@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-Int64 = npt.NDArray[np.int64]
+from semstab.core.types import Int64
 
 SPARSE = 8
 """A table may have so many places for one number."""

@@ -10,17 +10,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int64, Mask
+from semstab.model.events import Events
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.order.drift import VoxelDrift, drawn, streams, trend_columns, varying
 from semstab.statistics.sampling.arrangement import arranged
 from semstab.statistics.sampling.reach import Errors, longest
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 CERTAIN, MOST_SPANS = 0.95, 128
 """How certain it must be that errors last no longer, and by how many spans of time that is looked at."""
@@ -87,9 +85,7 @@ def scene_drift(
     )
 
 
-def sampled(
-    table: VoxelTable, events: Events, seed: int = 0, vary: npt.NDArray[np.bool_] | None = None
-) -> tuple[VoxelTable, Events]:
+def sampled(table: VoxelTable, events: Events, seed: int = 0, vary: Mask | None = None) -> tuple[VoxelTable, Events]:
     """The voxels of a map from which it is told whether it drifts, with their observations: see `drawn`.
 
     vary (n,) says whose observations differ, where that is known.

@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64
 from semstab.model.evidence import stretches
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE
 from semstab.statistics.ranks import numbered
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 LIKELY = 0.5
 """A place is called stable from this probability on."""
@@ -97,7 +95,7 @@ def _parts(table: VoxelTable) -> Iterator[tuple[slice, tuple[npt.NDArray[Any], F
     return ((some, (table.op[some], share[some], voxels[some])) for some in stretches(len(table)))
 
 
-def _votes(op: npt.NDArray[np.int32], share: Float64, voxels: Float64) -> tuple[Votes, Int64]:
+def _votes(op: Int32, share: Float64, voxels: Float64) -> tuple[Votes, Int64]:
     """Those of a table, and which each of its places with OP >= 2 has."""
     again = op >= 2
     T = op[again].astype(np.int64)

@@ -37,9 +37,7 @@ from semstab.testing.builders import (
     voxels,
 )
 from semstab.testing.contract import ContractTests
-from semstab.testing.evidence import EvidenceTests
-from semstab.testing.geometry import GeometryTests
-from semstab.testing.properties import PropertyTests
+from semstab.testing.properties import EvidenceTests, GeometryTests, PropertyTests
 
 __all__ = [
     "EXACT",

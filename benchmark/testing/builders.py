@@ -7,11 +7,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from semstab.backends import FusionBackend
+from semstab.core.types import Float64
 from semstab.metrics import entropy, sbd, vss
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.measures import SBD_MAX
@@ -148,7 +150,33 @@ def share_that_differs(a: VoxelTable, b: VoxelTable, tolerance: float) -> float:
     return 1 - len(same) / len(everywhere) if everywhere else 0.0
 
 
-def _rows(table: VoxelTable) -> dict[Voxel, npt.NDArray[np.float64]]:
+def _rows(table: VoxelTable) -> dict[Voxel, Float64]:
     measures = np.stack([vss(table), sbd(table), entropy(table)], axis=1)
     columns = [measures, *(np.asarray(getattr(table, name)).reshape(len(table), -1) for name in (*EXACT, *SUMS))]
     return dict(zip(voxels(table), np.concatenate(columns, axis=1), strict=True))
+
+
+# What the groups of tests have in common: a backend to test, and how to fuse with it.
+
+
+class BackendTests:
+    """Tests of the backend that `create` makes; BackendConformance says what the attributes mean."""
+
+    tolerance: float = 1e-9
+    voxel_share: float = 0.0
+    reach: int = 2**31
+
+    def create(self, voxel_size: float, num_classes: int) -> FusionBackend:
+        """A new, empty map."""
+        raise NotImplementedError("a subclass of BackendConformance says how its backend is made")
+
+    def fuse(self, *frames: Frame, voxel_size: float = 1.0, K: int = 3) -> VoxelTable:
+        """The map of these frames."""
+        backend = self.create(voxel_size, K)
+        for frame in frames:
+            backend.integrate(frame)
+        return backend.table()
+
+    def near(self, value: Any) -> Any:
+        """`value`, give or take the tolerance."""
+        return pytest.approx(value, abs=self.tolerance)

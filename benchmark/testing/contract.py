@@ -14,10 +14,10 @@ from semstab.metrics import entropy, vss
 from semstab.model.frames import Frame
 from semstab.model.results import RECURRENT, FrameReport
 from semstab.model.voxels import VoxelTable
-from semstab.testing.base import BackendTests
 from semstab.testing.builders import (
     JS_HALF,
     SEQUENCES,
+    BackendTests,
     Hit,
     as_frames,
     assert_same_map,

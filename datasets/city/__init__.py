@@ -13,13 +13,12 @@ import threading
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.config import nearest
-from semstab.datasets.city.classes import uavid8
-from semstab.datasets.city.flight import FLIGHTS
-from semstab.datasets.city.options import CityOptions, SimulatedBackbone
+from semstab.core.types import Float64, UInt8
+from semstab.datasets.city.mesh import uavid8
+from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedBackbone
 from semstab.datasets.city.rendering import Caster, Rendered, render
 from semstab.datasets.city.simulation import Simulation, View
 from semstab.datasets.city.world import World, build_world
@@ -77,7 +76,7 @@ class CityScene(Scene):
         return self._options.frames
 
     @cached_property
-    def timestamps(self) -> npt.NDArray[np.float64]:
+    def timestamps(self) -> Float64:
         """(len,) seconds since the flight began."""
         return np.array([self._share(index) * self._flight.seconds for index in range(len(self))])
 
@@ -103,7 +102,7 @@ class CityScene(Scene):
         T_wc = T.copy()
         T_wc[:3, 3] += self.origin
         rendered = self._render(index, T)
-        labels: npt.NDArray[np.uint8] | None = rendered.classes
+        labels: UInt8 | None = rendered.classes
         scores = None
         if model is not None:
             view = View(index, rendered, self.camera, T_wc, self.origin)
@@ -154,14 +153,14 @@ class CityScene(Scene):
         """How much of the flight lies behind at a frame."""
         return index / max(1, len(self) - 1)
 
-    def _pose(self, index: int) -> npt.NDArray[np.float64]:
+    def _pose(self, index: int) -> Float64:
         if not 0 <= index < len(self):
             raise DataError(f"city/{self.name}: there is no frame {index}; the scene has {len(self)} frames, from 0")
         with self._lock:  # the town is built once, by whoever asks first
             ground = self._ground
         return self._flight.pose(self._share(index), ground, self._options.altitude)
 
-    def _render(self, index: int, T: npt.NDArray[np.float64]) -> Rendered:
+    def _render(self, index: int, T: Float64) -> Rendered:
         """The rendered frame, kept while there is room.
 
         What does not fit is rendered again: dropping old frames instead would, in passes over all frames, drop each

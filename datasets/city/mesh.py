@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from semstab.core.types import Float64, Int64, Mask, UInt8
+from semstab.model.labels import LabelSpace
 
 Color = tuple[float, float, float]
 
@@ -22,7 +23,7 @@ class Surface:
 
     vertices: Float64
     faces: Int64
-    classes: npt.NDArray[np.uint8]
+    classes: UInt8
     colors: Float64
 
     @classmethod
@@ -60,7 +61,7 @@ class Shape:
     vertices: Float64
     faces: Int64
     colors: Float64
-    tinted: npt.NDArray[np.bool_]
+    tinted: Mask
 
     def place(
         self, class_id: int, position: Float64, yaw: Float64, size: Float64, tint: Float64, lean: Float64 | None = None
@@ -142,3 +143,14 @@ def moved(template: Shape, offset: npt.ArrayLike, scale: npt.ArrayLike) -> Shape
     """The template scaled about its origin, then moved."""
     vertices = template.vertices * np.asarray(scale) + np.asarray(offset)
     return Shape(vertices, template.faces, template.colors, template.tinted)
+
+
+# Ids of the uavid8 classes, by which every face of the town is labelled.
+
+CLUTTER, BUILDING, ROAD, STATIC_CAR, TREE, LOW_VEGETATION, HUMAN, MOVING_CAR = range(8)
+
+
+@cache
+def uavid8() -> LabelSpace:
+    """The label space of the town's ground truth and of every simulated backbone."""
+    return LabelSpace.load("uavid8")

@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from semstab.datasets.city.classes import CLUTTER, LOW_VEGETATION
-from semstab.datasets.city.mesh import Color, Float64
+from semstab.core.types import Float64
+from semstab.datasets.city.mesh import CLUTTER, LOW_VEGETATION, Color
 from semstab.datasets.city.streets import Plot, Rectangle
 
 SIDEWALK = 1.9

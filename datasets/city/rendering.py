@@ -2,17 +2,59 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.datasets.city.classes import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE
-from semstab.datasets.city.hashing import hash_integers, uniform
-from semstab.datasets.city.mesh import Float64, Int64, Surface
+from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt64
+from semstab.datasets.city.mesh import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE, Surface
 from semstab.model.frames import Intrinsics
 from semstab.model.labels import IGNORE_8BIT
+
+# Random numbers that are a function of integers: the same place, view or frame always draws the same number.
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX2 = np.uint64(0x94D049BB133111EB)
+
+
+def splitmix64(x: UInt64) -> UInt64:
+    """The output function of splitmix64 (Steele, Lea, Flood 2014) for states x, an array with an axis."""
+    x = x + _GOLDEN
+    x ^= x >> np.uint64(30)
+    x *= _MIX1
+    x ^= x >> np.uint64(27)
+    x *= _MIX2
+    x ^= x >> np.uint64(31)
+    return x
+
+
+def salt(*parts: str | int) -> int:
+    """A 64-bit number that stands for names and numbers; the same in every process, unlike `hash`."""
+    text = "\x1f".join(str(part) for part in parts)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def hash_integers(seed: int, *coordinates: Int64) -> UInt64:
+    """Hash integer coordinates, arrays of one shape, one after the other into 64 bits."""
+    state = np.full(coordinates[0].shape, seed, dtype=np.uint64)
+    for coordinate in coordinates:
+        state = splitmix64(state ^ coordinate.astype(np.int64, copy=False).view(np.uint64))
+    return state
+
+
+def rehash(state: UInt64, seed: int) -> UInt64:
+    """A second, independent hash of what `state` is a hash of."""
+    return splitmix64(state ^ np.uint64(seed))
+
+
+def uniform(state: UInt64) -> Float64:
+    """Hashes as numbers in [0, 1), from their upper 53 bits."""
+    numbers: Float64 = (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return numbers
+
 
 CHUNK = 1 << 18
 """Rays cast at a time: what bounds the memory of a large image."""
@@ -40,10 +82,10 @@ class Rendered:
     color      (H, W, 3) uint8 RGB
     """
 
-    depth: npt.NDArray[np.float32]
-    classes: npt.NDArray[np.uint8]
-    incidence: npt.NDArray[np.float32]
-    color: npt.NDArray[np.uint8]
+    depth: Float32
+    classes: UInt8
+    incidence: Float32
+    color: UInt8
 
     @property
     def nbytes(self) -> int:
@@ -82,12 +124,12 @@ class Caster:
         face[missed], parameter[missed] = -1, np.inf
         return face, parameter
 
-    def blocks(self, points: Float64, direction: Float64) -> npt.NDArray[np.bool_]:
+    def blocks(self, points: Float64, direction: Float64) -> Mask:
         """Whether a ray from each point (n, 3) along one direction hits anything."""
         if not len(self.normals):
             return np.zeros(len(points), dtype=bool)
         towards = np.broadcast_to(direction, points.shape)
-        hit: npt.NDArray[np.bool_] = np.asarray(self._intersector.intersects_first(points, towards)) >= 0
+        hit: Mask = np.asarray(self._intersector.intersects_first(points, towards)) >= 0
         return hit
 
 
@@ -125,7 +167,7 @@ class _Hit:
     points: Float64
     normals: Float64
     incidence: Float64
-    classes: npt.NDArray[np.uint8]
+    classes: UInt8
     material: Float64
 
 
@@ -146,7 +188,7 @@ def _nearest(casters: tuple[Caster, Caster], origin: Float64, directions: Float6
     return _Hit(depth, points, normals, np.where(np.isinf(depth), 0.0, np.minimum(incidence, 1.0)), classes, material)
 
 
-def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> npt.NDArray[np.uint8]:
+def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> UInt8:
     """Lambert's law under one sun with cast shadows, with grain that is tied to the place."""
     light = np.maximum(hit.normals @ SUN, 0.0)
     lit = np.flatnonzero(light > 0)
@@ -158,7 +200,7 @@ def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> npt.NDArray[np.uint8]:
     brightness *= 1 + fine * _noise(hit.points, 0.3) + coarse * _noise(hit.points, 2.3)
     seen = hit.classes != IGNORE_8BIT
     shaded = np.where(seen[:, None], hit.material * brightness[:, None], SKY)
-    color: npt.NDArray[np.uint8] = np.clip(shaded * 255, 0, 255).astype(np.uint8)
+    color: UInt8 = np.clip(shaded * 255, 0, 255).astype(np.uint8)
     return color
 
 

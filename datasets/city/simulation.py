@@ -6,18 +6,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from semstab.datasets.city.classes import uavid8
-from semstab.datasets.city.hashing import UInt64, hash_integers, rehash, salt, uniform
-from semstab.datasets.city.mesh import Float64, Int64
+from semstab.core.types import Float32, Float64, Int64, UInt8, UInt64
+from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import CONFUSION, SimulatedBackbone
-from semstab.datasets.city.rendering import CHUNK, Rendered
+from semstab.datasets.city.rendering import CHUNK, Rendered, hash_integers, rehash, salt, uniform
 from semstab.model.frames import Intrinsics
 from semstab.model.labels import IGNORE_8BIT
 
-Labels = npt.NDArray[np.uint8]
-Scores = npt.NDArray[np.float32]
+Labels = UInt8
+Scores = Float32
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ class Simulation:
         nothing = (moved == IGNORE_8BIT) | (true == IGNORE_8BIT)
         return np.where(nothing, true, moved)
 
-    def _field(self, frame: int, axis: int, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+    def _field(self, frame: int, axis: int, shape: tuple[int, int]) -> Float32:
         """Random numbers within +-border on a grid of border_scale pixels, interpolated to each pixel."""
         model, (H, W) = self.model, shape
         rows, columns = (int(np.ceil(n / model.border_scale)) + 1 for n in (H, W))
@@ -170,7 +168,7 @@ def confusion_matrix(model: SimulatedBackbone) -> Float64:
     return probabilities
 
 
-def _view_chance(model: SimulatedBackbone, incidence: npt.NDArray[np.float32], distance: Float64) -> Float64:
+def _view_chance(model: SimulatedBackbone, incidence: Float32, distance: Float64) -> Float64:
     """Probability of a view error: grows with the angle to the normal, 1 from 60 degrees, and with the distance."""
     slant = np.minimum(1.0, 2 * (1 - incidence.astype(np.float64)))
     chance: Float64 = model.view * slant * np.minimum(1.0, distance / model.view_distance)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from semstab.datasets.city.mesh import Float64
+from semstab.core.types import Float64
 
 MAIN_WIDTH = 11.0
 SIDE_WIDTH = 8.0

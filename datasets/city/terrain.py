@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.city.classes import LOW_VEGETATION
-from semstab.datasets.city.mesh import Float64, Int64, Shape, Surface
+from semstab.core.types import Float64, Int64
+from semstab.datasets.city.mesh import LOW_VEGETATION, Shape, Surface
 from semstab.datasets.city.streets import Layout, Rectangle
 
 SPACING = 4.0

@@ -6,15 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.datasets.city.classes import HUMAN, MOVING_CAR, STATIC_CAR
-from semstab.datasets.city.mesh import Float64, Shape, Surface, box, choose, combine, join
+from semstab.core.types import Float64, Mask
+from semstab.datasets.city.mesh import HUMAN, MOVING_CAR, STATIC_CAR, Shape, Surface, box, choose, combine, join
 from semstab.datasets.city.plots import SIDEWALK, SIDEWALK_ABOVE, Spot, columns
 from semstab.datasets.city.streets import MAIN_WIDTH, Street
 from semstab.datasets.city.terrain import Site
 
-Bool = npt.NDArray[np.bool_]
+Bool = Mask
 
 ROAD_ABOVE = 0.094
 SIGHT = 140.0

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.datasets.city import buildings, greenery, traffic
-from semstab.datasets.city.classes import CLUTTER, ROAD
-from semstab.datasets.city.flight import Flight
-from semstab.datasets.city.mesh import Float64, Surface, box, join
+from semstab.core.types import Float64
+from semstab.datasets.city import buildings, traffic
+from semstab.datasets.city.mesh import CLUTTER, ROAD, Surface, box, join
+from semstab.datasets.city.options import Flight
 from semstab.datasets.city.plots import Inventory, Spot, columns, furnish
 from semstab.datasets.city.streets import MAIN_WIDTH, Layout, Plot, Rectangle, Street, plan_streets
 from semstab.datasets.city.terrain import Site, Terrain
@@ -107,10 +107,10 @@ def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Fli
 
     return [
         *buildings.build(town.buildings, site, _rng(seed, flight, 7)),
-        *greenery.trees(close(town.trees), site, _rng(seed, flight, 8)),
-        greenery.bushes(close(town.bushes), site, _rng(seed, flight, 9)),
-        greenery.hedges(town.hedges, site, _rng(seed, flight, 10)),
-        greenery.fences(town.fences, site, _rng(seed, flight, 11)),
+        *buildings.trees(close(town.trees), site, _rng(seed, flight, 8)),
+        buildings.bushes(close(town.bushes), site, _rng(seed, flight, 9)),
+        buildings.hedges(town.hedges, site, _rng(seed, flight, 10)),
+        buildings.fences(town.fences, site, _rng(seed, flight, 11)),
         traffic.parked_cars(close(town.cars), site, _rng(seed, flight, 12)),
         traffic.standing_people(close(town.people), site, _rng(seed, flight, 13)),
         _bins(town, site, _rng(seed, flight, 14)),

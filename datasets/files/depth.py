@@ -7,20 +7,18 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float32, Float64
 from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import FileOptions
-from semstab.datasets.formats.colmap_depth import read_depth_map
-from semstab.datasets.formats.dense_depth import read_dmap, read_mvei
+from semstab.datasets.files.surfaces import Surface, View
+from semstab.datasets.formats.dense_depth import read_depth_map, read_dmap, read_mvei
 from semstab.datasets.formats.images import MILLIMETRES, Read, color_size, read_depth
-from semstab.datasets.surfaces.casting import View
-from semstab.datasets.surfaces.surface import Surface
-from semstab.datasets.views.ray_depth import planar
+from semstab.datasets.geometry.cameras import planar
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 
-Depth = npt.NDArray[np.float32]
+Depth = Float32
 Shape = tuple[int, int]
 Camera = Callable[[Shape], Intrinsics]
 """The intrinsics of a frame's depth image, of shape (H, W)."""
@@ -40,9 +38,7 @@ class DepthSource(Protocol):
         """Units of stored depth in a metre, None where depth is not stored."""
         ...
 
-    def depth(
-        self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]
-    ) -> Depth:
+    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
         """Depth (H, W) along the optical axis in metres, of a file whose bytes `read` gives. Raises DataError."""
         ...
 
@@ -66,9 +62,7 @@ class StoredDepth:
         usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
         return self._options.depth_scale or frame.depth_scale or usual
 
-    def depth(
-        self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]
-    ) -> Depth:
+    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
         """What the file holds, without what marks pixels that have none."""
         scale = self._options.depth_scale or frame.depth_scale
         depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
@@ -104,9 +98,7 @@ class CastDepth:
         """Depth is not stored."""
         return
 
-    def depth(
-        self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], npt.NDArray[np.float64]]
-    ) -> Depth:
+    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
         """What the camera sees of it."""
         shape = shape_of(frame, self._options)
         depth = self._surface.depth(View(camera(shape), T_wc(), shape))

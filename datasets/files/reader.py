@@ -8,24 +8,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Generic, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.frame_table import FrameTable
-from semstab.datasets.files.label_source import ScenePlace
-from semstab.datasets.files.messages import nearest
-from semstab.datasets.files.options import FileOptions
+from semstab.core.types import UInt16
+from semstab.datasets.files.frame_source import FrameSource, FrameTable
+from semstab.datasets.files.labels import ScenePlace
+from semstab.datasets.files.options import FileOptions, Folders
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface, usual_folder
 from semstab.datasets.formats.disk import naturally, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
-from semstab.datasets.scene import Dataset
-from semstab.datasets.surfaces.casts import usual_folder
-from semstab.datasets.surfaces.surface import Surface
-from semstab.datasets.surfaces.triangles import SEEN_FROM_ABOVE
-from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.poses import Poses
+from semstab.datasets.geometry.cameras import Camera, Poses
+from semstab.datasets.scene import Dataset, nearest
 from semstab.errors import ConfigError, DataError
 from semstab.model.georeference import Georeference
 
@@ -103,7 +95,7 @@ class FileDataset(Dataset, Generic[Options]):
         """Whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
         return self.options.surface is not None or folder.is_dir()
 
-    def class_ids(self) -> Mapping[str, npt.NDArray[np.uint16]]:
+    def class_ids(self) -> Mapping[str, UInt16]:
         """By label source, a table (65536,) from the ids of its files to those of its taxonomy, where they differ."""
         return {}
 

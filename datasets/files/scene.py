@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,34 +11,51 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.prefetch import prefetch
+from semstab.core.rows import Memory, Scratch, room_for
+from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
 from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
-from semstab.datasets.files.digests import Digests
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.frame_table import FrameTable
-from semstab.datasets.files.label_maps import LabelMaps
-from semstab.datasets.files.label_source import (
-    ScenePlace,
-    label_paths,
-)
-from semstab.datasets.files.options import FileOptions
-from semstab.datasets.files.templates import Folders
+from semstab.datasets.files.frame_source import FrameSource, FrameTable
+from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
+from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
+from semstab.datasets.formats.disk import read_pose
 from semstab.datasets.formats.images import Read, read_color
-from semstab.datasets.formats.text_files import read_pose
+from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
+from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
 from semstab.datasets.scene import Scene
-from semstab.datasets.surfaces.casting import View
-from semstab.datasets.surfaces.surface import Surface
-from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.lenses import undistorted
-from semstab.datasets.views.poses import UP_AXES, Poses, to_camera_to_world
-from semstab.datasets.views.resampling import Labels, Pixels, Scores, fit
-from semstab.datasets.views.same_view import at_image, fitted
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
-from semstab.runtime.prefetch import prefetch
+
+# Digests of the files of frames, as far as these were read.
+
+BYTES = 32
+
+
+class Digests:
+    """32 bytes for each file of a frame, of a long sequence in a file; several threads may keep them."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._kept: dict[str, Memory | Scratch] = {}
+
+    def keep(self, index: int, what: str, digest: bytes) -> None:
+        """That of what file of a frame it is; not where the disk is full: the frame's file is read again then."""
+        if what not in self._kept:
+            self._kept.setdefault(what, room_for(BYTES * self._frames))
+        with contextlib.suppress(OSError):
+            self._kept[what].write(np.frombuffer(digest, np.uint8), BYTES * index)
+
+    def of(self, index: int, what: str) -> bytes | None:
+        """That of a frame's file; None where it was not read."""
+        if what not in self._kept:
+            return None
+        digest = self._kept[what].read(np.uint8, BYTES, BYTES * index).tobytes()
+        return digest if any(digest) else None
+
 
 PLACES = {
     "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",
@@ -68,7 +86,7 @@ class FileScene(Scene):
         place: ScenePlace,
         frames: FrameTable,
         options: FileOptions,
-        class_ids: Mapping[str, npt.NDArray[np.uint16]] | None = None,
+        class_ids: Mapping[str, UInt16] | None = None,
         surface: Surface | None = None,
     ) -> None:
         if len(set(frames.names)) < len(frames):
@@ -97,7 +115,7 @@ class FileScene(Scene):
         return len(self._frames)
 
     @cached_property
-    def timestamps(self) -> npt.NDArray[np.float64] | None:
+    def timestamps(self) -> Float64 | None:
         """(len,) seconds on the dataset's own clock; None where it has none."""
         if self.options.frames_per_second is not None:
             return np.arange(len(self)) / self.options.frames_per_second
@@ -183,12 +201,12 @@ class FileScene(Scene):
         K = None if camera is None else camera.at(shape, self.options.pixel_centre or 0.0)
         return at_image(self.geometry(index), shape, str(source.color or source.name), K)
 
-    def depth(self, index: int) -> npt.NDArray[np.float32]:
+    def depth(self, index: int) -> Float32:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
         source, read = self._frame(index), self._reader(index, DEPTH)
         return self._depth.depth(source, read, lambda shape: self.intrinsics(index, shape), lambda: self.T_wc(index))
 
-    def color(self, index: int) -> npt.NDArray[np.uint8] | None:
+    def color(self, index: int) -> UInt8 | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
         source = self._frame(index)
         path = self._color_file(source)
@@ -199,7 +217,7 @@ class FileScene(Scene):
         shape = (size[1], size[0])
         return undistorted(read_color(path), source.color_lens, self.intrinsics(index, shape), shape, str(path))
 
-    def image(self, index: int) -> npt.NDArray[np.uint8]:
+    def image(self, index: int) -> UInt8:
         """What models predict on: the colour image, or the distorted photograph where label maps belong to that."""
         source = self._frame(index)
         if source.label_lens is None:
@@ -277,7 +295,7 @@ class FileScene(Scene):
     def _framed(
         self,
         index: int,
-        depth: npt.NDArray[np.float32],
+        depth: Float32,
         labels: Labels | None,
         scores: Scores | None,
         *,
@@ -304,10 +322,10 @@ class FileScene(Scene):
             files={what: str(path) for what, path in known.items() if path is not None},
         )
 
-    def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> Mask:
         """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
         mask = self._maps.mask(path, self._reader(index, MASK))
-        masked: npt.NDArray[np.bool_] = self._stored(index, mask, shape, path, "the mask is") == 1
+        masked: Mask = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:

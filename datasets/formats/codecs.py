@@ -22,6 +22,7 @@ import deflate  # its checksums take a twentieth of zlib's time
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float32, UInt8
 from semstab.datasets.formats import png_grey
 from semstab.datasets.formats.disk import AGAIN
 from semstab.errors import DataError, one_line
@@ -71,13 +72,13 @@ class Png:
             image = image // np.uint8(255 // (2**self.bits - 1))
         return image
 
-    def metres(self, scale: float) -> npt.NDArray[np.float32]:
+    def metres(self, scale: float) -> Float32:
         """Samples (H, W) of a 16-bit grey image, of which `scale` make a metre."""
         width, height, *_ = self.header
         quick = png_grey.decode_metres(width, height, scale, self._data()) if self._is_common() else None
         return np.divide(self.samples(), scale, dtype=np.float32, casting="same_kind") if quick is None else quick
 
-    def rgb(self) -> npt.NDArray[np.uint8]:
+    def rgb(self) -> UInt8:
         """Colour (H, W, 3) uint8 of an image of any kind."""
         return np.ascontiguousarray(_imdecode(self.path, self._encoded(), "IMREAD_COLOR")[..., ::-1])
 
@@ -135,7 +136,7 @@ def parse_png(path: Path, data: bytes) -> Png:
 # --- JPEG, TIFF, EXR ------------------------------------------------------------------------------------------------
 
 
-def decode_jpeg(path: Path, data: bytes) -> npt.NDArray[np.uint8]:
+def decode_jpeg(path: Path, data: bytes) -> UInt8:
     """RGB (H, W, 3). Pillow, because OpenCV fills the rest of a truncated JPEG with grey."""
     from PIL import JpegImagePlugin
 
@@ -150,7 +151,7 @@ def decode_jpeg(path: Path, data: bytes) -> npt.NDArray[np.uint8]:
         raise DataError(f"{path}: not a whole JPEG image ({one_line(error)}); {AGAIN}") from error
 
 
-def decode_color_tiff(path: Path, data: bytes) -> npt.NDArray[np.uint8]:
+def decode_color_tiff(path: Path, data: bytes) -> UInt8:
     """RGB (H, W, 3) of an 8-bit image, or of a deeper one its upper bits."""
     channels = _checked_tags(path, data, pixel_bytes=3).get(277, 1)
     if channels not in (1, 3, 4):

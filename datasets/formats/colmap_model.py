@@ -16,13 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from semstab.datasets.formats.disk import AGAIN, natural
-from semstab.datasets.formats.text_tables import to_number
-from semstab.datasets.views.cameras import Camera
-from semstab.datasets.views.poses import Poses, from_quaternions
+from semstab.core.files import open_file
+from semstab.datasets.formats.disk import AGAIN, natural, to_number
+from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
-from semstab.runtime.files import open_file
 
 MODELS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",

@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import math
 import os
 import re
-from collections.abc import Container, Iterable, Iterator
+import reprlib
+import struct
+import zipfile
+import zlib
+from array import array
+from collections.abc import Container, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
-from semstab.errors import DataError
-from semstab.runtime.files import open_file, read_limited
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.files import open_file, parse_json, read_limited
+from semstab.core.types import Float64
+from semstab.datasets.geometry.cameras import Poses
+from semstab.errors import DataError, one_line
+from semstab.model.frames import Intrinsics
 
 AGAIN = "copy or export it again"
 MAX_BYTES = 2**32
@@ -90,3 +104,205 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
         return
     except OSError as error:
         raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
+
+
+# npy and npz bytes to an array of plain numbers: the whole one, or one DataError with the file; nothing is run.
+
+MAX_ARRAY_BYTES = 2**29
+"""Of an image as an array; scores, of many classes, may be larger."""
+MAX_SCORE_BYTES = 2**32
+
+NPY_DTYPE = re.compile(rb"""['"]descr['"]\s*:\s*['"]([<>|=]?(?:b1|[iu][1248]|f[248]))['"]""")
+NPY_ORDER = re.compile(rb"""['"]fortran_order['"]\s*:\s*(True|False)""")
+NPY_SHAPE = re.compile(rb"""['"]shape['"]\s*:\s*\(([\d\s,]{0,200})\)""")
+
+
+def decode_array(path: Path, data: bytes, key: str, limit: int | None = None) -> npt.NDArray[Any]:
+    """The array of an .npy file, or of an .npz file the one called `key` or the only one; read-only."""
+    return (
+        _decode_npz(path, data, key, limit or MAX_ARRAY_BYTES)
+        if path.suffix.lower() == ".npz"
+        else _decode_npy(str(path), data)
+    )
+
+
+def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
+    """Parsed by hand: numpy evaluates the header as Python, with its warnings, and allocates what it claims."""
+    if not data.startswith(b"\x93NUMPY") or len(data) < 12:
+        raise DataError(f"{where}: not an .npy array; {AGAIN}")
+    width = 2 if data[6] == 1 else 4
+    start = 8 + width + int.from_bytes(data[8 : 8 + width], "little")
+    if start > len(data):
+        raise DataError(f"{where}: the .npy array is truncated after {len(data)} bytes; {AGAIN}")
+    header = data[8 + width : start]
+    dtype, order, shape = (pattern.search(header) for pattern in (NPY_DTYPE, NPY_ORDER, NPY_SHAPE))
+    if not (dtype and order and shape):
+        raise DataError(f"{where}: the .npy header is damaged, or the array does not hold plain numbers; save it anew")
+    kind = np.dtype(dtype[1].decode())
+    sizes = tuple(int(n) for n in re.findall(rb"\d+", shape[1]))
+    needed, found = math.prod(sizes) * kind.itemsize, len(data) - start
+    if needed == 0 or len(sizes) > 4:
+        raise DataError(f"{where}: an array of shape {sizes} cannot hold an image; {AGAIN}")
+    if found != needed:
+        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {found}; {AGAIN}")
+    array = np.frombuffer(data, kind, offset=start).reshape(sizes, order="F" if order[1] == b"True" else "C")
+    return array.astype(kind.newbyteorder("="), copy=False)
+
+
+def _decode_npz(path: Path, data: bytes, key: str, limit: int) -> npt.NDArray[Any]:
+    damage = (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, LookupError, RuntimeError)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            info = _member(path, archive, key, limit)
+            with archive.open(info) as member:
+                content = member.read(info.file_size)  # bounded; the checksum is verified at its end
+    except DataError:
+        raise
+    except damage as error:
+        raise DataError(f"{path}: not a whole .npz archive ({one_line(error)}); {AGAIN}") from error
+    return _decode_npy(f"{path} ({reprlib.repr(info.filename)})", content)
+
+
+def _member(path: Path, archive: zipfile.ZipFile, key: str, limit: int) -> zipfile.ZipInfo:
+    """The member called `key`, or the only one. Raises DataError where there is none that can be read."""
+    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    info = next(iter(members.values())) if len(members) == 1 else members.get(key)
+    if info is None:
+        raise DataError(f"{path}: holds arrays {reprlib.repr(sorted(members))}; name one '{key}'")
+    if info.file_size > limit or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise DataError(
+            f"{path}: {reprlib.repr(info.filename)} claims {info.file_size} bytes (at most {limit}), compression"
+            f" {info.compress_type} (stored or deflated are read); save it with numpy"
+        )
+    return info
+
+
+# JSON files of datasets: an object with numbers where numbers are expected, or one DataError with the file.
+
+MAX_JSON_BYTES = 2**28
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a file. Raises DataError where there is none."""
+    data = read_bytes(path, MAX_JSON_BYTES)
+    try:
+        content = parse_json(data)
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected an object with named values, found a {type(content).__name__}")
+    return content
+
+
+def number(content: Mapping[str, Any], key: str, where: str) -> float:
+    """A finite number of an object. Raises DataError with `where` (the file) and the key."""
+    value = content.get(key)
+    if value is None:
+        raise DataError(f"{where}: '{key}' is missing; add it")
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e300 or not math.isfinite(value):
+        raise DataError(f"{where}: '{key}' is {repr(value)[:40]}; expected a number")
+    return float(value)
+
+
+def matrix(value: Any, where: str) -> Poses:
+    """(4, 4) from rows of 3x4 or 4x4 numbers, NaN and infinity among them. Raises DataError with `where`."""
+    try:
+        T = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"{where}: expected a matrix of numbers, got {repr(value)[:60]}") from error
+    if T.shape == (3, 4):
+        T = np.vstack([T, [0, 0, 0, 1]])
+    if T.shape != (4, 4):
+        raise DataError(f"{where}: expected a 4x4 matrix, got {repr(value)[:60]}")
+    return T
+
+
+# Poses and intrinsics as text: one matrix a file, or one DataError with the file.
+
+MAX_TEXT_BYTES = 2**16
+
+
+def read_pose(path: Path) -> Float64:
+    """A (4, 4) matrix from 16 numbers, or from the 12 of its upper rows, apart by whitespace or commas.
+
+    Raises DataError for anything else.
+    """
+    numbers = _numbers(path)
+    if len(numbers) == 12:
+        numbers += [0, 0, 0, 1]
+    if len(numbers) != 16:
+        hint = " (position and quaternion?)" if len(numbers) in (7, 8) else ""
+        raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, found {len(numbers)} numbers{hint}; convert it")
+    return np.array(numbers, dtype=np.float64).reshape(4, 4)
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Intrinsics in pixels from a 3x3 or 4x4 matrix. Raises DataError for anything else."""
+    numbers = _numbers(path)
+    if len(numbers) not in (9, 16):
+        raise DataError(
+            f"{path}: expected a 3x3 camera matrix, found {len(numbers)} numbers; write fx 0 cx 0 fy cy 0 0 1"
+        )
+    side = 3 if len(numbers) == 9 else 4
+    K = np.array(numbers, dtype=np.float64).reshape(side, side)[:3, :3]
+    if not np.isfinite(K).all() or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
+        raise DataError(f"{path}: {K.tolist()} is no camera matrix; write fx 0 cx 0 fy cy 0 0 1, in rows")
+    try:
+        return Intrinsics.from_matrix(K)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _numbers(path: Path) -> list[float]:
+    data = read_bytes(path, MAX_TEXT_BYTES)
+    words = data.decode("utf-8-sig", errors="replace").replace(",", " ").split()
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise DataError(f"{path}: expected numbers ({one_line(error)}); write the matrix as text") from error
+
+
+# Text files with one record a line (trajectories, lists of images): all of it, or one DataError with the line.
+
+MAX_TABLE_BYTES = 2**28
+
+
+def records(path: Path) -> Iterator[tuple[int, str]]:
+    """Number, from 1, and text of each line that is neither empty nor a comment (#).
+
+    Raises DataError where the file cannot be read or is larger than any such table.
+    """
+    data = read_bytes(path, MAX_TABLE_BYTES)
+    for number, line in enumerate(data.decode("utf-8-sig", errors="replace").split("\n"), start=1):
+        text = line.strip()
+        if text and not text.startswith("#"):
+            yield number, text
+
+
+def read_table(path: Path, columns: int, what: str) -> Float64:
+    """(n, columns) numbers, apart by whitespace or commas; `what` says in errors what a line is.
+
+    Raises DataError that names the line for another number of words, or one that is no number; and for no line.
+    """
+    values = array("d")
+    for number, text in records(path):
+        words = text.replace(",", " ").split()
+        if len(words) != columns:
+            raise DataError(f"{path}: line {number} has {len(words)} values; expected {columns} ({what})")
+        values.extend(to_number(word, path, number) for word in words)
+    if not values:
+        raise DataError(f"{path}: holds no line; expected lines of {what}")
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
+
+
+def read_matrices(path: Path) -> Float64:
+    """(n, 4, 4) from a flattened matrix a line. Raises what `read_table` raises."""
+    return read_table(path, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
+
+
+def to_number(word: str, path: Path, line: int) -> float:
+    """One number. Raises DataError that names the line."""
+    try:
+        return float(word)
+    except ValueError as error:
+        raise DataError(f"{path}: line {line}: {word[:40]!r} is not a number") from error

@@ -10,17 +10,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.datasets.formats.arrays import MAX_SCORE_BYTES, decode_array
-from semstab.datasets.formats.codecs import (
-    Png,
-    decode_color_tiff,
-    decode_exr,
-    decode_jpeg,
-    decode_tiff,
-    parse_png,
-)
-from semstab.datasets.formats.disk import read_bytes
-from semstab.datasets.views.resampling import Labels
+from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
+from semstab.datasets.formats.codecs import Png, decode_color_tiff, decode_exr, decode_jpeg, decode_tiff, parse_png
+from semstab.datasets.formats.disk import MAX_SCORE_BYTES, decode_array, read_bytes
+from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
@@ -39,7 +32,7 @@ Size = tuple[int, int]
 Read = Callable[[Path], bytes]
 
 
-def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) -> npt.NDArray[np.float32]:
+def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
     """Depth (H, W) in metres, float32, as stored: what marks a pixel invalid stays.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
@@ -60,7 +53,7 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     if scale is None and depth.dtype.kind != "f":
         raise DataError(f"{path}: depth is {depth.dtype}, of unknown unit; set depth_scale (units per metre)")
     with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
-        metres: npt.NDArray[np.float32] = np.divide(depth, scale or 1, dtype=np.float32, casting="same_kind")
+        metres: Float32 = np.divide(depth, scale or 1, dtype=np.float32, casting="same_kind")
     return metres
 
 
@@ -103,7 +96,7 @@ def read_scores(
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
 
 
-def read_mask(path: Path, read: Read = read_bytes) -> npt.NDArray[np.bool_]:
+def read_mask(path: Path, read: Read = read_bytes) -> Mask:
     """Mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
 
     Raises DataError where it is no one-channel PNG, or damaged.
@@ -111,11 +104,11 @@ def read_mask(path: Path, read: Read = read_bytes) -> npt.NDArray[np.bool_]:
     png = parse_png(path, read(path))
     if png.kind not in ("grey", "palette"):
         raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
-    mask: npt.NDArray[np.bool_] = png.indices() == 0
+    mask: Mask = png.indices() == 0
     return mask
 
 
-def read_color(path: Path) -> npt.NDArray[np.uint8]:
+def read_color(path: Path) -> UInt8:
     """Colour (H, W, 3) uint8 RGB from PNG, JPEG or TIFF, not rotated by EXIF. Raises DataError for a damaged file."""
     data = read_bytes(path)
     suffix = path.suffix.lower()
@@ -161,7 +154,7 @@ def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labe
     return ids.astype(np.uint8) if fits else ids.astype(np.uint16)
 
 
-def _opaque(path: Path, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def _opaque(path: Path, image: UInt8) -> UInt8:
     """RGB of an RGB or fully opaque RGBA image."""
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
@@ -169,7 +162,7 @@ def _opaque(path: Path, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return image[..., :3]
 
 
-def _labels_by_color(path: Path, rgb: npt.NDArray[np.uint8], space: LabelSpace) -> Labels:
+def _labels_by_color(path: Path, rgb: UInt8, space: LabelSpace) -> Labels:
     table, (H, W) = _ids_by_color(space), rgb.shape[:2]
     ids = np.empty((H, W), dtype=np.uint8 if max(space.ids) < IGNORE_8BIT else np.uint16)
     rows, count, first = max(1, PIXELS_AT_ONCE // W), 0, (0, 0)
@@ -189,7 +182,7 @@ def _labels_by_color(path: Path, rgb: npt.NDArray[np.uint8], space: LabelSpace) 
 
 
 @functools.lru_cache(maxsize=2)
-def _ids_by_color(space: LabelSpace) -> npt.NDArray[np.uint16]:
+def _ids_by_color(space: LabelSpace) -> UInt16:
     """(2^24,) class id of each packed colour. Raises ConfigError where two classes share a colour."""
     if len(set(space.colors)) < len(space):
         shared = next(color for color in space.colors if space.colors.count(color) > 1)
@@ -199,7 +192,7 @@ def _ids_by_color(space: LabelSpace) -> npt.NDArray[np.uint16]:
     return table
 
 
-def _packed(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
+def _packed(rgb: UInt8) -> UInt32:
     """RGB (..., 3) as one 24-bit number each."""
     r, g, b = (rgb[..., channel].astype(np.uint32) for channel in range(3))
     return (r << np.uint32(16)) | (g << np.uint32(8)) | b

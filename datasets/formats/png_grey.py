@@ -15,7 +15,8 @@ import deflate
 import numpy as np
 import numpy.typing as npt
 
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
+from semstab.core.types import Float32, UInt8
 
 LARGEST_RATIO = 1032
 """A byte of a deflate stream becomes at most that many: what claims more is not worth the memory."""
@@ -35,7 +36,7 @@ def decode(width: int, height: int, bits: int, parts: Iterable[memoryview]) -> n
     return out.view("<u2" if B == 2 else np.uint8)[..., 0]
 
 
-def decode_metres(width: int, height: int, scale: float, parts: Iterable[memoryview]) -> npt.NDArray[np.float32] | None:
+def decode_metres(width: int, height: int, scale: float, parts: Iterable[memoryview]) -> Float32 | None:
     """Samples (height, width) of such an image of 16 bits, divided by `scale`: one pass less than in two steps."""
     if (raw := _inflated(height * (1 + width * 2), parts)) is None:
         return None
@@ -43,7 +44,7 @@ def decode_metres(width: int, height: int, scale: float, parts: Iterable[memoryv
     return out if _unfilter_metres(raw, np.float32(scale), out) else None
 
 
-def _inflated(size: int, parts: Iterable[memoryview]) -> npt.NDArray[np.uint8] | None:
+def _inflated(size: int, parts: Iterable[memoryview]) -> UInt8 | None:
     """The `size` bytes of filtered rows; None where it is another number, or damaged."""
     stream = b"".join(parts)
     if size > LARGEST_RATIO * len(stream):

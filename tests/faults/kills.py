@@ -32,7 +32,7 @@ import tiny_study
 import yaml
 
 from semstab.cli import app
-from semstab.outputs.recording.target import is_whole
+from semstab.recording.target import is_whole
 
 Words = list[str]
 TIMES = ("fuse_ms_per_frame", "stages_ms")

@@ -16,9 +16,9 @@ from command_line import environment
 from posed_config import configure
 
 import semstab
+from semstab.core.files import write_text
 from semstab.errors import ConfigError
-from semstab.outputs.recording import Recording
-from semstab.runtime.files import write_text
+from semstab.recording.observer import Recording
 
 
 def test_a_recording_that_finds_no_room_costs_no_result(tmp_path, monkeypatch) -> None:

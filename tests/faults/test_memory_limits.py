@@ -13,9 +13,9 @@ from posed_writer import write_posed
 
 import semstab
 from semstab.backends.numpy_reference import NumpyReference
+from semstab.core.process import available_bytes, group_bytes
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
-from semstab.runtime.memory import available_bytes, group_bytes
 from semstab.statistics.agreement import between_of
 from semstab.statistics.sampling.intervals import answers, asked_of_looks
 
@@ -90,7 +90,7 @@ def test_groups_of_version_1_and_of_a_container_count(tmp_path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="macOS does not bound the address space")
 def test_the_processes_own_limit_bounds_what_is_free() -> None:
     program = (
-        "import resource, psutil; from semstab.runtime.memory import available_bytes\n"
+        "import resource, psutil; from semstab.core.process import available_bytes\n"
         "used = psutil.Process().memory_info().vms\n"
         "resource.setrlimit(resource.RLIMIT_AS, (used + 50_000_000, -1)); print(available_bytes())"
     )

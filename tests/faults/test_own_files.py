@@ -17,14 +17,14 @@ from rich.console import Console
 
 import semstab
 from semstab.convert import convert
+from semstab.core.files import read_json
+from semstab.core.json_form import from_json
 from semstab.engine import load_result
 from semstab.errors import LONGEST_LINE, SemstabError
 from semstab.model.records import UnitContent
-from semstab.outputs.tables import tables
-from semstab.outputs.terminal.summary import print_summary
-from semstab.predict.disk.folder import PredictionFolder
-from semstab.runtime.files import read_json
-from semstab.runtime.json_form import from_json
+from semstab.predict.folder import PredictionFolder
+from semstab.report.tables import tables
+from semstab.report.terminal import print_summary
 
 VALUES = (None, True, -1, 1e308, float("nan"), "x", "\ud800", [], {}, "../../x", 10**400, "a" * 5000, 0)
 WHOLES = (b"", b"[]", b"null", b"{}", b"[" * 100_000, b'{"a":' * 50_000, b"\xff\xfe", b"1" * 6000, b'"x"')

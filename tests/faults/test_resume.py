@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 import semstab
 from semstab.cli import app
 from semstab.convert import convert
+from semstab.core.files import FolderLock
 from semstab.errors import ConfigError
-from semstab.outputs.recording import Recording
-from semstab.outputs.recording.target import is_whole
-from semstab.runtime.files import FolderLock
+from semstab.recording.observer import Recording
+from semstab.recording.target import is_whole
 
 
 @pytest.fixture
@@ -61,12 +61,12 @@ class FirstFrame:
 def test_a_conversion_killed_at_its_birth_goes_on(root, tmp_path, monkeypatch) -> None:
     config, out = configure(root, backbones=["a"]), tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr("semstab.convert.folder.write_json", stop)
+        patch.setattr("semstab.convert.write_json", stop)
         with pytest.raises(Killed):
             list(convert(config, out))
     (out / "wall" / ".semstab-ab12cd34.yaml").write_text("half")
     with monkeypatch.context() as patch:
-        patch.setattr("semstab.convert.folder.write_text", stop)
+        patch.setattr("semstab.convert.write_text", stop)
         with pytest.raises(Killed):
             list(convert(config, out))
     with pytest.raises(Killed):

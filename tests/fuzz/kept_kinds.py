@@ -15,12 +15,11 @@ from posed_config import configure
 
 import semstab
 from semstab.backbones import Backbone, Prediction
-from semstab.backbones.outside.class_list import class_names
+from semstab.backbones.names import class_names
 from semstab.comparison.writing import compare, load_comparison
 from semstab.conformance import case_folder, compared
 from semstab.datasets import open_dataset
-from semstab.datasets.surfaces.casting import View
-from semstab.datasets.surfaces.casts import Casts
+from semstab.datasets.files.surfaces import Casts, View
 from semstab.engine.tiling.portion import About, Finished
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
@@ -28,12 +27,12 @@ from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.recording import Recording
-from semstab.outputs.recording.entities import Clock
-from semstab.outputs.recording.series import send_rows
-from semstab.outputs.recording.target import is_whole
 from semstab.predict.filters import parse
-from semstab.predict.kept import Kept
+from semstab.predict.predictor import Kept
+from semstab.recording.entities import Clock
+from semstab.recording.observer import Recording
+from semstab.recording.series import send_rows
+from semstab.recording.target import is_whole
 from semstab.settings import load_config, resolve
 
 

@@ -23,36 +23,35 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
-from semstab.backbones.sam.heuristic import read_rules
-from semstab.backbones.segearth.prompts import read_prompts
+from semstab.backbones.sam import read_rules
+from semstab.backbones.segearth_ov import read_prompts
 from semstab.comparison.contrasts import contrasts
+from semstab.comparison.gate import gate_config, parse
 from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
 from semstab.comparison.pairing import pair
 from semstab.convert import convert
+from semstab.core.files import read_json
+from semstab.core.json_form import from_json
 from semstab.datasets import open_dataset
+from semstab.datasets.files.surfaces import Surface
 from semstab.datasets.formats.codecs import reads_exr
-from semstab.datasets.formats.colmap_depth import read_depth_map
-from semstab.datasets.formats.dense_depth import read_dmap, read_mvei
+from semstab.datasets.formats.dense_depth import read_depth_map, read_dmap, read_mvei
 from semstab.datasets.formats.images import color_size, read_color, read_depth, read_labels, read_mask, read_scores
 from semstab.datasets.scannet import read_class_table
-from semstab.datasets.surfaces.surface import Surface
 from semstab.engine import load_result
-from semstab.gating import gate_config
-from semstab.gating.rules import parse
+from semstab.exports import export
+from semstab.model.events import Events
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.georeference import Georeference, wkt
 from semstab.model.labels import LabelSpace
 from semstab.model.records import UnitContent
-from semstab.model.voxels import Events, VoxelTable
-from semstab.outputs.export import export
-from semstab.outputs.plots.maps import Overview
-from semstab.outputs.tables import tables
-from semstab.outputs.terminal.summary import print_summary
-from semstab.predict.disk.folder import PredictionFolder
-from semstab.runtime.files import read_json
-from semstab.runtime.json_form import from_json
+from semstab.model.voxels import VoxelTable
+from semstab.predict.folder import PredictionFolder
+from semstab.report.figures.maps import Overview
+from semstab.report.tables import tables
+from semstab.report.terminal import print_summary
 from semstab.settings import load_config, load_study
-from semstab.statistics.judging.commit import Commit
+from semstab.statistics.commit import Commit
 from semstab.statistics.looks import Looks
 from semstab.statistics.sampling.influence import InfluenceSums
 
@@ -133,7 +132,7 @@ def read_surface(path: Path, georeference: Georeference | None) -> None:
 
 
 def odm_view() -> Any:
-    from semstab.datasets.surfaces.casting import View
+    from semstab.datasets.files.surfaces import View
 
     return View(CAMERA, down.pose(0), SHAPE)
 

@@ -15,20 +15,20 @@ import pytest
 import yaml
 from image_files import npy_bytes, npz_bytes
 
-from semstab.backbones.outside.class_list import class_names
-from semstab.backbones.segearth.prompts import read_prompts
+from semstab.backbones.names import class_names
+from semstab.backbones.segearth_ov import read_prompts
+from semstab.core.files import parse_json
 from semstab.datasets import open_dataset
+from semstab.datasets.files.surfaces import Surface
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.las_files import opened
-from semstab.datasets.surfaces.surface import Surface
 from semstab.engine.tiling.sights import Sights
 from semstab.errors import ConfigError, DataError, one_line
+from semstab.exports.ply import Header
 from semstab.model.georeference import wkt
 from semstab.model.voxels import VoxelTable
-from semstab.outputs.export.ply import Header
-from semstab.outputs.loaded import read_series
-from semstab.outputs.plots.maps import Overview
-from semstab.runtime.files import parse_json
+from semstab.report.figures.maps import Overview
+from semstab.report.loaded import read_series
 from semstab.settings import load_config, resolve
 from semstab.statistics.looks import Looks
 from semstab.statistics.sampling import InfluenceSums

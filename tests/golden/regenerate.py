@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from semstab import backends
+from semstab.core.files import write_json, write_text
+from semstab.core.json_form import to_json
 from semstab.metrics import summarise
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.measures import measures
-from semstab.outputs.tables import tables, to_csv, to_latex, to_markdown
-from semstab.runtime.files import write_json, write_text
-from semstab.runtime.json_form import to_json
+from semstab.report.tables import tables
+from semstab.report.tables.table import to_csv, to_latex, to_markdown
 
 FILE = Path(__file__).parent / "small_map.json"
 K = 4

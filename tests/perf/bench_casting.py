@@ -23,10 +23,9 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from semstab.datasets.surfaces.casting import View
-from semstab.datasets.surfaces.surface import Surface
+from semstab.core.files import write_json
+from semstab.datasets.files.surfaces import Surface, View
 from semstab.model.frames import Intrinsics
-from semstab.runtime.files import write_json
 
 HEIGHT = 45.0
 

@@ -15,9 +15,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from semstab import Frame, Intrinsics
+from semstab.core.files import write_json
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, seen_in, sights_of
-from semstab.runtime.files import write_json
 
 ALTITUDE, FIELD_OF_VIEW, FAR, BESIDE, STEP = 60.0, np.radians(70), 250.0, 25.0, 12.0
 WIDTH, HEIGHT, TILE, CELL = 96, 72, 256, 16

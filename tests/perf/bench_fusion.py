@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Any
 
-from semstab.runtime.process import settle
+from semstab.core.process import settle
 
 settle()  # as the command line does, before anything starts threads
 
@@ -30,7 +30,7 @@ import open3d.core as o3c  # noqa: E402
 
 import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
-from semstab.runtime.files import write_json  # noqa: E402
+from semstab.core.files import write_json  # noqa: E402
 
 FRAMES = 3
 BASELINE = "Open3D integrate"

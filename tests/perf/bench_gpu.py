@@ -25,13 +25,11 @@ import torch
 
 import semstab
 from semstab import backends
-from semstab.backends.torch_map import TorchMap
-from semstab.backends.torch_parts.maps import TorchMaps
-from semstab.backends.torch_parts.storage import Columns
-from semstab.backends.torch_parts.views import TensorPrediction
+from semstab.backends.torch_map import TorchMap, TorchMaps
+from semstab.backends.torch_storage import Columns, TensorPrediction
+from semstab.core.files import write_json
 from semstab.metrics import compare
 from semstab.model.results import Unit
-from semstab.runtime.files import write_json
 
 VOXEL_SIZE, APART, WARM_UP, BACKBONES = 0.2, 200.0, 5, 3
 

@@ -28,12 +28,12 @@ from posed_writer import write_posed  # noqa: E402
 
 from semstab import Frame, Intrinsics  # noqa: E402
 from semstab.config import Config  # noqa: E402
+from semstab.core.files import write_json  # noqa: E402
+from semstab.core.process import resident_bytes  # noqa: E402
 from semstab.datasets import open_dataset  # noqa: E402
 from semstab.engine.tiling.sights import Looking  # noqa: E402
 from semstab.engine.units import make_plan  # noqa: E402
 from semstab.engine.work.jobs import Request  # noqa: E402
-from semstab.runtime.files import write_json  # noqa: E402
-from semstab.runtime.memory import resident_bytes  # noqa: E402
 
 WIDTH, HEIGHT, OWN, LEG = 16, 12, 50, 500
 

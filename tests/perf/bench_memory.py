@@ -23,11 +23,11 @@ import flight
 import numpy as np
 
 import semstab
+from semstab.core.files import write_json
 from semstab.engine.sizing import SHARE
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights
 from semstab.engine.work.memory import GB, Kind, Load, filled_of, voxels_of
-from semstab.runtime.files import write_json
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))

@@ -23,9 +23,9 @@ from bench_statistics import Watch, resident
 
 import semstab
 from semstab import backends
+from semstab.core.files import write_json
 from semstab.engine.work.finish import save_voxels
 from semstab.metrics import summarise
-from semstab.runtime.files import write_json
 
 VOXEL_SIZE, APART, VISITS = 0.2, 200.0, 15
 

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from statistics import median
 from typing import Any
 
-from semstab.runtime.process import settle
+from semstab.core.process import settle
 
 settle()  # as the command line does, before anything starts threads
 
@@ -31,10 +31,10 @@ import numpy.typing as npt  # noqa: E402
 
 import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
-from semstab.backends.shared.pixels.pixel_keys import frame_terms, keys_of_row  # noqa: E402
-from semstab.backends.shared.scores.vectors import LANES, scale_eight  # noqa: E402
-from semstab.runtime.compiled import parallel  # noqa: E402
-from semstab.runtime.files import write_json  # noqa: E402
+from semstab.backends.shared.pixel_keys import frame_terms, keys_of_row  # noqa: E402
+from semstab.backends.shared.score_loops import LANES, scale_eight  # noqa: E402
+from semstab.core.compiled import parallel  # noqa: E402
+from semstab.core.files import write_json  # noqa: E402
 
 VOXEL = 0.2
 

@@ -47,7 +47,7 @@ def write_scene(root: Path) -> None:
 
 UNTIL_FUSED = """
 import os, sys
-from semstab.runtime.process import settle
+from semstab.core.process import settle
 settle()
 from semstab import backends
 made = backends.create

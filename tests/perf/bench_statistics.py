@@ -29,11 +29,12 @@ import room
 
 from semstab import Frame, statistics
 from semstab.backends import create
+from semstab.core.files import write_json
+from semstab.core.process import settle
 from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
-from semstab.model.voxels import Events, VoxelTable
-from semstab.runtime.files import write_json
-from semstab.runtime.process import settle
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.fusion_rules import fuse_all
 

@@ -24,8 +24,8 @@ from typing import Any
 import flight
 import numpy as np
 
+from semstab.core.files import write_json
 from semstab.model.voxels import VoxelTable
-from semstab.runtime.files import write_json
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))

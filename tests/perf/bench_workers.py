@@ -27,8 +27,8 @@ from pathlib import Path
 import bench_tiles
 import numpy as np
 
+from semstab.core.files import write_json
 from semstab.model.voxels import VoxelTable
-from semstab.runtime.files import write_json
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 UNWATCHED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.cli import main
-from semstab.runtime.memory import resident_bytes
-from semstab.runtime.stopwatch import Stopwatch
+from semstab.core.process import Stopwatch, resident_bytes
 
 EVERY = 0.005
 """Seconds from one look at the memory to the next."""

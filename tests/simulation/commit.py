@@ -17,11 +17,11 @@ import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
 from semstab.comparison.opening import open_contender
-from semstab.metrics.matching import rows_of
+from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.commit import EVIDENCE, Commit, calibrate
 from semstab.statistics.correctness import Truth, join_truth
-from semstab.statistics.judging.commit import EVIDENCE, Commit, calibrate
 
 CLASSES = ("a", "b")
 

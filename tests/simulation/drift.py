@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from simulated_events import log_of
 
-from semstab.model.voxels import Events
+from semstab.model.events import Events
 from semstab.statistics import scene_drift, voxel_drift
 
 CASES = ((40, 20, 6), (40, 40, 6), (200, 80, 20), (200, 200, 10))

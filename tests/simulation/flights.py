@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.looks import Sample
 from semstab.statistics.sampling import InfluenceSums, influence_sums
 

@@ -16,8 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 from flights import Flight, World, fly, sums_of, world
 
-from semstab.gating.judging import Frames, change, negative, verdict
-from semstab.gating.rules import parse
+from semstab.comparison.gate import Frames, change, negative, parse, verdict
 from semstab.model.statistics import Interval
 from semstab.statistics.sampling import InfluenceSums
 from semstab.statistics.sampling.influence import FUNCTIONALS

@@ -15,10 +15,10 @@ import numpy as np
 from flights import Flight, fly, sample_of, table_of, world
 
 from semstab.model.statistics import Judged
-from semstab.statistics.judging.verdict import verdict
 from semstab.statistics.looks import reach_of
 from semstab.statistics.sampling import answers, influence_sums, judged_by, value
 from semstab.statistics.sampling.influence import FUNCTIONALS, columns_of
+from semstab.statistics.verdict import verdict
 
 BETTER = {"stable": ("stable", "partly stable"), "usable": ("stable", "partly stable", "usable")}
 """At each level, what says as much or more."""

@@ -9,18 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.runtime.array_files import read_arrays, write_arrays
+from semstab.core.files import read_arrays, write_arrays
+from semstab.core.types import Int32, Int64
 
 MOST_ROWS = 1 << 22
 """Pairs of frame and cell that are kept; where there are more, cells become twice as wide."""
 
 BUDGET, SHARE = 1 << 18, 1 << 29
 """Sampled voxels that are kept: one in eight at first, and half of them go whenever there are too many."""
-
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int64
 from semstab.engine.tiling.sights import Sights
-from semstab.model.voxels.extent import Extent
+from semstab.model.voxels import Extent
 
 ROOM = 4
 """A tile takes at most that part of what a task may take, where its size is not given."""
@@ -55,7 +55,7 @@ class Tiling:
     """
 
     tiles: Sights
-    weight: npt.NDArray[np.float64]
+    weight: Float64
     budget: float
     parts: tuple[Part, ...]
 
@@ -86,7 +86,7 @@ class Tiling:
         cut = _best_cut(self.tiles, rows, 2 * weight / weight.sum())
         return () if cut is None else tuple(_part(self.tiles, some) for some in cut.sides(self.tiles, rows))
 
-    def _rows(self, part: Part) -> npt.NDArray[np.int64]:
+    def _rows(self, part: Part) -> Int64:
         return np.flatnonzero(part.extent.holds(self.tiles.place.T * self.size))
 
 
@@ -118,7 +118,7 @@ def tile_size(sights: Sights, cost: Cost, budget: float) -> int:
     return size
 
 
-def _split(tiles: Sights, weight: npt.NDArray[np.float64], budget: float) -> Iterator[npt.NDArray[np.int64]]:
+def _split(tiles: Sights, weight: Float64, budget: float) -> Iterator[Int64]:
     """Rows of tiles by rectangle, each within the budget as far as there is something to cut."""
     waiting = [np.arange(len(tiles.place))]
     while waiting:
@@ -144,13 +144,13 @@ class _Cut:
     axis: int
     at: int
 
-    def sides(self, tiles: Sights, rows: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], ...]:
+    def sides(self, tiles: Sights, rows: Int64) -> tuple[Int64, ...]:
         """Rows of the tiles below, and of those above."""
         below = tiles.place[rows, self.axis] < self.at
         return rows[below], rows[~below]
 
 
-def _best_cut(tiles: Sights, rows: npt.NDArray[np.int64], weight: npt.NDArray[np.float64]) -> _Cut | None:
+def _best_cut(tiles: Sights, rows: Int64, weight: Float64) -> _Cut | None:
     """Where the rectangle of these tiles, whose weight is in parts, is cut; None where it is one tile."""
     place = tiles.place[rows]
     inside = ((tiles.cell >= place.min(axis=0)) & (tiles.cell <= place.max(axis=0))).all(axis=1)
@@ -170,7 +170,7 @@ def _best_cut(tiles: Sights, rows: npt.NDArray[np.int64], weight: npt.NDArray[np
     return min(found, default=None)
 
 
-def _part(tiles: Sights, rows: npt.NDArray[np.int64]) -> Part:
+def _part(tiles: Sights, rows: Int64) -> Part:
     place, (x, y, z) = tiles.place[rows], tiles.origin.tolist()
     low, high = place.min(axis=0), place.max(axis=0) + 1
     inside = ((tiles.cell >= low) & (tiles.cell < high)).all(axis=1)

@@ -11,17 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.files import parse_json, read_arrays, write_arrays
+from semstab.core.json_form import from_json, to_json
+from semstab.core.rows import Rows
+from semstab.core.types import Float64
 from semstab.engine.series import NUMBERS, Series
 from semstab.engine.tiling.partition import Part
 from semstab.engine.tiling.stretches import Stretch
 from semstab.model.records import FrameQuality
 from semstab.model.results import Agreement, SizeAlpha
-from semstab.runtime.array_files import read_arrays, write_arrays
-from semstab.runtime.files import parse_json
-from semstab.runtime.json_form import from_json, to_json
-from semstab.runtime.rows import Rows
 
 PORTIONS = "parts"
 """Folder of what is finished of units in tiles, unit by unit, until they are whole."""
@@ -37,8 +36,6 @@ SECONDS = ("association_seconds", "update_seconds")
 """Not known of a frame that no part fused."""
 
 MEANS = ("map_vss", "map_entropy", "map_recurrent")
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

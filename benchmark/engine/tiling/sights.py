@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.backends.shared.association import check_depth
-from semstab.backends.shared.pixels.keys import index_of_keys, out_of_reach
-from semstab.backends.shared.pixels.pixel_keys import frame_terms
+from semstab.backends.shared.keys import index_of_keys, out_of_reach
+from semstab.backends.shared.pixel_keys import frame_terms
+from semstab.core.files import read_arrays, write_arrays
+from semstab.core.prefetch import prefetch
+from semstab.core.types import Float64, Int32, Int64
 from semstab.engine.tiling.collected import SHARE, Collected, Seen
 from semstab.engine.tiling.look import LOST, NO_ROOM, look
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.pixels.perturbation import perturb
-from semstab.runtime.array_files import read_arrays, write_arrays
-from semstab.runtime.prefetch import prefetch
+from semstab.pixels.preparation import perturb
 from semstab.statistics.ranks import distinct_rows
 from semstab.task import Task
 
@@ -31,10 +31,6 @@ CELL = 64
 """Voxels along an edge of the cells that are told apart at first."""
 
 ALL = 1 << 32
-
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

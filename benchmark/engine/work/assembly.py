@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.rows import Rows
+from semstab.core.types import Float64
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import NUMBERS, Series
 from semstab.engine.tiling.again import Again, SeenAgain
@@ -28,7 +30,6 @@ from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
 from semstab.model.results import Agreement
 from semstab.model.statistics import Correlogram
 from semstab.model.voxels import VoxelTable
-from semstab.runtime.rows import Rows
 from semstab.statistics import Looks, Sample
 from semstab.statistics.description import concluded
 from semstab.statistics.looks.correlogram import correlogram
@@ -72,7 +73,7 @@ class Joined:
     sums: TableSums
     rows: Series
     image: Rows
-    reduced: npt.NDArray[np.float64] | None
+    reduced: Float64 | None
     up: tuple[float, float, float] | None
     files: Mapping[str, str]
 
@@ -222,9 +223,7 @@ def _checked(found: Sequence[Agreement | None]) -> Agreement | None:
     return together(there) if there and len(there) == len(found) else None
 
 
-def _up(
-    planned: PlannedUnit, tiles: Sequence[Path], voxels: int, poses: npt.NDArray[np.float64]
-) -> tuple[float, float, float] | None:
+def _up(planned: PlannedUnit, tiles: Sequence[Path], voxels: int, poses: Float64) -> tuple[float, float, float] | None:
     """The scene's up axis, said, or estimated from some voxels of each tile; None where neither works."""
     scene, step = planned.task.scene, -(-voxels // UP_VOXELS)
     try:
@@ -235,7 +234,7 @@ def _up(
     return x, y, z
 
 
-def _centers(tiles: Sequence[Path], voxel_size: float, step: int) -> npt.NDArray[np.float64]:
+def _centers(tiles: Sequence[Path], voxel_size: float, step: int) -> Float64:
     """(n, 3) of every n-th voxel, metres, in the order of a whole table."""
     found: list[Mapping[str, npt.NDArray[Any]]] = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in tiles]
     index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in found])

@@ -16,13 +16,12 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
+from semstab.core.prefetch import default_threads
+from semstab.core.process import available_bytes, follow_parent, settle
 from semstab.engine.observer import Observers
 from semstab.engine.work.jobs import Job, Outcome, failed
 from semstab.engine.work.passes import run_job
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.runtime.memory import available_bytes
-from semstab.runtime.prefetch import default_threads
-from semstab.runtime.process import follow_parent, settle
 
 CONNECT_SECONDS = 10
 MOMENT = 0.2

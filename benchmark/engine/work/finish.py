@@ -15,6 +15,9 @@ import numpy.typing as npt
 from semstab.backends import FusionBackend
 from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
 from semstab.config import Config
+from semstab.core.files import atomic_path
+from semstab.core.process import Stopwatch, give_back
+from semstab.core.types import Float64, Int64
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
@@ -27,10 +30,12 @@ from semstab.engine.work.stream import NoMap, Stream, UnitMap
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics import compare, summarise
-from semstab.metrics.matching import rows_of
+from semstab.metrics.agreement import rows_of
 from semstab.metrics.summary import TableSums
+from semstab.model.events import Events
 from semstab.model.frames import LeftOut
 from semstab.model.measures import dominant, mean, measures, vss
+from semstab.model.parquet import Tile, names_in
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import (
     RECURRENT,
@@ -44,11 +49,7 @@ from semstab.model.results import (
     slug,
 )
 from semstab.model.statistics import MapStatistics
-from semstab.model.voxels import Events, VoxelTable
-from semstab.model.voxels.parquet import Tile, names_in
-from semstab.runtime.files import atomic_path
-from semstab.runtime.process import give_back
-from semstab.runtime.stopwatch import Stopwatch
+from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, Sample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
 from semstab.statistics.correctness import join_truth
@@ -194,7 +195,7 @@ def _scores_left_out(rows: Series) -> LeftOut | None:
     return None if np.isnan(left_out).all() else LeftOut(mean(left_out), float(np.nanmax(most)))
 
 
-def reduced_sums(table: VoxelTable) -> npt.NDArray[np.float64]:
+def reduced_sums(table: VoxelTable) -> Float64:
     """What `reduced_of` is a function of: sums over voxels."""
     values, recurrent = vss(table), table.op >= RECURRENT
     means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
@@ -202,7 +203,7 @@ def reduced_sums(table: VoxelTable) -> npt.NDArray[np.float64]:
     return np.concatenate([means, np.atleast_1d(alpha)])
 
 
-def reduced_of(sums: npt.NDArray[np.float64]) -> ReducedScores:
+def reduced_of(sums: Float64) -> ReducedScores:
     """What soft scores come to as labels, from the sums of their map."""
     return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
 
@@ -296,20 +297,20 @@ def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part
     return savers
 
 
-def _save_tile(found: _Part, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+def _save_tile(found: _Part, voxels: Int64, tile: Tile, path: Path) -> None:
     columns = {name: values[voxels] for name, values in found.maps.items()}
     save_voxels(found.table.rows(voxels), path, columns, tile)
 
 
-def _save_truth(truth: VoxelTable, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+def _save_truth(truth: VoxelTable, voxels: Int64, tile: Tile, path: Path) -> None:
     truth.rows(voxels).save(path, tile=tile)
 
 
-def _save_events(events: Events, voxels: npt.NDArray[np.int64], tile: Tile, path: Path) -> None:
+def _save_events(events: Events, voxels: Int64, tile: Tile, path: Path) -> None:
     events.rows(voxels).save(path, tile)
 
 
-def tiles_of(table: VoxelTable, size: int, key: str) -> Iterator[tuple[Tile, npt.NDArray[np.int64]]]:
+def tiles_of(table: VoxelTable, size: int, key: str) -> Iterator[tuple[Tile, Int64]]:
     """The rows of a table by tile of that edge, of the map of that key."""
     shift = size.bit_length() - 1
     place = (table.ix >> shift).astype(np.int64) << 32
@@ -383,7 +384,7 @@ def _save_arrays(arrays: Mapping[str, Any], path: Path) -> None:
         np.savez_compressed(temporary, **named)
 
 
-def _up(scene: Scene, table: VoxelTable, poses: npt.NDArray[np.float64]) -> tuple[float, float, float] | None:
+def _up(scene: Scene, table: VoxelTable, poses: Float64) -> tuple[float, float, float] | None:
     """The scene's up axis, said or estimated; None where neither works."""
     try:
         up = estimate_up(table, poses) if scene.up is None else scene.up

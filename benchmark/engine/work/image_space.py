@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
+from semstab.core.rows import Rows
 from semstab.metrics import SelfConsistency, VideoConsistency, compensated_flicker
 from semstab.model.frames import Frame
 from semstab.model.measures import mean
 from semstab.model.records import ImageSpace
-from semstab.runtime.rows import Rows
 
 CLIPS = (8, 16)
 """Frames a clip, as VSPW reports."""

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from semstab.check.views import evenly
+from semstab.check.reprojection import evenly
 from semstab.config import Config, FrameSelection, as_range
+from semstab.core.files import TEMPORARY
 from semstab.engine.observer import Factory
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
@@ -20,8 +21,7 @@ from semstab.engine.work.image_space import CLIPS
 from semstab.engine.work.sizes import FRAMES
 from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
 from semstab.model.records import UnitContent
-from semstab.model.voxels.extent import Extent
-from semstab.runtime.files import TEMPORARY
+from semstab.model.voxels import Extent
 
 
 @dataclass(frozen=True)

@@ -5,34 +5,152 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from semstab.backends import FusionBackend, create, takes_option
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
+from semstab.core.prefetch import Fetched, prefetch
+from semstab.core.process import Stopwatch, available_bytes, resident_bytes
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
+from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import truth_task
 from semstab.engine.observer import Observer, Observers
 from semstab.engine.series import FrameRow
-from semstab.engine.work.finish import finish, finish_portion
-from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
-from semstab.engine.work.looking import look
-from semstab.engine.work.looking_again import looked_again
-from semstab.engine.work.regions import measure_regions
-from semstab.engine.work.room import Room
+from semstab.engine.tiling.again import Again, SeenAgain
+from semstab.engine.tiling.portion import PORTIONS
+from semstab.engine.tiling.sights import seen_by
+from semstab.engine.work.finish import Savers, finish, finish_portion, further_columns, save_voxels, written
+from semstab.engine.work.jobs import Job, Outcome, Request, failed, message, shared_marker
+from semstab.engine.work.memory import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, in_order, streams_of
 from semstab.errors import DataError
+from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.model.frames import Frame
-from semstab.model.voxels.extent import Extent
-from semstab.runtime.memory import available_bytes, resident_bytes
-from semstab.runtime.prefetch import Fetched, prefetch
-from semstab.runtime.stopwatch import Stopwatch
-from semstab.statistics import Sampler
-from semstab.task import Task, tasks_of
+from semstab.model.parquet import tile_of
+from semstab.model.records import TRUTH, VOXELS, RegionFlicker, UnitContent
+from semstab.model.voxels import Extent, VoxelTable
+from semstab.pixels.preparation import leave_out, perturb
+from semstab.pixels.warp import correspond
+from semstab.statistics import Sampler, Truth, join_truth
+from semstab.statistics.kinds import Kinds, spread
+from semstab.statistics.sums import SecondSums, second_look
+from semstab.task import Task, frame_indices, tasks_of
+
+# What a stretch of frames sees, found by a job.
+
+
+def look(job: Job, scene: Scene, request: Request) -> Outcome:
+    """Write what the frames see; raises what `seen_by` raises."""
+    assert request.looking is not None
+    (task,) = tasks_of(scene, request.config)
+    to, config = request.looking, request.config
+    seen = seen_by(task, config.voxel_size, config.pixel_stride, to.origin, to.cell, job.threads)
+    _, files = written(job, {to.file: seen.save})
+    return Outcome(request.identity, files=files)
+
+
+# The second look at the voxels of a part, taken by a job.
+
+
+def looked_again(job: Job, request: Request) -> Outcome:
+    """What was found; nothing where the folder is not to be seen from here, so that who sees it has to look."""
+    assert request.again is not None
+    shared = shared_marker(job.folder, job.start).exists()
+    found = look_again(request.again, job.folder) if shared else None
+    return Outcome(request.identity, portion=request.again.name, again=found)
+
+
+def look_again(again: Again, folder: Path) -> SeenAgain:
+    """Tile by tile."""
+    files, found = dict[str, str](), list[SecondSums]()
+    for name in again.tiles:
+        file, table = folder / name, VoxelTable.load(folder / name)
+        true = file.parents[1] / "truth" / file.name
+        truth = VoxelTable.load(true) if name.startswith(f"{PORTIONS}/") and true.exists() else None
+        kinds = Kinds.found(table, truth=_known(table, truth) if again.overall.true else None)
+        sums, more = second_look(kinds, again.overall, truth)
+        found.append(sums)
+        if again.written:
+            maps = VoxelTable.columns(file, further_columns(file))
+            columns, tile = {**maps, **spread(more, kinds.of), **again.overall.maps(table, maps)}, tile_of(file)
+            savers: Savers = {
+                f"{VOXELS}/{again.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
+            }
+            if truth is not None and again.true:
+                savers[f"{TRUTH}/{again.slug}/{file.name}"] = partial(truth.save, tile=tile)
+            for path, save in savers.items():
+                save(folder / path)
+                files[path] = file_digest(folder / path).hex()
+    return SeenAgain(SecondSums.merged(found), files)
+
+
+def _known(table: VoxelTable, truth: VoxelTable | None) -> Truth:
+    """The true classes of a tile; none where the ground truth saw nothing of it."""
+    if truth is None:
+        return Truth(np.zeros(len(table), np.bool_), np.full(len(table), -1, np.int64))
+    return join_truth(table, truth)
+
+
+# Flicker of label sources that hold regions without classes, as Segment Anything's proposals do; none is fused.
+
+
+def measure_regions(job: Job, scene: Scene, request: Request) -> Outcome:
+    """The outcome of a unit of regions: the means over its pairs of sampled frames."""
+    frames = _frames(job, scene, request)
+    rows = [_compared(previous, current) for previous, current in itertools.pairwise(frames)]
+    flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
+    found = RegionFlicker(job.scene, job.backbone, macro_mean(flicker), macro_mean(compensated), macro_mean(share))
+    digest = scene.digest(frame_indices(scene, request.config, [job.backbone]), job.backbone)
+    return Outcome(request.identity, UnitContent(digest, regions=found))
+
+
+def _frames(job: Job, scene: Scene, request: Request) -> Iterator[Frame]:
+    """The sampled frames with the regions' own ids."""
+    config = request.config
+
+    def decode(index: int) -> Frame:
+        frame = scene.frame(index, job.backbone, color=False)
+        if frame.labels is None:
+            raise DataError(f"{frame.where('scores')}: regions are label maps of ids, not scores")
+        frame = leave_out(frame, masks=config.exclude.masks)
+        if config.perturbation is not None:
+            frame = perturb(frame, config.perturbation, job.scene)
+        return frame.every(config.pixel_stride)
+
+    indices = frame_indices(scene, config, [job.backbone])
+    with contextlib.closing(prefetch(decode, indices, threads=job.threads, size=lambda frame: frame.nbytes)) as fetched:
+        for each in fetched:
+            yield each.item
+
+
+def _compared(previous: Frame, current: Frame) -> tuple[float, float, float]:
+    """Flicker, compensated flicker (percent), and the co-visible share of two successive frames."""
+    before, now = _labels(previous), _labels(current)
+    flicker = math.nan
+    if previous.shape == current.shape:
+        flicker = matched_region_flicker(before, now, previous.valid & current.valid).flicker_percent
+    seen = correspond(current, previous)
+    both = current.valid & seen.bring(previous.valid, fill=False)
+    compensated = matched_region_flicker(seen.bring(before), now, both).flicker_percent
+    valid = np.count_nonzero(current.valid)
+    return flicker, compensated, np.count_nonzero(both) / valid if valid else math.nan
+
+
+def _labels(frame: Frame) -> Any:
+    assert frame.labels is not None
+    return frame.labels
+
 
 logger = logging.getLogger("semstab")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.pixels.keys import HALF
-from semstab.backends.shared.pixels.pixel_keys import keys_of_row
-from semstab.runtime.compiled import serial
+from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.pixel_keys import keys_of_row
+from semstab.core.compiled import serial
 
 
 @serial

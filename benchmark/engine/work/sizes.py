@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.shared.pixels.keys import HALF
-from semstab.check.views import evenly
+from semstab.backends.shared.keys import HALF
+from semstab.check.reprojection import evenly
 from semstab.config import Config
+from semstab.core.types import Int64, Mask, UInt8
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.model.results import SizeAlpha
@@ -30,8 +31,6 @@ ALIGNED = round(FACTORS[-1] / FACTORS[0])
 
 PIXEL_BYTES = 80
 """Of a pixel: its voxel and label, and what putting them in order takes."""
-
-Int64 = npt.NDArray[np.int64]
 
 
 def sizes_bytes(first: Frame, frames: int, K: int, *, soft: bool) -> float:
@@ -67,7 +66,7 @@ class SizeMaps:
         self._keep(some.labels if some.scores is None else some.scores, here)
         self._keys.append(keys[here])
 
-    def _keep(self, said: Any, here: npt.NDArray[np.bool_]) -> None:
+    def _keep(self, said: Any, here: Mask) -> None:
         """Labels (n,) or scores (n, K) of pixels behind those that are there: once, as they may be most of memory."""
         n, kind = sum(map(len, self._keys)), np.uint16 if said.ndim == 2 else np.promote_types(said.dtype, np.float32)
         rows = said.astype(kind, copy=False)[here]  # compiled loops know no half precision
@@ -83,7 +82,7 @@ class SizeMaps:
 
     def _placed(self, frame: Frame) -> Int64:
         """Packed keys (H, W) of the smallest voxels that its pixels show, -1 where one is not valid."""
-        from semstab.backends.shared.pixels.pixel_keys import frame_terms
+        from semstab.backends.shared.pixel_keys import frame_terms
         from semstab.engine.work.size_loops import keys_of
 
         (H, W), camera, T_wc, size = frame.shape, frame.intrinsics, fixed(frame.T_wc), self._sizes[0]
@@ -107,7 +106,7 @@ class SizeMaps:
             SizeAlpha(size, len(self._frames), float(alpha_of(of))) for size, of in zip(self._sizes, sums, strict=True)
         )
 
-    def _sums(self, code: Int64, frame: npt.NDArray[np.uint8]) -> Iterator[Any]:
+    def _sums(self, code: Int64, frame: UInt8) -> Iterator[Any]:
         """(3 + K,) what alpha is a function of, of each map: its voxels are the codes without their last bits."""
         from semstab.engine.work.size_loops import runs, sums_of_labels, sums_of_scores
 

@@ -9,21 +9,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.backends import FusionBackend
 from semstab.backends.numpy_reference import NumpySample
+from semstab.core.process import Stopwatch
+from semstab.core.rows import Rows
+from semstab.core.types import Float64
 from semstab.engine.evaluation import truth_task
 from semstab.engine.series import Series
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
 from semstab.engine.work.sizes import SizeMaps
 from semstab.metrics import FrameJudge, flicker_percent
+from semstab.model.events import Events
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Events, VoxelTable
-from semstab.runtime.rows import Rows
-from semstab.runtime.stopwatch import Stopwatch
+from semstab.model.voxels import VoxelTable
 from semstab.statistics import Sampler
 from semstab.task import Task, prepare
 
@@ -133,7 +134,7 @@ class Stream:
         self.overview: dict[str, Any] = {}
 
     @property
-    def poses(self) -> npt.NDArray[np.float64]:
+    def poses(self) -> Float64:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
         return np.zeros((0, 3, 3)) if self._poses is None else some_poses(self._poses)
 
@@ -167,7 +168,7 @@ class Stream:
         return prepare(self.truth_task, decoded.truth, self.pixel_stride)
 
 
-def some_poses(rows: Rows) -> npt.NDArray[np.float64]:
+def some_poses(rows: Rows) -> Float64:
     """(F, 3, 3) of each row, or of every n-th where there are more than are needed to tell where up is."""
     return rows.table(step=max(1, -(-len(rows) // POSES))).reshape(-1, 3, 3)
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64, Mask
 from semstab.errors import DataError
 from semstab.model.voxels import VoxelTable
-
-Float64 = npt.NDArray[np.float64]
 
 PLANES = 4
 """Planes looked at, the largest first; the ground is one of them."""
@@ -89,7 +88,7 @@ def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
         rest = rest[~inlier]
 
 
-def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> Mask:
     """Which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
 
     Here and not by Open3D, as a run that fuses without it takes a second to load it.
@@ -102,7 +101,7 @@ def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -
     homogeneous = np.vstack([points.T, np.ones(len(points))]).astype(np.float32)
     within = [np.count_nonzero(np.abs(some @ homogeneous) <= distance, axis=1) for some in np.split(plane, CHUNKS)]
     best = plane[int(np.argmax(np.concatenate(within)))]
-    inlier: npt.NDArray[np.bool_] = np.abs(best @ homogeneous) <= distance
+    inlier: Mask = np.abs(best @ homogeneous) <= distance
     return inlier
 
 

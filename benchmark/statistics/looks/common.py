@@ -8,16 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int64
 from semstab.errors import DataError
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.model.voxels import Events
 from semstab.statistics.looks.entries import Looks
 from semstab.statistics.looks.views import Views
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

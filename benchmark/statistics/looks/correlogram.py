@@ -12,20 +12,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64, UInt16
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
-from semstab.model.voxels import Events
 from semstab.statistics.agreement import between_of
 from semstab.statistics.looks.entries import Sample
 from semstab.statistics.ranks import numbered
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_GROUPS
 from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
@@ -41,7 +38,7 @@ MOST_CUBES, MOST_SUMS = 160, 2**17
 class _Looks:
     """Looks (n,) by the entries of their evidence, with ||s||^2 of each."""
 
-    entries: tuple[Int64, npt.NDArray[np.uint16], Float64]
+    entries: tuple[Int64, UInt16, Float64]
     squares: Float64
 
     @classmethod
@@ -81,9 +78,9 @@ class _Cells:
     edge   of a cube in metres, step frames of a group
     """
 
-    at: npt.NDArray[np.int32]
+    at: Int32
     cube: Int64
-    frames: npt.NDArray[np.int32]
+    frames: Int32
     of: Int64
     edge: float
     step: int

@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core import arrays
+from semstab.core.files import atomic_path, parse_json
+from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt32
 from semstab.errors import DataError, one_line
-from semstab.metrics.matching import shared_observations
+from semstab.metrics.agreement import shared_observations
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.model.voxels import Events, index_columns
-from semstab.runtime import arrow
-from semstab.runtime.files import atomic_path, parse_json
+from semstab.model.voxels import index_columns
 from semstab.statistics.looks.keys import CELLS, DIGITS, Voxel, alike, cells_of, keys_of
 from semstab.statistics.looks.views import Views
 from semstab.statistics.ranks import ranked
@@ -35,9 +37,7 @@ COLUMNS = "key", "view", "label", "weight", "drawn"
 SCHEMA = 2
 OWN, TRUTH = "its own labels in finer cells", "the ground truth"
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Entries = tuple[Int64, npt.NDArray[np.int32], npt.NDArray[np.uint16], Float64]
+Entries = tuple[Int64, Int32, UInt16, Float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +80,10 @@ class Looks:
     """
 
     key: Int64
-    view: npt.NDArray[np.int32]
-    label: npt.NDArray[np.uint16]
+    view: Int32
+    label: UInt16
     weight: Float64
-    drawn: npt.NDArray[np.uint32]
+    drawn: UInt32
     low: Voxel
     views: Views
     voxel_size: float
@@ -155,10 +155,10 @@ class Looks:
     def _log(
         self,
         key: Int64,
-        view: npt.NDArray[np.int32],
-        label: npt.NDArray[np.uint16],
+        view: Int32,
+        label: UInt16,
         weight: Float64,
-        kept: npt.NDArray[np.bool_],
+        kept: Mask,
     ) -> Events:
         """The log of the kept ones of entries that are in order."""
         from semstab.statistics.looks.observing import look
@@ -187,7 +187,7 @@ class Looks:
         columns = dict(zip("xyz", self.cell.astype(np.int32).T, strict=True))
         columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
-        content = pa.table({name: arrow.column(values) for name, values in columns.items()})
+        content = pa.table({name: arrays.column(values) for name, values in columns.items()})
         text = f'{json.dumps({"schema": SCHEMA, "kind": "Looks", **about})[:-1]}, "views": {self.views.text()}}}'
         with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
             file.write_table(content)
@@ -207,7 +207,7 @@ class Looks:
                 raise DataError("of another kind, or of another version, which sampled other voxels: run it again")
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
-            x, y, z, view, label, weight, drawn = map(arrow.values_of, content.columns)
+            x, y, z, view, label, weight, drawn = map(arrays.values_of, content.columns)
             key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
             return cls(key, view, label, weight, drawn, low, views, **about)
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:

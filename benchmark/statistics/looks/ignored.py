@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from semstab.model.contrast import CommonLooks, Ignored
+from semstab.model.events import Events
 from semstab.model.measures import Quantity, mean
-from semstab.model.statistics.comparison import CommonLooks, Ignored
-from semstab.model.voxels import Events
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, alpha_between, psa
 from semstab.statistics.looks.common import common, decided, psa_bounds
 from semstab.statistics.looks.entries import Looks

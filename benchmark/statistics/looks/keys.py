@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Int64
 from semstab.errors import DataError
 
 CELLS = 4
@@ -24,7 +24,6 @@ WITHIN = 4, 2, 0
 """Where in a key the three voxel indices begin, and the three digits."""
 
 Voxel = tuple[int, int, int]
-Int64 = npt.NDArray[np.int64]
 
 
 def cells_of(key: Int64, low: Voxel) -> Int64:

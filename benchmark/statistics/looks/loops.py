@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.pixels.pixel_keys import in_voxels
-from semstab.runtime.compiled import serial
+from semstab.backends.shared.pixel_keys import in_voxels
+from semstab.core.compiled import serial
 from semstab.statistics.looks.keys import CELLS, DIGITS, SHIFTS, WITHIN
 
 FIRST, SECOND, THIRD = SHIFTS

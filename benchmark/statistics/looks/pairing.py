@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
 
 
 @serial

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-import numpy.typing as npt
-
+from semstab.core.types import Float64
 from semstab.model.statistics import ClassReach, Interval, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.looks.entries import Sample
@@ -55,7 +53,7 @@ def reach_by(sums: InfluenceSums, K: int) -> Iterator[Asked]:
 
 def reach_from(
     by: str,
-    places: npt.NDArray[np.float64],
+    places: Float64,
     sums: InfluenceSums,
     found: Sequence[Interval],
     *,

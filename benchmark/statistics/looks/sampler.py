@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.rows import Rows
+from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.runtime.rows import Rows
 from semstab.statistics.looks.entries import Looks, Sample
 from semstab.statistics.looks.keys import SPAN, Voxel
 from semstab.statistics.looks.views import VIEW, Views
@@ -38,10 +39,7 @@ REACH = SPAN // 2
 TYPES = np.int64, np.int32, np.uint16, np.float64, np.uint32
 """Of the columns of entries."""
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt32 = npt.NDArray[np.uint32]
-Entries = tuple[Int64, npt.NDArray[np.uint16], Float64, UInt32]
+Entries = tuple[Int64, UInt16, Float64, UInt32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +48,8 @@ class Pixels:
 
     cell: Int64
     drawn: UInt32
-    label: npt.NDArray[np.uint16]
-    pixel: npt.NDArray[np.int32]
+    label: UInt16
+    pixel: Int32
 
     def grouped(self, *, numbered: bool) -> tuple[int, Int64, Float64]:
         """Move each cell and label to the front, once; how many they are, which of them each pixel is, their pixels.

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from semstab.core.types import Float64, Int64
 
 VIEW = 5
 """Numbers of a view: frame, centre, time stamp."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from semstab.backends.shared.prefetch import touch
-from semstab.runtime.compiled import serial
+from semstab.backends.shared.pixel_keys import touch
+from semstab.core.compiled import serial
 
 LINE = 64
 """Bytes that come into the cache together."""

@@ -10,14 +10,12 @@ import functools
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.runtime.compiled import compiled, serial
+from semstab.core.compiled import compiled, serial
+from semstab.core.types import Int64
 from semstab.statistics.loops.asking import ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.logarithm import EIGHT, add_plogp
-
-Int64 = npt.NDArray[np.int64]
 
 ENUMERATED = 5
 """Up to this OP all T! orders are gone through; 5! = 120."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.hashing import mix
-from semstab.backends.shared.prefetch import touch
-from semstab.runtime.compiled import serial
+from semstab.backends.shared.keys import mix
+from semstab.backends.shared.pixel_keys import touch
+from semstab.core.compiled import serial
 
 FACTORS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1342543DE82EF95), np.uint64(0xAEF17502108EF2D9))
 """Odd numbers without a pattern."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
 from semstab.statistics.loops.chunks import CHUNKS
 
 

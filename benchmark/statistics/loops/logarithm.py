@@ -9,10 +9,10 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from semstab.backends.shared.bits import bits_of
-from semstab.backends.shared.scores.logarithm import plogp_of
-from semstab.backends.shared.scores.vectors import DOUBLES, LANES, spread
-from semstab.runtime.compiled import serial
+from semstab.backends.shared.beliefs import plogp_of
+from semstab.backends.shared.pixel_keys import bits_of
+from semstab.backends.shared.score_loops import DOUBLES, LANES, spread
+from semstab.core.compiled import serial
 
 MANTISSA_BITS = 52
 ROUNDER = 1.5 * 2.0**MANTISSA_BITS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.backends.shared.beliefs import js_term
-from semstab.runtime.compiled import serial
+from semstab.core.compiled import serial
 from semstab.statistics.loops.chunks import CHUNKS
 
 LONGEST_TABLE = 256

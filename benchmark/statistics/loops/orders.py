@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.hashing import mix
-from semstab.runtime.compiled import compiled, serial
+from semstab.backends.shared.keys import mix
+from semstab.core.compiled import compiled, serial
 from semstab.statistics.loops.asking import SOON, ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.few_looks import ROUNDING

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.hashing import mix
-from semstab.backends.shared.prefetch import touch
-from semstab.runtime.compiled import serial
+from semstab.backends.shared.keys import mix
+from semstab.backends.shared.pixel_keys import touch
+from semstab.core.compiled import serial
 from semstab.statistics.loops.kinds import AT_ONCE, FACTORS, FIRST_ROOM, hashed_with, number_block
 
 

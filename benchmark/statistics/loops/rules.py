@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.runtime.compiled import compiled, serial
+from semstab.core.compiled import compiled, serial
 from semstab.statistics.loops.asking import ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.logarithm import EIGHT, add_plogp, exp2_fast

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt64
 from semstab.errors import ConfigError
 from semstab.model.evidence import stretches
 from semstab.model.measures import Quantity, sbd
@@ -20,9 +20,6 @@ from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
 from semstab.statistics.observed import Log, Observed
 from semstab.statistics.ranks import ranked
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
@@ -172,13 +169,13 @@ class _Orders:
     seed      of the orders that voxels of the same OP go through
     """
 
-    vary: npt.NDArray[np.bool_]
+    vary: Mask
     variation: Float64
     first: Int64
     T: Int64
-    log: tuple[Int64, npt.NDArray[np.uint16], Float64]
+    log: tuple[Int64, UInt16, Float64]
     K: int
-    streams: npt.NDArray[np.uint64]
+    streams: UInt64
     seed: np.uint64
 
     @classmethod
@@ -191,11 +188,11 @@ class _Orders:
         return cls(vary, spread, events.starts[vary], T, events.evidence.entries, table.K, own, base)
 
     @property
-    def many(self) -> npt.NDArray[np.bool_]:
+    def many(self) -> Mask:
         """(n,) whether there are too many orders to go through all of them."""
         from semstab.statistics.loops.few_looks import ENUMERATED
 
-        above: npt.NDArray[np.bool_] = self.T > ENUMERATED
+        above: Mask = self.T > ENUMERATED
         return above
 
     def part(self, which: Int64) -> _Orders:
@@ -207,9 +204,7 @@ class _Orders:
         many = np.flatnonzero(self.many)
         return many[lowest(self.streams[many], count)]
 
-    def measure(
-        self, known: npt.NDArray[np.bool_], draws: int, most: int, enough: int
-    ) -> tuple[Float64, Float64, Float64]:
+    def measure(self, known: Mask, draws: int, most: int, enough: int) -> tuple[Float64, Float64, Float64]:
         """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
         from semstab.statistics.loops import chunks, few_looks, orders
 
@@ -248,7 +243,7 @@ class _Orders:
         )
 
 
-def drawn(table: VoxelTable, vary: npt.NDArray[np.bool_], observations: int, seed: int = 0) -> Int64:
+def drawn(table: VoxelTable, vary: Mask, observations: int, seed: int = 0) -> Int64:
     """The rows (r,) of the voxels whose orders stand for all: those of the lowest hashes whose observations `vary`.
 
     They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
@@ -266,7 +261,7 @@ def drawn(table: VoxelTable, vary: npt.NDArray[np.bool_], observations: int, see
     return rows[np.union1d(enough, many[lowest(own[many], DRIFT_SAMPLE)])]
 
 
-def lowest(numbers: npt.NDArray[np.uint64], count: int) -> Int64:
+def lowest(numbers: UInt64, count: int) -> Int64:
     """Which of numbers (n,) are the lowest so many, ascending."""
     few = np.argpartition(numbers, count)[:count] if count < len(numbers) else np.arange(len(numbers))
     return few[np.argsort(numbers[few])]
@@ -287,7 +282,7 @@ def flips(events: Log) -> Flips:
     return flips_of(events, *changes(events))
 
 
-def changes(events: Log) -> tuple[Float64, Float64, npt.NDArray[np.int32]]:
+def changes(events: Log) -> tuple[Float64, Float64, Int32]:
     """Of `flips` what does not hang on frames: rate and null (n,), and how many looks (n,) follow the last change."""
     from semstab.statistics.loops import chunks, log_kernels
 
@@ -297,7 +292,7 @@ def changes(events: Log) -> tuple[Float64, Float64, npt.NDArray[np.int32]]:
     return rate, null, since
 
 
-def flips_of(events: Log, rate: Float64, null: Float64, since: npt.NDArray[np.int32]) -> Flips:
+def flips_of(events: Log, rate: Float64, null: Float64, since: Int32) -> Flips:
     """Those of a log, from its `changes`."""
     from semstab.statistics.loops import log_kernels
 
@@ -313,18 +308,18 @@ def variation(table: VoxelTable) -> Float64:
     return np.maximum(spread, 0.0, out=spread)
 
 
-def varying(table: VoxelTable, events: Log) -> tuple[npt.NDArray[np.bool_], Int64, Int64]:
+def varying(table: VoxelTable, events: Log) -> tuple[Mask, Int64, Int64]:
     """The voxels (n,) whose observations differ, with their first rows and OP; the others cannot drift."""
     vary = _vary(table, variation(table))
     return vary, events.starts[vary], table.op[vary].astype(np.int64)
 
 
-def _vary(table: VoxelTable, spread: Float64) -> npt.NDArray[np.bool_]:
-    vary: npt.NDArray[np.bool_] = spread > ONE_HOT * table.op
+def _vary(table: VoxelTable, spread: Float64) -> Mask:
+    vary: Mask = spread > ONE_HOT * table.op
     return vary
 
 
-def streams(table: VoxelTable, rows: Any, seed: int) -> npt.NDArray[np.uint64]:
+def streams(table: VoxelTable, rows: Any, seed: int) -> UInt64:
     """A random number (r,) of each of some voxels that depends on its index and the seed only."""
     from semstab.statistics.loops import orders
 
@@ -340,7 +335,7 @@ def _log_factorials(count: int) -> Float64:
     return logs
 
 
-def _spread_out(values: Float64, where: npt.NDArray[np.bool_]) -> Float64:
+def _spread_out(values: Float64, where: Mask) -> Float64:
     """The values at the voxels that they belong to, NaN elsewhere."""
     out = np.full(len(where), np.nan)
     out[where] = values

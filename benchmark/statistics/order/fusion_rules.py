@@ -6,18 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64, UInt16
 from semstab.errors import ConfigError
-from semstab.model.concentration import Concentration
+from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.model.voxels import Events
+from semstab.model.information import Concentration
 from semstab.statistics.agreement import ONE_HOT
 from semstab.statistics.observed import Log
 from semstab.statistics.ranks import ranked
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 RULES = ("averaging", "majority", "product", "geometric")
 """The paper's mean of evidence; the share of frames that vote for a class; Bayes' product of the frames' evidence under
@@ -34,9 +31,7 @@ class Belief(Evidence):
     rest: Float64
 
     @classmethod
-    def with_bits(
-        cls, first: Int64, label: npt.NDArray[np.uint16], weight: Float64, K: int, rest: Float64, bits: Float64
-    ) -> Belief:
+    def with_bits(cls, first: Int64, label: UInt16, weight: Float64, K: int, rest: Float64, bits: Float64) -> Belief:
         """Where the entropy (n,) of each is known."""
         known = Concentration.of(first, label, weight, K, rest, bits)
         return cls(first, label, weight, K, rest, known=known)
@@ -63,7 +58,7 @@ class Fused:
     """
 
     evidence: Belief
-    op: npt.NDArray[np.int32]
+    op: Int32
     drift_sum: Float64
 
     @property
@@ -119,7 +114,7 @@ def fuse_all(
     ]
 
 
-def classes_seen(events: Log) -> tuple[Int64, npt.NDArray[np.uint16]]:
+def classes_seen(events: Log) -> tuple[Int64, UInt16]:
     """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops
@@ -133,7 +128,7 @@ def classes_seen(events: Log) -> tuple[Int64, npt.NDArray[np.uint16]]:
     return first, label
 
 
-def labels(evidence: Float64 | Evidence) -> npt.NDArray[np.int64]:
+def labels(evidence: Float64 | Evidence) -> Int64:
     """Class (n,) of the largest belief of evidence (n, K), the lowest of those that tie: rounding decides none."""
     from semstab.statistics.loops.rows import label_near
 

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from semstab.core.types import Float64, Int64
 
 ROUNDED = 12
 """Bits of p-values that are kept: so few different ones are told apart that they can be counted."""

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from semstab.core.types import Float64, Int64
 
 REACHES = (0.4, 0.5, 0.6, 0.75, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """How far errors may reach, in cells, besides not at all."""

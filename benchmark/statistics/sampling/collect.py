@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.concentration import by_group
+from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.model.events import Events
+from semstab.model.information import by_group
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa
 from semstab.statistics.observed import Log
 from semstab.statistics.ranks import SPARSE, distinct, ranked
@@ -20,9 +22,6 @@ from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
 from semstab.statistics.sampling.places import Places
 from semstab.statistics.steady import steady
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 
 def influence_sums(
@@ -166,7 +165,7 @@ class FrameGroups:
 
     step: int
     groups: Int64
-    of: tuple[Int64, npt.NDArray[np.int32]]
+    of: tuple[Int64, Int32]
 
     @classmethod
     def of_log(cls, events: Log) -> FrameGroups:
@@ -267,7 +266,7 @@ def _with_truth(
         "stable": stable, "stable_wrong": stable * ~right,
     }  # fmt: skip
 
-    def by_class(which: Int64, where: npt.NDArray[np.bool_]) -> Float64:
+    def by_class(which: Int64, where: Mask) -> Float64:
         group = places.at[where] * table.K + which[where]
         count = np.zeros(places.count * table.K)
         np.add.at(count, group, table.voxels[where])

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.metrics.matching import voxel_keys
+from semstab.core.types import Int32, Mask
+from semstab.metrics.agreement import voxel_keys
 from semstab.statistics.sampling.influence import MOST_CELLS
-
-Int32 = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 
 FEW_RUNS = 1 << 12
 """Voxels that follow each other in a map are mostly in one cube: there is room for so many runs at first."""

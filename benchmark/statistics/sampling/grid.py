@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int64
 from semstab.model.statistics import THIS_MAP, Question
 from semstab.statistics.blocks import gradient_of
 from semstab.statistics.sampling.arrangement import Cells, arranged
 from semstab.statistics.sampling.influence import Statistic
 from semstab.statistics.sampling.reach import Errors, Spread, one_thread, spreads
 from semstab.statistics.sampling.where import Where
-
-Float64 = npt.NDArray[np.float64]
 
 TINY = 1e-12
 """A variance below is none."""
@@ -35,8 +33,8 @@ class Grid:
     one_off  what the number falls by where all that counts was not as the first sum has it, but the opposite
     """
 
-    places: npt.NDArray[np.int64]
-    frames: npt.NDArray[np.int64]
+    places: Int64
+    frames: Int64
     block: Float64
     cell: Float64
     size: Float64

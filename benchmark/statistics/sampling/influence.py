@@ -17,17 +17,16 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core import arrays as arrow
+from semstab.core.files import atomic_path, parse_json
+from semstab.core.json_form import from_json
+from semstab.core.types import Float64, Int32, Int64
 from semstab.errors import DataError, one_line
-from semstab.runtime import arrow
-from semstab.runtime.files import atomic_path, parse_json
-from semstab.runtime.json_form import from_json
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
 from semstab.statistics.ranks import distinct_rows
 from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
 from semstab.statistics.sampling.where import Where
 
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
@@ -220,9 +219,9 @@ class About:
             raise DataError(f"groups of {self.step} frames, which is no power of 2 up to {MOST_STEP}")
 
 
-def _joined(index: Int32, times: float) -> npt.NDArray[np.int64]:
+def _joined(index: Int32, times: float) -> Int64:
     """Which cubes, or groups of frames, these are where so many are one; -1 of frames stays."""
-    wide: npt.NDArray[np.int64] = index.astype(np.int64) // round(min(times, 2.0**40))
+    wide: Int64 = index.astype(np.int64) // round(min(times, 2.0**40))
     return wide
 
 

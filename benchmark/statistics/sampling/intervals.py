@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Judged, Question
 from semstab.statistics.blocks import LEVEL
 from semstab.statistics.sampling.grid import TINY, Grid, TwoWay, apart, influences, two_way
@@ -25,8 +26,6 @@ from semstab.statistics.sampling.influence import (
     value,
 )
 from semstab.statistics.sampling.where import Where
-
-Float64 = npt.NDArray[np.float64]
 
 LEAST_FRAMES = 30
 """Of fewer frames nothing is said about the next flight: a kind of bad frame, one in ten, is missed by one flight of 20

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
+from semstab.core.types import Float64
 
 MOST_CLASSES = 64
 """Sums by class are kept up to so many classes."""

@@ -9,13 +9,12 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64
 from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.blocks import LEVEL
 from semstab.statistics.sampling.influence import MOST_GROUPS, InfluenceSums
 from semstab.statistics.sampling.intervals import LEAST_FRAMES, TOO_FEW, none, of_places
-
-Float64 = npt.NDArray[np.float64]
 
 LASTS = "what frames are like lasts as long as the flight: fly more"
 

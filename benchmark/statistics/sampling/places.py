@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.model.concentration import by_group
+from semstab.core.types import Float64, Int32, Mask
+from semstab.model.events import Events
+from semstab.model.information import by_group
 from semstab.model.statistics import Interval
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_CELLS, Scale, Statistic
 from semstab.statistics.sampling.intervals import Asked, answers, asked_of_places
 from semstab.statistics.sampling.where import Where
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +32,13 @@ class Places:
     voxels  (n,) how many voxels each stands for, None for one each
     """
 
-    cell: npt.NDArray[np.int32]
-    at: npt.NDArray[np.int32]
+    cell: Int32
+    at: Int32
     edge: float
     voxels: Float64 | None = None
 
     @classmethod
-    def of(cls, table: VoxelTable, edge: float | None = None, *, where: npt.NDArray[np.bool_] | None = None) -> Places:
+    def of(cls, table: VoxelTable, edge: float | None = None, *, where: Mask | None = None) -> Places:
         """Of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
 
         There are at most MOST_CELLS cubes, unless their edge is given, in metres.
@@ -118,7 +118,7 @@ class PlaceSums:
     sums  (G, C) of each name
     """
 
-    cell: npt.NDArray[np.int32]
+    cell: Int32
     edge: float
     sums: Mapping[str, Float64]
 
@@ -173,7 +173,7 @@ class PlaceSums:
         return cls._summed(cells, parts[0].edge, joined)
 
     @classmethod
-    def _summed(cls, cells: npt.NDArray[np.int32], edge: float, rows: Mapping[str, Float64]) -> PlaceSums:
+    def _summed(cls, cells: Int32, edge: float, rows: Mapping[str, Float64]) -> PlaceSums:
         distinct, of = np.unique(cells, axis=0, return_inverse=True)
         sums = {name: np.zeros((len(distinct), own.shape[1])) for name, own in rows.items()}
         for name, own in rows.items():

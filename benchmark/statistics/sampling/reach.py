@@ -14,13 +14,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
+from semstab.core.types import Float64
 from semstab.statistics.sampling.arrangement import GROWTH, REACHES, Arrangement, Cells
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 DOUBT = 4.0
 """By how much the log likelihood must be better for a share of a cell's variance that it has for itself: a weak

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64
+from semstab.model.events import Events
 from semstab.model.statistics import RuleOutcome
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.correctness import rule_means_of
 from semstab.statistics.kinds import Kinds
@@ -21,7 +22,6 @@ from semstab.statistics.patterns import Patterns
 from semstab.statistics.sampling import Places, PlaceSums
 from semstab.statistics.scene_drift import OrderTest, order_test, sampled
 
-Float64 = npt.NDArray[np.float64]
 FALSE_DISCOVERIES = 0.05
 """Rate at which voxels are named that trend, or drift unusually."""
 

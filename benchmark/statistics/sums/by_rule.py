@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64
 from semstab.model.evidence import stretches
 from semstab.model.measures import Voxels
 from semstab.statistics.correctness import rule_sums
@@ -14,9 +15,6 @@ from semstab.statistics.kinds import Kinds
 from semstab.statistics.order import fusion_rules
 from semstab.statistics.patterns import judged_alike
 from semstab.statistics.ranks import ordered
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 TOGETHER = 1 << 15
 """Patterns whose beliefs are held at once."""
@@ -43,7 +41,7 @@ def sums_by_rule(kinds: Kinds) -> Float64:
     return total
 
 
-def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, npt.NDArray[np.int32]]]:
+def _some_patterns(kinds: Kinds) -> Iterator[tuple[Int64, Int64, Int32]]:
     """Some patterns (p,) with OP >= 2 after the others, the rows (n,) of the voxels that have one, and which (n,)."""
     of, again = kinds.patterns.of, kinds.patterns.table.op >= 2
     seen, rows = np.flatnonzero(again), np.flatnonzero(kinds.one.table.op >= 2)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.arrays import from_arrays, to_arrays
+from semstab.core.types import Float64
 from semstab.metrics.summary import STRATA
 from semstab.model.voxels import VoxelTable
-from semstab.runtime.array_form import from_arrays, to_arrays
 from semstab.statistics.blocks import Occupied
 from semstab.statistics.correctness import Judged, judged_strata, judged_where
-from semstab.statistics.judging.ceiling import repeated
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps, MapSums
 from semstab.statistics.observed import Log
@@ -26,8 +26,7 @@ from semstab.statistics.steady import Votes
 from semstab.statistics.sums.by_log import LogSums, log_maps
 from semstab.statistics.sums.by_rule import sums_by_rule
 from semstab.statistics.sums.stable_looks import StableLooks
-
-Float64 = npt.NDArray[np.float64]
+from semstab.statistics.verdict import repeated
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.metrics.matching import shared_rows
+from semstab.core.types import Float64, Int64
+from semstab.metrics.agreement import shared_rows
 from semstab.model.statistics import DriftTests, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import quadrant_sums, wrong_of_steady
-from semstab.statistics.judging.ceiling import loss_sums
-from semstab.statistics.judging.flipping import FlippingSums
+from semstab.statistics.flipping import FlippingSums
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.map_sums import Maps
 from semstab.statistics.order.drift import TESTABLE
@@ -23,9 +22,7 @@ from semstab.statistics.sampling import InfluenceSums, Places, PlaceSums
 from semstab.statistics.steady import Votes, steady
 from semstab.statistics.sums.by_log import FALSE_DISCOVERIES
 from semstab.statistics.sums.first import FirstSums
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from semstab.statistics.verdict import loss_sums
 
 
 @dataclass(frozen=True, eq=False)

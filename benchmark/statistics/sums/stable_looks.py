@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64, Int32, Int64
 from semstab.model.results import RECURRENT
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.observed import Log
@@ -16,9 +16,6 @@ from semstab.statistics.ranks import distinct_rows, numbered
 from semstab.statistics.sampling.collect import FrameGroups
 from semstab.statistics.sampling.influence import InfluenceSums
 from semstab.statistics.sampling.layout import layout, width
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 AT_ONCE = 1 << 21
 """Sums that are made together."""
@@ -37,7 +34,7 @@ class StableLooks:
     edge, step  of cubes and groups, as in `InfluenceSums`
     """
 
-    key: npt.NDArray[np.int32]
+    key: Int32
     weight: Float64
     edge: float
     step: int
@@ -97,9 +94,7 @@ class StableLooks:
         ).coarsened(sums.edge, sums.step)
 
 
-def _by_frame(
-    log: Log, kind: npt.NDArray[np.int32], copies: Float64 | None, kinds: int, groups: FrameGroups
-) -> tuple[Int64, Float64]:
+def _by_frame(log: Log, kind: Int32, copies: Float64 | None, kinds: int, groups: FrameGroups) -> tuple[Int64, Float64]:
     """What kinds (n,) of voxels, -1 is none, which groups of frames saw: kind * groups + group, and how many.
 
     A row stands for `copies` (n,) of voxels, for one where these are not given, of which each counts
@@ -119,6 +114,6 @@ def _by_frame(
     return np.concatenate(keys), np.concatenate(weights)
 
 
-def _distinct(key: npt.NDArray[np.int32], weight: Float64) -> tuple[npt.NDArray[np.int32], Float64]:
+def _distinct(key: Int32, weight: Float64) -> tuple[Int32, Float64]:
     rows, of = distinct_rows(key)
     return rows.astype(np.int32), np.bincount(of, weights=weight, minlength=len(rows)).astype(np.float64)

@@ -7,30 +7,22 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from semstab.core.types import Float64
 from semstab.errors import ConfigError
-from semstab.metrics.matching import require_same_grid, require_same_map, shared_rows
+from semstab.metrics.agreement import require_same_grid, require_same_map, shared_rows
+from semstab.model.contrast import BackboneComparison, Paired, RuleComparison, Standardised
+from semstab.model.events import Events
 from semstab.model.measures import Measure, Quantity, measures
 from semstab.model.statistics import Estimate, RuleMeans
-from semstab.model.statistics.comparison import BackboneComparison, Paired, RuleComparison, Standardised
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means_of, rule_sums
 from semstab.statistics.looks import Looks
 from semstab.statistics.looks.common import decided
 from semstab.statistics.looks.ignored import Shared, common_looks
 from semstab.statistics.order import fusion_rules
 from semstab.statistics.versus.comparison import coverage_of, held, paired, repeated_rows
-from semstab.statistics.versus.standard import (
-    EDGES,
-    Observed,
-    Tables,
-    standardised_of,
-    stratum_sums,
-    voxelwise,
-)
-
-Float64 = npt.NDArray[np.float64]
+from semstab.statistics.versus.standard import EDGES, Observed, Tables, standardised_of, stratum_sums, voxelwise
 
 SCHEMA = 1
 

@@ -6,35 +6,20 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.metrics.matching import shared_rows
+from semstab.core.types import Float64, Int64
+from semstab.metrics.agreement import shared_rows
+from semstab.model.contrast import MapCoverage, Paired, Rank, Ranking
+from semstab.model.events import Events
 from semstab.model.measures import Quantity, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNDEFINED, Estimate
-from semstab.model.statistics.comparison import MapCoverage, Paired, Rank, Ranking
-from semstab.model.voxels import Events, VoxelTable
-from semstab.statistics.agreement import (
-    ALPHA,
-    ALPHA_BETWEEN,
-    PSA,
-    alpha_columns,
-    alpha_of,
-    between_of,
-    ratio_of,
-)
-from semstab.statistics.blocks import (
-    LEAST_BLOCKS,
-    REPLICATES,
-    BlockBootstrap,
-    Statistic,
-    spatial_blocks,
-)
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, alpha_columns, alpha_of, between_of, ratio_of
+from semstab.statistics.blocks import LEAST_BLOCKS, REPLICATES, BlockBootstrap, Statistic, spatial_blocks
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.versus.differences import OnCommonPlaces, differences
 from semstab.statistics.versus.standard import Tables, voxelwise
-
-Float64 = npt.NDArray[np.float64]
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
@@ -42,7 +27,7 @@ def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
     return coverage_of(tuple(tables), [held(tables)])
 
 
-def held(tables: Tables) -> npt.NDArray[np.int64]:
+def held(tables: Tables) -> Int64:
     """(M, 6) of each map, or of its part in one place: voxels, observations, repeated and recurrent voxels, common to
     all, in no other."""
     common = len(shared_rows(*tables.values())[0])
@@ -56,7 +41,7 @@ def held(tables: Tables) -> npt.NDArray[np.int64]:
     return np.array(rows, dtype=np.int64)
 
 
-def coverage_of(names: Sequence[str], parts: Sequence[npt.NDArray[np.int64]]) -> tuple[MapCoverage, ...]:
+def coverage_of(names: Sequence[str], parts: Sequence[Int64]) -> tuple[MapCoverage, ...]:
     """Coverage of the maps by what their parts have, see `held`."""
     return tuple(
         MapCoverage(
@@ -84,7 +69,7 @@ def compared(*, truth: bool) -> tuple[Quantity, ...]:
 # --- On the same places -----------------------------------------------------------------------------------------------
 
 
-def repeated_rows(tables: Tables) -> list[npt.NDArray[np.int64]]:
+def repeated_rows(tables: Tables) -> list[Int64]:
     """Rows of the voxels that every map saw twice or more, one array a map, in the same order of voxels."""
     rows = shared_rows(*tables.values())
     again = np.all([table.op[r] >= 2 for table, r in zip(tables.values(), rows, strict=True)], axis=0)
@@ -128,7 +113,7 @@ def paired(
 
 
 def _columns(
-    tables: Tables, rows: Sequence[npt.NDArray[np.int64]], truth: VoxelTable | None, whole: Tables
+    tables: Tables, rows: Sequence[Int64], truth: VoxelTable | None, whole: Tables
 ) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
     """By measure: each backbone's columns on the common voxels, and what makes the measure of their sums."""
     quantities = compared(truth=truth is not None)

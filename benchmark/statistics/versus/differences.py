@@ -11,20 +11,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.metrics.matching import observations, rows_of
+from semstab.core.types import Float64, Int64
+from semstab.metrics.agreement import observations, rows_of
+from semstab.model.contrast import BackboneComparison, PairedDifference
+from semstab.model.events import Events
 from semstab.model.measures import ENTROPY, Quantity
 from semstab.model.statistics import UNKNOWN, Estimate, Interval
-from semstab.model.statistics.comparison import BackboneComparison, PairedDifference
-from semstab.model.voxels import Events, VoxelTable
+from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.blocks import Statistic
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.sampling import InfluenceSums, Places, difference, estimate, influence_sums, question_of
 
-Float64 = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
+Rows = Int64
 
 SUMMED = (ALPHA_BETWEEN, PSA, ALPHA, ENTROPY, ACCURACY)
 """What the sums tell; of VSS they have that of places seen three times, of SBD nothing."""

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.types import Float64, Int64
 from semstab.errors import ConfigError
-from semstab.metrics.matching import require_same_grid
+from semstab.metrics.agreement import require_same_grid
 from semstab.model.measures import Quantity, measures
 from semstab.model.statistics import Estimate
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import PSA, psa
 from semstab.statistics.blocks import BlockBootstrap, Blocks, Occupied, interval
 
-Float64 = npt.NDArray[np.float64]
 Tables = Mapping[str, VoxelTable]
 
 EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
@@ -40,7 +40,7 @@ class Observed:
     occupied  of each map
     """
 
-    counts: npt.NDArray[np.int64]
+    counts: Int64
     occupied: tuple[Occupied, ...]
 
     @classmethod
@@ -127,7 +127,7 @@ def standardised_of(parts: Sequence[Float64], size: float, weights: Float64, *, 
     }
 
 
-def _stratum(table: VoxelTable, edges: Sequence[int]) -> npt.NDArray[np.int64]:
+def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
     """(n,) 0 for OP = 1, else 1 to len(edges) + 1."""
     if list(edges) != sorted(set(edges)) or not edges or edges[0] < 2:
         raise ConfigError(f"edges = {list(edges)}: upper bounds of OP must ascend from 2 or more")

@@ -1,0 +1,188 @@
+"""The border: what a backbone says is checked here once, so that nobody inside has to doubt it."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backbones import Backbone, Image, Prediction, Streamed, ask
+from semstab.core.types import Float32
+from semstab.errors import ConfigError, DataError
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace, ignore_id
+
+# A backbone around another one: what filters, taxonomies and votes are made of.
+
+
+class Wrapped(Backbone):
+    """Another backbone, with something done to what it says; all that is not overridden is the inner one's.
+
+    Where it leaves scores as they are, it may set `streams` to the inner one's. What a sequence leaves behind belongs
+    into attributes that `reset` makes anew: copies for other sequences (`fit`) share them until then.
+    """
+
+    def __init__(self, inner: Backbone) -> None:
+        self.inner = inner
+        self.label_space = inner.label_space
+        self.gives_scores = inner.gives_scores
+        self.fit_frames = inner.fit_frames
+        self.sequential = inner.sequential
+        self.wants_geometry = inner.wants_geometry
+
+    def fit(self, images: Sequence[Image]) -> Self:
+        """A copy around the inner backbone adapted to the sequence."""
+        fitted = copy.copy(self)
+        fitted.inner = self.inner.fit(images)
+        return fitted
+
+    def reset(self) -> None:
+        """Forget all images."""
+        if self.inner.sequential:
+            self.inner.reset()
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`."""
+        return self.ask(images, scores, geometry)
+
+    def ask(self, images: Sequence[Image], scores: bool, geometry: Sequence[Frame]) -> list[Prediction]:
+        """What the inner backbone says; it is told the geometry where it wants it."""
+        inner = geometry if self.inner.wants_geometry else ()
+        return ask(self.inner, images, scores=scores, geometry=inner)
+
+    def identity(self) -> dict[str, Any]:
+        """That of the inner backbone."""
+        return self.inner.identity()
+
+
+MEMBERS = (
+    "label_space", "gives_scores", "fit_frames", "sequential", "wants_geometry", "streams", "fit", "reset", "predict",
+    "stream", "identity",
+)  # fmt: skip
+
+SUM_TOLERANCE = 0.01
+"""By how much a pixel's scores may miss 1: half precision does."""
+
+
+class Checked(Wrapped):
+    """A backbone whose every answer is looked at: one line says what is wrong with it.
+
+    Raises ConfigError for a class that is no backbone, DataError for predictions that are none of these images.
+    """
+
+    def __init__(self, backbone: Any, name: str) -> None:
+        self.name = name
+        if lacks := [member for member in MEMBERS if not hasattr(backbone, member)]:
+            raise ConfigError(
+                f"backbone '{name}': a {type(backbone).__name__} has no {', '.join(lacks)}; derive its class from"
+                " semstab.backbones.Backbone"
+            )
+        super().__init__(backbone)
+        self.streams = backbone.streams
+        if not isinstance(self.label_space, LabelSpace | None):
+            what = type(self.label_space).__name__
+            raise ConfigError(f"backbone '{name}': label_space is a {what}; make it a semstab.LabelSpace, or None")
+
+    def fit(self, images: Sequence[Image]) -> Self:
+        """The backbone adapted to a sequence."""
+        fitted = super().fit(images)
+        if not hasattr(fitted.inner, "predict"):
+            raise ConfigError(f"backbone '{self.name}': fit gave {_kind(fitted.inner)}; let it return the backbone")
+        return fitted
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`; scores that were not asked for are left out."""
+        found = self.ask(images, scores, geometry)
+        if not isinstance(found, Sequence) or len(found) != len(images):
+            what = f"{len(found)} predictions" if isinstance(found, Sequence) else _kind(found)
+            raise self._wrong(f"gave {what} for {len(images)} images; give a list with one each")
+        return [self._checked(prediction, image, scores) for prediction, image in zip(found, images, strict=True)]
+
+    def stream(self, image: Image) -> Streamed:
+        """See `Backbone`."""
+        found = self.inner.stream(image)
+        self._check_labels(found.labels, image.shape[:2])
+        return Streamed(found.labels, lambda: self._maps(found, image.shape[:2]))
+
+    def identity(self) -> dict[str, Any]:
+        """That of the backbone, which JSON must hold."""
+        identity: Any = self.inner.identity()
+        try:
+            json.dumps(identity, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"backbone '{self.name}': identity() is not for JSON ({error}); use texts, numbers, lists"
+            ) from error
+        if not isinstance(identity, dict):
+            raise ConfigError(f"backbone '{self.name}': identity() gave {_kind(identity)}; give a dict of settings")
+        return identity
+
+    def _checked(self, prediction: Any, image: Image, wants_scores: bool) -> Prediction:
+        if not isinstance(prediction, Prediction):
+            raise self._wrong(f"gave {_kind(prediction)}; give a semstab.backbones.Prediction")
+        self._check_labels(prediction.labels, image.shape[:2])
+        if not wants_scores:
+            return Prediction(prediction.labels)
+        self._check_scores(prediction.scores, image.shape[:2])
+        return prediction
+
+    def _maps(self, found: Streamed, shape: tuple[int, ...]) -> Iterator[Float32]:
+        """The maps, looked at as they come."""
+        K, count, total = len(self.label_space or ()), 0, np.zeros((*shape, 1), dtype=np.float32)
+        for scores in found.maps():
+            count += 1
+            if scores.shape != shape or not (scores >= 0).all():
+                raise self._wrong(
+                    f"gave scores of shape {scores.shape} or below 0; give one of 0 or more for each pixel"
+                )
+            total[..., 0] += scores
+            yield scores
+        if count != K or not _add_up(total):
+            raise self._wrong(f"gave {count} maps of scores that do not sum to 1; give {K}, one a class, that do")
+
+    def _check_labels(self, labels: Any, shape: tuple[int, ...]) -> None:
+        if not isinstance(labels, np.ndarray) or labels.dtype not in (np.uint8, np.uint16):
+            raise self._wrong(f"gave labels that are {_kind(labels)}; give an array of uint8 or uint16")
+        if labels.shape != shape:
+            raise self._wrong(f"gave labels of shape {labels.shape} for an image of {shape}; give one label a pixel")
+        if self.label_space is not None:
+            known = np.zeros(1 << 8 * labels.itemsize, dtype=np.bool_)
+            known[[id_ for id_ in (*self.label_space.ids, ignore_id(labels)) if id_ < len(known)]] = True
+            if not (fine := known[labels]).all():
+                raise self._wrong(
+                    f"gave the id {labels[~fine][0]}, which is none of its {len(self.label_space)} classes"
+                )
+
+    def _check_scores(self, scores: Any, shape: tuple[int, ...]) -> None:
+        K = 0 if self.label_space is None else len(self.label_space)
+        if not isinstance(scores, np.ndarray) or scores.dtype.kind != "f":
+            raise self._wrong(f"gave scores that are {_kind(scores)}; give an array of float32")
+        if scores.shape != (*shape, K):
+            raise self._wrong(f"gave scores of shape {scores.shape}; give {(*shape, K)}, the classes last")
+        if not _add_up(scores):
+            raise self._wrong("gave scores that are no shares: they must be 0 or more and sum to 1; apply a softmax")
+
+    def _wrong(self, what: str) -> DataError:
+        return DataError(f"backbone '{self.name}' {what}")
+
+
+def _add_up(scores: npt.NDArray[np.floating[Any]]) -> bool:
+    """Whether the scores (H, W, K) of each pixel are not negative and sum to 1; or to 0, where nothing is said."""
+    total = scores.sum(axis=2, dtype=np.float32)
+    return bool((scores >= 0).all() and ((np.abs(total - 1) <= SUM_TOLERANCE) | (total == 0)).all())
+
+
+def _kind(value: Any) -> str:
+    return (
+        "nothing"
+        if value is None
+        else f"a {type(value).__name__}" + (f" of {value.dtype}" if isinstance(value, np.ndarray) else "")
+    )

@@ -1,0 +1,291 @@
+"""Pretrained models from a folder or from the hub: found, loaded whole, or one error that says what to do."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import huggingface_hub
+import torch
+import transformers
+from huggingface_hub.errors import GatedRepoError, HFValidationError, RepositoryNotFoundError, RevisionNotFoundError
+from pydantic import Field, PositiveInt, field_validator
+from transformers import AutoImageProcessor, SegformerImageProcessorPil
+
+from semstab.config import Settings
+from semstab.core.files import read_json
+from semstab.errors import ConfigError, DataError, one_line
+
+if not transformers.is_torch_available():  # else its classes are stand-ins that fail when they are used
+    raise ImportError(f"transformers {transformers.__version__} does not work with torch {torch.__version__}")
+
+HUB_ID = re.compile(r"[\w-][\w.-]*(/[\w-][\w.-]*)?")
+WEIGHTS = ("*.safetensors", "*.bin")
+"""Suffixes of weights, the preferred first."""
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+HUB_TIMEOUT = 10.0
+
+
+class ModelOptions(Settings):
+    """Which pretrained model, and how it runs."""
+
+    model: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
+    revision: str | None = Field(None, description="branch, tag or commit on the hub; the newest where not given")
+    device: str = Field("cpu", description="cpu, cuda, cuda:1, mps")
+    dtype: Literal["float32", "bfloat16", "float16"] = Field(
+        "float32", description="of the computation; lower precision flips labels, which counts as flicker"
+    )
+    threads: int | None = Field(None, ge=1, description="threads on a CPU; torch's own number where not given")
+
+    def identity(self) -> dict[str, Any]:
+        """The options that its output depends on; the model itself is named by `Checkpoint.revision`."""
+        return self.model_dump(mode="json", exclude={"model", "revision", "threads"})
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The files of one version of a model.
+
+    name      the folder, or the id on the hub
+    folder    where the files are
+    revision  the commit on the hub, or the digest of the files
+    """
+
+    name: str
+    folder: Path
+    revision: str
+
+    @property
+    def title(self) -> str:
+        """The hub id, or the folder's own name."""
+        return self.folder.name if self.name == str(self.folder) else self.name
+
+    @classmethod
+    def find(cls, options: ModelOptions) -> Checkpoint:
+        """Look in the file system, then in the hub's cache, then on the hub.
+
+        Raises DataError where the model is in none of them, ConfigError for a name that is no model's.
+        """
+        folder = Path(options.model).expanduser()
+        if folder.is_dir():
+            if options.revision is not None:
+                raise ConfigError(f"{folder}: a folder has no revision '{options.revision}'; leave it out")
+            _require_model(folder)
+            return cls(str(folder), folder, _digest(folder))
+        if not HUB_ID.fullmatch(options.model) or folder.exists():
+            raise DataError(f"{folder}: there is no such folder; name one that save_pretrained wrote, or a hub id")
+        fetched = _cached(options) or _download(options)
+        return cls(options.model, fetched, fetched.name)
+
+    def preprocessing(self) -> dict[str, Any]:
+        """What preprocessor_config.json says; nothing where it is not there. Raises DataError where it is damaged."""
+        file = self.folder / "preprocessor_config.json"
+        if not file.is_file():
+            return {}
+        content = read_json(file)
+        if not isinstance(content, dict):
+            raise DataError(f"{file}: is no JSON object; {AGAIN}")
+        return content
+
+    def load(self, loader: Any, **options: Any) -> Any:
+        """What `loader.from_pretrained` makes of the folder, without network.
+
+        Raises DataError where it makes nothing.
+        """
+        with _quiet():
+            try:
+                return loader.from_pretrained(self.folder, local_files_only=True, **options)
+            except Exception as error:  # the loaders raise whatever their parsers do
+                what = loader.__name__
+                raise DataError(f"{self.folder}: {what} cannot load it ({_first_sentence(error)}); {AGAIN}") from error
+
+    def load_model(self, loader: Any, options: ModelOptions) -> Any:
+        """A model on its device, ready to predict.
+
+        Raises DataError where weights are missing or have other shapes, ConfigError for a device that is not there.
+        """
+        device = checked_device(options.device)
+        if options.threads is not None:
+            torch.set_num_threads(options.threads)
+        model, info = self.load(loader, dtype=DTYPES[options.dtype], output_loading_info=True)
+        unusable = [*info["missing_keys"], *(str(key) for key in info["mismatched_keys"])]
+        if unusable:
+            raise DataError(
+                f"{self.folder}: {len(unusable)} weights are missing, among them {min(unusable)}:"
+                f" it was not trained as {type(model).__name__}; choose another model"
+            )
+        return model.to(device).eval()
+
+
+AGAIN = "name a folder that save_pretrained wrote, or a hub id, of such a model"
+
+
+def bilinear(images: torch.Tensor, size: Any) -> torch.Tensor:
+    """Images (K, h, w) brought to (K, H, W), pixel areas aligned."""
+    return torch.nn.functional.interpolate(images[None], size=size, mode="bilinear", align_corners=False)[0]
+
+
+def checked_device(name: str) -> torch.device:
+    """The device of that name. Raises ConfigError where torch has none."""
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise ConfigError(f"device {name}: torch cannot use it ({_first_sentence(error)}); use cpu") from error
+    if device.type == "cuda":  # reduced precision flips labels
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cuda.matmul.allow_tf32 = False
+    return device
+
+
+def _require_model(folder: Path) -> None:
+    if not (folder / "config.json").is_file():
+        raise DataError(f"{folder}: holds no config.json, so no model; name a folder that save_pretrained wrote")
+    if not any(path for pattern in WEIGHTS for path in folder.glob(pattern)):
+        raise DataError(f"{folder}: holds no weights (model.safetensors); copy them into it")
+
+
+def _digest(folder: Path) -> str:
+    """Of the names and contents of the files that loading may read."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(folder.iterdir()):
+        if path.suffix in (".json", ".txt", ".safetensors", ".bin") and path.is_file():
+            digest.update(path.name.encode() + b"\0")
+            with path.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "blake2b").digest())
+    return digest.hexdigest()
+
+
+def _cached(options: ModelOptions) -> Path | None:
+    """The folder of the hub's cache, where an earlier download left the whole model there."""
+    try:
+        found = huggingface_hub.snapshot_download(options.model, revision=options.revision, local_files_only=True)
+        folder = Path(str(found))
+        _require_model(folder)
+    except (OSError, ValueError):  # DataError is a ValueError: a part of a model
+        return None
+    return folder
+
+
+def _download(options: ModelOptions) -> Path:
+    name, revision = options.model, options.revision
+    try:
+        # Asked first, because it fails at once where there is no network; the download would try for half a minute.
+        about = huggingface_hub.HfApi().model_info(name, revision=revision, timeout=HUB_TIMEOUT)
+        files = [sibling.rfilename for sibling in about.siblings or ()]
+        weights = next((pattern for pattern in WEIGHTS if any(Path(file).match(pattern) for file in files)), WEIGHTS[0])
+        wanted = ["*.json", "*.txt", weights]
+        folder = Path(huggingface_hub.snapshot_download(name, revision=about.sha, allow_patterns=wanted))
+    except GatedRepoError as error:
+        raise DataError(
+            f"model '{name}': its owner asks for consent; give it on the hub, then 'hf auth login'"
+        ) from error
+    except (RepositoryNotFoundError, HFValidationError) as error:
+        raise DataError(
+            f"model '{name}': there is no such folder, and no such model on the hub; mend the name"
+        ) from error
+    except RevisionNotFoundError as error:
+        raise DataError(
+            f"model '{name}': the hub has no revision '{revision}' of it; mend it, or leave it out"
+        ) from error
+    except Exception as error:  # no network has many faces
+        raise DataError(
+            f"model '{name}': there is no such folder, it is not in the hub's cache, and the hub cannot be reached"
+            f" ({_first_sentence(error)}); where there is a network 'hf download {name} --local-dir FOLDER', then name"
+            " the folder"
+        ) from error
+    _require_model(folder)
+    return folder
+
+
+def _first_sentence(error: Exception) -> str:
+    """Without the paragraphs of advice that libraries append."""
+    return re.split(r"(?<=[.:;]) |\n", one_line(error), maxsplit=1)[0].rstrip(".:;")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the progress bar and the notes of transformers, which would break into our own."""
+    notes: Any = transformers.utils.logging
+    verbosity, bars = notes.get_verbosity(), notes.is_progress_bar_enabled()
+    notes.set_verbosity_error()
+    notes.disable_progress_bar()
+    try:
+        yield
+    finally:
+        notes.set_verbosity(verbosity)
+        if bars:
+            notes.enable_progress_bar()
+
+
+# A checkpoint's own preprocessing: how images become what the model was made for.
+
+Processing = Literal["pil", "torchvision"]
+
+
+class ImageModelOptions(ModelOptions):
+    """Which pretrained model, how it runs, and by which library images are resized for it."""
+
+    processor: Processing = Field(
+        "pil", description="pil or torchvision: they resize differently, which changes up to 2 % of the labels"
+    )
+
+
+def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: Any) -> Any:
+    """The checkpoint's own preprocessing, without a crop, done by the library that is asked for and no other.
+
+    Checkpoints of before transformers 5 may name a 'feature extractor' that is no longer there. Raises ConfigError
+    where that library is not installed, DataError where the checkpoint's preprocessing cannot be done by it.
+    """
+    if processing == "torchvision" and importlib.util.find_spec("torchvision") is None:
+        raise ConfigError("processor: torchvision is not installed; leave it out, or pip install torchvision")
+    said = checkpoint.preprocessing()
+    kind = said.get("image_processor_type") or said.get("feature_extractor_type")
+    if processing == "pil" and kind == "SegformerFeatureExtractor":
+        processor = checkpoint.load(SegformerImageProcessorPil, **settings)
+    else:
+        processor = checkpoint.load(AutoImageProcessor, backend=processing, **settings)
+    if type(processor).__name__.endswith("Pil") != (processing == "pil"):
+        other = "torchvision" if processing == "pil" else "pil"
+        raise DataError(
+            f"{checkpoint.folder}: its {type(processor).__name__} cannot do its work by {processing}; set processor:"
+            f" {other}"
+        )
+    if getattr(processor, "do_center_crop", None):
+        processor.do_center_crop = False
+    return processor
+
+
+def model_type(checkpoint: Checkpoint) -> str:
+    """What transformers calls the checkpoint's kind: 'segformer', 'mask2former', ..."""
+    return str(checkpoint.load(transformers.AutoConfig).model_type)
+
+
+# Settings of the backbone `transformers`.
+
+
+class SegmenterOptions(ImageModelOptions):
+    """Which checkpoint, at which image size, run by what, asked for what."""
+
+    image_size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = Field(
+        None,
+        description="the shorter side in pixels, the shape of the image kept; or [height, width]; where not given, what"
+        " the checkpoint was made for",
+    )
+    engine: Literal["torch", "onnx"] = Field("torch", description="torch, or ONNX Runtime on the CPU")
+    prompts: tuple[str, ...] | None = Field(None, description="of a CLIPSeg model: what it is asked for, its classes")
+    threshold: float | None = Field(
+        None, gt=0, lt=1, description="of a CLIPSeg model: where no prompt is as likely, nothing is said"
+    )
+
+    @field_validator("prompts", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        return [part.strip() for part in value.split(",")] if isinstance(value, str) else value

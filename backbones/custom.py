@@ -1,0 +1,309 @@
+"""A model that a user brings as a class or a function: an image in, labels or scores out."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import re
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
+from semstab.backbones.border import Wrapped
+from semstab.backbones.names import class_names
+from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+
+# Code that a user names: `FILE.py:NAME` or `package.module:NAME`, imported, and known by its content.
+
+T = TypeVar("T")
+
+MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
+
+
+@dataclass(frozen=True)
+class Code:
+    """A class or a function in a user's file or package.
+
+    text    as it was named
+    name    of the class or the function
+    target  itself
+    module  where it is
+    """
+
+    text: str
+    name: str
+    target: Callable[..., Any]
+    module: ModuleType
+
+    @classmethod
+    def load(cls, text: str) -> Code:
+        """Import it. Raises ConfigError where it is not there, MissingDependencyError, DataError where it fails."""
+        place, _, name = text.rpartition(":")
+        if not place or not name.isidentifier():
+            raise ConfigError(
+                f"backbone '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function"
+            )
+        module = guarded(text, lambda: _of_file(Path(place)) if place.endswith(".py") else _of_package(place, text))
+        target = getattr(module, name, None)
+        if target is None:
+            own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+            near = difflib.get_close_matches(name, own, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(own) or 'nothing to call'}"
+            raise ConfigError(f"{place}: has no '{name}'; {hint}")
+        if not callable(target):
+            raise ConfigError(f"{text}: is a {type(target).__name__}; name a class, or a function of an image")
+        return cls(text, name, target, module)
+
+    @property
+    def digest(self) -> str:
+        """Of the file that it stands in."""
+        file = self.module.__file__
+        return "" if file is None else hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
+
+    def accepts(self, options: dict[str, Any], *more: Any) -> None:
+        """Raises ConfigError where it cannot be called with `more` and these options."""
+        try:
+            inspect.signature(self.target).bind(*more, **options)
+        except ValueError:  # compiled code does not say
+            return
+        except TypeError as error:
+            raise ConfigError(
+                f"{self.text}: {error}; options are KEY=VALUE after its name, or --set KEY=VALUE"
+            ) from error
+
+
+def is_code(name: str) -> bool:
+    """Whether a backbone's name says where code is, and is none of a registry."""
+    return ":" in name or name.endswith(".py")
+
+
+def absolute(name: str) -> str:
+    """The name of code, its file's from the root of the file system."""
+    place, _, what = name.rpartition(":")
+    return f"{Path(place).expanduser().absolute()}:{what}" if place.endswith(".py") else name
+
+
+def guarded(text: str, do: Callable[[], T]) -> T:
+    """What user's code does; what it raises becomes one line that says where it was raised."""
+    try:
+        return do()
+    except (ConfigError, DataError, MissingDependencyError):
+        raise
+    except ImportError as error:
+        package = f"; install {error.name.partition('.')[0]}" if error.name else ""
+        raise MissingDependencyError(f"{text}: it imports what is not there ({one_line(error)}){package}") from error
+    except (Exception, SystemExit) as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        at = f"{Path(last.filename).name}:{last.lineno}"
+        if isinstance(error, SyntaxError):
+            at = f"{Path(error.filename or '').name}:{error.lineno}"
+        raise DataError(f"{text}: {type(error).__name__} at {at}: {one_line(error)}") from error
+
+
+def _of_file(path: Path) -> ModuleType:
+    path = path.expanduser()
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such file")
+    content = hashlib.blake2b(str(path.resolve()).encode() + path.read_bytes(), digest_size=6).hexdigest()
+    name = f"{path.stem}_{content}"  # of its own, whatever else is called like the file, and of this version
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path.resolve())
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    _may_import_from(path.resolve().parent)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _of_package(place: str, text: str) -> ModuleType:
+    if not MODULE.fullmatch(place):
+        raise ConfigError(f"backbone '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function")
+    _may_import_from(Path.cwd())
+    return importlib.import_module(place)
+
+
+def _may_import_from(folder: Path) -> None:
+    """Last, so that nothing there takes the place of an installed package."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+class OwnOptions(BaseModel):
+    """What the code is called with, and the names of its classes."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    classes: list[str] | str | None = Field(
+        None, description="names in the order of ids; or a file: a name a line, or a taxonomy's YAML; the code's own"
+    )
+
+
+class Own:
+    """Makes backbones of a user's class or function; has `Options` and is called with them, like a backbone's class."""
+
+    def __init__(self, text: str) -> None:
+        self.code = Code.load(text)
+        self._is_backbone = isinstance(self.code.target, type) and Backbone in self.code.target.__mro__
+        own = getattr(self.code.target, "Options", None) if self._is_backbone else None
+        self.has_options = isinstance(own, type) and issubclass(own, BaseModel)
+        self.Options: type[BaseModel] = own if self.has_options and own is not None else OwnOptions
+
+    def __call__(self, options: BaseModel) -> Backbone:
+        """The backbone. Raises ConfigError, DataError, MissingDependencyError, each in one line."""
+        code = self.code
+        if self.has_options:
+            return OfCode(guarded(code.text, lambda: code.target(options)), code, {})
+        assert isinstance(options, OwnOptions)
+        extra = dict(options.model_extra or {})
+        if self._is_backbone:
+            code.accepts(extra)
+            return OfCode(guarded(code.text, lambda: code.target(**extra)), code, extra)
+        return OwnModel(code, extra, options.classes)
+
+
+class OfCode(Wrapped):
+    """A backbone of a user's own class: its file is part of what its predictions are kept under."""
+
+    def __init__(self, inner: Backbone, code: Code, options: Mapping[str, Any]) -> None:
+        super().__init__(inner)
+        self._about = {"code": code.digest, "options": contents(options)}
+
+    def identity(self) -> dict[str, Any]:
+        """Its own, its file and its options."""
+        return {**self.inner.identity(), **self._about}
+
+
+class OwnModel(Backbone):
+    """A function of an image (H, W, 3) uint8 RGB, or an object with such a method `predict`, or that is called so.
+
+    It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
+    0 where it says nothing; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say `classes`,
+    `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and frame).
+    """
+
+    def __init__(self, code: Code, options: Mapping[str, Any], classes: Sequence[str] | str | None) -> None:
+        self._code, self._options = code, options
+        made: Any = code.target
+        if isinstance(code.target, type):
+            code.accepts(dict(options))
+            made = guarded(code.text, lambda: code.target(**options))
+            self._call: Callable[..., Any] = getattr(made, "predict", made)
+        else:
+            self._call = partial(code.target, **options)
+        if not callable(self._call):
+            raise ConfigError(f"{code.text}: has no method predict(image), and cannot be called with an image")
+        self._made = made
+        self.label_space = _label_space(code, made, classes)
+        self.gives_scores = bool(getattr(made, "gives_scores", True))
+        self.sequential = bool(getattr(made, "sequential", False))
+        self.wants_geometry = bool(getattr(made, "wants_geometry", False))
+        if self.sequential and not hasattr(made, "reset"):
+            raise ConfigError(f"{code.text}: a sequential model needs a method reset(), called before each sequence")
+        if not isinstance(code.target, type):
+            code.accepts(dict(options), *([None] * (1 + self.wants_geometry)))
+
+    def reset(self) -> None:
+        """Forget all images."""
+        guarded(self._code.text, self._made.reset)
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`. Raises DataError for an answer that is neither labels nor scores."""
+        shown = zip(images, geometry, strict=True) if self.wants_geometry else zip(images, strict=True)
+        return [self._one(image, frame, scores) for image, *frame in shown]
+
+    def identity(self) -> dict[str, Any]:
+        """Its file, its options, its classes."""
+        assert self.label_space is not None
+        about = {"code": self._code.digest, "name": self._code.name, "options": contents(self._options)}
+        return {**about, "classes": list(self.label_space.classes)}
+
+    def _one(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
+        found = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
+        shape, K = image.shape[:2], len(self.label_space or ())
+        if found.shape == shape and found.dtype.kind in "iu":
+            if scores:
+                raise DataError(
+                    f"{self._code.text}: gives labels, no scores; leave scores out, or let it give (H, W, K)"
+                )
+            return Prediction(_ids(found, K, self._code.text))
+        if found.shape == (*shape, K) and found.dtype.kind == "f":
+            soft = found.astype(np.float32, copy=False)
+            return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None)
+        raise DataError(
+            f"{self._code.text}: gave {found.dtype} of shape {found.shape} for an image of {shape}; give labels"
+            f" {shape} of whole numbers, or scores {(*shape, K)}"
+        )
+
+
+def contents(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by what they say; a file or a folder by what is in it."""
+    return {key: _content(value) for key, value in options.items()}
+
+
+def is_path(value: Any) -> bool:
+    """Whether an option names a file or a folder that is there."""
+    return isinstance(value, str) and bool(Path(value).suffix or "/" in value) and Path(value).expanduser().exists()
+
+
+def _content(value: Any) -> Any:
+    if not is_path(value):
+        return value
+    path = Path(value).expanduser()
+    digest = hashlib.blake2b(digest_size=16)
+    for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
+        digest.update(b"" if file == path else str(file.relative_to(path)).encode() + b"\0")
+        with file.open("rb") as opened:
+            digest.update(hashlib.file_digest(opened, "blake2b").digest())
+    return digest.hexdigest()
+
+
+def _array(found: Any) -> npt.NDArray[Any]:
+    """An array of what a model gives; tensors come from where they are."""
+    return np.asarray(found.detach().cpu().numpy() if hasattr(found, "detach") else found)
+
+
+def _ids(found: npt.NDArray[Any], classes: int, who: str) -> Labels:
+    """Labels as the narrowest type. Raises DataError for one that is no class and not ignored."""
+    ignore = IGNORE_8BIT if classes <= IGNORE_8BIT else IGNORE_16BIT
+    wrong = (found >= classes) & (found != ignore)
+    if wrong.any():
+        raise DataError(f"{who}: gave the label {found[wrong][0]}, but has {classes} classes, 0 to {classes - 1}")
+    return narrowed(np.where(found < 0, ignore, found), classes)
+
+
+def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> LabelSpace:
+    found = class_names(classes) if classes is not None else None
+    for owner in (made, code.module):
+        for name in ("label_space", "classes", "names", "CLASSES"):
+            found = getattr(owner, name, None) if found is None else found
+    if isinstance(found, LabelSpace):
+        return found
+    if isinstance(found, Mapping):  # from ids, as Ultralytics has it
+        found = [found[k] for k in sorted(found)]
+    if found is None or isinstance(found, str) or not all(isinstance(name, str) for name in found):
+        raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or say --classes a,b,c")
+    return LabelSpace(code.name, tuple(found))

@@ -1,0 +1,183 @@
+"""From a model's own classes to those of a taxonomy, by name: what Cityscapes and ADE20K call UAVid's classes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.resources
+import logging
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from semstab.backbones import Backbone, Image, Prediction, Streamed
+from semstab.backbones.border import Wrapped
+from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
+from semstab.core.types import Float32, Mask
+from semstab.errors import ConfigError, one_line
+from semstab.model.frames import Frame
+from semstab.model.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
+
+logger = logging.getLogger("semstab")
+
+Leniency = Literal["strict", "lenient"]
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """What one family of models calls the classes of UAVid; see configs/backbones/class_names.yaml.
+
+    recognised_by  names that only this vocabulary has, and always has
+    rest           the class of what no class takes
+    strict         class to the names that certainly are it; `lenient` to the names that are it on a generous view
+    """
+
+    recognised_by: Sequence[str]
+    rest: str
+    strict: Mapping[str, Sequence[str]]
+    lenient: Mapping[str, Sequence[str]]
+
+    def matches(self, space: LabelSpace) -> bool:
+        """Whether a model's classes come from this vocabulary."""
+        return {name_key(name) for name in self.recognised_by} <= {key for name in space.classes for key in _keys(name)}
+
+    def target_of(self, name: str, leniency: Leniency) -> str | None:
+        """The class of UAVid that a name is, None where it is none."""
+        tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
+        found = {name_key(member): target for table in tables for target, names in table.items() for member in names}
+        return next((found[key] for key in _keys(name) if key in found), None)
+
+
+@functools.cache
+def vocabularies() -> Mapping[str, Vocabulary]:
+    """Those that ship, by name."""
+    file = importlib.resources.files("semstab.configs") / "backbones" / "class_names.yaml"
+    content = parse_yaml(file.read_text(encoding="utf-8"), file.name)
+    return {name: Vocabulary(**entry) for name, entry in content.items()}
+
+
+def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "strict") -> LabelMapping:
+    """Map a model's classes to a taxonomy by name.
+
+    A class goes where its vocabulary says, or to the class of `target` with its name or among whose members it is; one
+    of which the vocabulary says nothing else goes to its rest. Where `target` knows none of these, strict raises
+    ConfigError and names the class, lenient leaves the class out, and warns where these are most.
+    """
+    vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
+    known, rows, lost = target.row_of, [], []
+    for name in source.classes:
+        candidates = _candidates(name, vocabulary, leniency)
+        found = next((known[key] for key in map(name_key, candidates) if key in known), None)
+        if found is None:
+            lost.append(name)
+        rows.append(None if found == LEFT_OUT else found)
+    if lost and leniency == "strict":
+        raise ConfigError(
+            f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {source.name}; add the names to a class's"
+            " members or to ignored, or leave them out with the lenient mapping"
+        )
+    if 2 * len(lost) > len(source):
+        logger.warning(
+            "taxonomy %s: %d of the %d classes of %s are none of its classes and are left out, among them %s; does the"
+            " taxonomy fit? Its members and its ignored list take names",
+            target.name, len(lost), len(source), source.name, ", ".join(lost[:3]),
+        )  # fmt: skip
+    return LabelMapping(source, target, tuple(rows))
+
+
+def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
+    """What a class may be called in the target, the best first."""
+    own = [name, *_parts(name)]
+    if vocabulary is None:
+        return own
+    said = vocabulary.target_of(name, leniency)
+    return [*own, vocabulary.rest] if said is None else [said, *own]
+
+
+class InTaxonomy(Wrapped):
+    """A backbone whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
+
+    Labels are the mapped classes of the model's own decision; scores of classes that fall together are added up.
+    Raises ConfigError for a backbone without classes, and what `class_mapping` raises.
+    """
+
+    def __init__(self, backbone: Backbone, target: LabelSpace, leniency: Leniency) -> None:
+        if backbone.label_space is None:
+            raise ConfigError("regions without classes cannot be brought into a taxonomy; leave it out")
+        super().__init__(backbone)
+        self.streams = backbone.streams
+        self._mapping = class_mapping(backbone.label_space, target, leniency)
+        self.label_space = dataclasses.replace(target, ids=tuple(range(len(target))))
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`."""
+        return [self._mapped(prediction) for prediction in self.ask(images, scores, geometry)]
+
+    def stream(self, image: Image) -> Streamed:
+        """See `Backbone`; the target's maps are in memory at once."""
+        found = self.inner.stream(image)
+        labels = self._mapping.labels(found.labels, "prediction")
+        return Streamed(labels, lambda: self._maps(found, labels != ignore_id(labels)))
+
+    def identity(self) -> dict[str, Any]:
+        """That of the inner backbone, and where each class goes."""
+        rows = list(self._mapping.rows)
+        return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
+
+    def _maps(self, found: Streamed, said: Mask) -> Iterator[Float32]:
+        """Those of classes that fall together added up, 0 where the label is ignored."""
+        totals = np.zeros((len(self._mapping.target), *said.shape), dtype=np.float32)
+        for row, scores in zip(self._mapping.rows, found.maps(), strict=True):
+            if row is not None:
+                totals[row] += scores
+        yield from (total * said for total in totals)
+
+    def _mapped(self, prediction: Prediction) -> Prediction:
+        labels = self._mapping.labels(prediction.labels, "prediction")
+        if prediction.scores is None:
+            return Prediction(labels)
+        scores = np.array(self._mapping.scores(prediction.scores, "prediction"), dtype=np.float32)
+        scores[labels == ignore_id(labels)] = 0
+        return Prediction(labels, scores)
+
+
+def _keys(name: str) -> list[str]:
+    return [name_key(name), *(name_key(part) for part in _parts(name))]
+
+
+def _parts(name: str) -> list[str]:
+    """The synonyms of a name like 'door;double door' or 'building, edifice'."""
+    parts = [part.strip() for part in re.split(r"[;,]", name)]
+    return parts if len(parts) > 1 else []
+
+
+# Names of classes as a user says them.
+
+
+def class_names(said: Sequence[str] | str) -> Sequence[str] | LabelSpace:
+    """'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML.
+
+    Raises ConfigError where they are none, or cannot be read.
+    """
+    if not isinstance(said, str):
+        return said
+    path = Path(said).expanduser()
+    if path.suffix in (".yaml", ".yml"):
+        return LabelSpace.load(path)
+    if path.suffix and path.is_file():
+        try:
+            text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"classes {said}: cannot be read ({one_line(error)})") from error
+        names = [line.strip() for line in text.splitlines()]
+    else:
+        names = [name.strip() for name in said.split(",")]
+    if not (found := [name for name in names if name]):
+        raise ConfigError(f"classes {said}: holds no name")
+    return found

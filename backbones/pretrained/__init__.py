@@ -1,1 +1,0 @@
-"""Checkpoints of transformers for segmentation: found, loaded whole, asked for labels and scores."""

@@ -1,1 +1,0 @@
-"""Segment Anything: its proposals, and what is made of them."""

@@ -1,1 +1,0 @@
-"""SegEarth-OV, and what it is made of."""

@@ -1,0 +1,402 @@
+"""Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time.
+
+Where a voxel's evidence is says `next` of its record: `ALONE`, of one class, in the record itself; from 0 on, more of
+it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row `DENSE - next`. Then the
+record holds the dominant class as its label, and the sum of p log2 p as its value.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from semstab.backends.shared.beliefs import js_term, observe_row, plogp
+from semstab.backends.shared.keys import PARTITIONS, mix
+from semstab.backends.shared.pixel_keys import AHEAD, touch
+from semstab.core.compiled import compiled, parallel, serial
+from semstab.model.results import RECURRENT
+
+ALONE, DENSE = -1, -2
+
+SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
+
+
+def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
+    """The types of a voxel's record and of a node of its chain, for evidence of that float type."""
+    record = [
+        ("key", np.int64), ("pixels", np.int64), ("drift_sum", np.float64), ("self_sum", np.float64),
+        ("frame_entropy_sum", np.float64), ("value", evidence), ("next", np.int32), ("op", np.int32),
+        ("first_frame", np.int32), ("last_frame", np.int32), ("label", np.uint16),
+    ]  # fmt: skip
+    node = [("value", evidence), ("next", np.int32), ("label", np.uint16)]
+    return np.dtype(record, align=True), np.dtype(node, align=True)
+
+
+@parallel
+def look_up(key, bounds, slots, row, slot, new):
+    """The row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition."""
+    mask = np.uint64(slots.shape[1] - 1)
+    for p in nb.prange(PARTITIONS):
+        n = 0
+        mine, last = slots[p], bounds[p + 1]
+        for v in range(bounds[p], last):
+            touch(mine, np.int64(mix(key[min(v + 2 * AHEAD, last - 1)]) & mask))
+            at = np.int64(mix(key[v]) & mask)
+            while mine[at].row != -1 and mine[at].key != key[v]:
+                at = (at + 1) & np.int64(mask)
+            slot[v] = at
+            if mine[at].row == -1:
+                n += 1
+                mine[at].key = key[v]
+                mine[at].row = -1 - n
+                row[v] = -n
+            else:
+                row[v] = mine[at].row
+        new[p] = n
+
+
+@parallel
+def rehash(old, new):
+    """Enter the voxels of the slots into new ones, of which there are more."""
+    mask = np.uint64(new.shape[1] - 1)
+    for p in nb.prange(PARTITIONS):
+        for at in range(new.shape[1]):
+            new[p, at].row = -1
+        for i in range(old.shape[1]):
+            if old[p, i].row >= 0:
+                at = np.int64(mix(old[p, i].key) & mask)
+                while new[p, at].row != -1:
+                    at = (at + 1) & np.int64(mask)
+                new[p, at].key = old[p, i].key
+                new[p, at].row = old[p, i].row
+
+
+@serial
+def begin(record, key, label, frame):
+    """A voxel that no frame has seen before."""
+    record.key, record.label, record.next = key, label, ALONE
+    record.value = record.drift_sum = record.self_sum = record.frame_entropy_sum = 0.0
+    record.pixels = record.op = 0
+    record.first_frame = record.last_frame = frame
+
+
+@serial
+def observe_dense(record, evidence, sums, pixels, out):
+    """Add one observation to a voxel with a dense row; see `observe_row`."""
+    observe_row(evidence, sums, pixels, record.op, record.label, np.float64(record.value), out)
+    record.label, record.value = np.uint16(out[4]), out[7]
+
+
+@serial
+def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out):
+    for e in range(first, last):
+        s[label[e]] = weight[e]
+    observe_dense(record, evidence, s, pixels, out)
+    for e in range(first, last):
+        s[label[e]] = 0.0
+
+
+@compiled(forceinline=True)
+def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
+    """Add one observation to a voxel that disagrees with itself, or with the frame.
+
+    s is work space with room for K values, all 0. Leaves in `out` the change of VSS, that of the entropy in bits, the
+    drift in bits, and the dominant class before and after.
+    """
+    for e in range(first, last):
+        s[label[e]] = weight[e] / pixels
+    before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
+    top_before = top_after = plogp_before = plogp_after = drift = 0.0
+    most_before = most_after = -1.0
+    dominant_before = dominant_after = np.int64(0)
+    at = np.int64(-2)  # the record itself
+    while True:
+        lab = np.int64(record.label if at == -2 else nodes[at].label)
+        value = np.float64(record.value) if at == -2 else np.float64(nodes[at].value)
+        leads = (value > most_before) | ((value == most_before) & (lab < dominant_before))
+        dominant_before = lab if leads else dominant_before
+        most_before = max(most_before, value)
+        p = value * before
+        value += s[lab]
+        s[lab] = 0.0
+        leads = (value > most_after) | ((value == most_after) & (lab < dominant_after))
+        dominant_after = lab if leads else dominant_after
+        most_after = max(most_after, value)
+        q = value * after
+        if at == -2:
+            record.value = value
+            following = np.int64(record.next)
+        else:
+            nodes[at].value = value
+            following = np.int64(nodes[at].next)
+        top_before, top_after = max(top_before, p), max(top_after, q)
+        plogp_before += plogp(p)
+        plogp_after += plogp(q)
+        drift += js_term(p, q)
+        if following < 0:
+            break
+        at = following
+    for e in range(first, last):
+        share = s[label[e]]
+        if share > 0.0:
+            s[label[e]] = 0.0
+            if ranges[0] == ranges[1]:
+                ranges[0], ranges[1] = ranges[2], ranges[3]
+                ranges[2] = ranges[3]
+            node = ranges[0]
+            ranges[0] += 1
+            nodes[node].label = label[e]
+            nodes[node].value = share
+            nodes[node].next = -1
+            if at == -2:
+                record.next = node
+            else:
+                nodes[at].next = node
+            at = node
+            lab = np.int64(label[e])
+            if share > most_after or (share == most_after and lab < dominant_after):
+                most_after, dominant_after = share, lab
+            q = share * after
+            top_after = max(top_after, q)
+            plogp_after += plogp(q)
+            drift += js_term(0.0, q)
+    out[0] = top_after - top_before
+    out[1] = plogp_before - plogp_after
+    out[2] = min(max(drift, 0.0), 1.0) if op > 0 else 0.0
+    out[3], out[4] = dominant_before, dominant_after
+
+
+@compiled(forceinline=True)
+def _touch_ahead(v, last, row, records, nodes, dense):
+    """Ask for the records of later voxels, which lie across two lines of the cache, and for where they go on."""
+    soon = max(row[min(v + 2 * AHEAD, last)], 0)
+    touch(records, soon)
+    touch(records, soon + 1)
+    following = np.int64(records[max(row[min(v + AHEAD, last)], 0)].next)
+    touch(nodes, max(following, 0))
+    if dense.shape[0] > 1:
+        touch(dense.reshape(-1), max(DENSE - following, 0) * dense.shape[1])
+
+
+@parallel
+def update(
+    key, pixels, start, label, weight, bounds, frame, row, slot, base, slots, records, nodes, dense, ranges, sums,
+    drift_of, dominant_before, dominant_after,
+):  # fmt: skip
+    """Add the frame's observations; sums (PARTITIONS, 4): changes of VSS and entropy, drift, recurrent voxels.
+
+    row, the last three: see `Changes`.
+    """
+    for p in nb.prange(PARTITIONS):
+        s = np.zeros(dense.shape[1])
+        out = np.zeros(8)
+        own = ranges[p]
+        vss = entropy = drift = 0.0
+        reached = 0
+        for v in range(bounds[p], bounds[p + 1]):
+            _touch_ahead(v, bounds[p + 1] - 1, row, records, nodes, dense)
+            first, last = start[v], start[v + 1]
+            r = row[v]
+            if r < 0:
+                r = base[p] - r - 1
+                row[v] = r
+                slots[p, slot[v]].row = r
+                begin(records[r], key[v], label[first], frame)
+            record = records[r]
+            op = record.op
+            if last - first == 1 and record.next == ALONE and record.label == label[first]:
+                record.value += 1.0
+                record.self_sum += 1.0
+                vss += 1.0 if op == 0 else 0.0
+                drift_of[v] = 0.0
+                dominant_before[v] = dominant_after[v] = record.label
+            else:
+                if record.next <= DENSE:
+                    _observe_dense(record, dense[DENSE - record.next], s, label, weight, first, last, pixels[v], out)
+                else:
+                    _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
+                vss += out[0]
+                entropy += out[1]
+                drift += out[2]
+                record.drift_sum += out[2]
+                drift_of[v] = out[2]
+                dominant_before[v], dominant_after[v] = np.uint16(out[3]), np.uint16(out[4])
+                for e in range(first, last):
+                    share = weight[e] / pixels[v]
+                    record.self_sum += share * share
+                    record.frame_entropy_sum -= plogp(share)
+            if op == 0:
+                drift_of[v] = np.nan
+                dominant_before[v] = dominant_after[v]
+            record.op = op + 1
+            record.pixels += pixels[v]
+            record.first_frame = min(record.first_frame, frame)
+            record.last_frame = max(record.last_frame, frame)
+            reached += 1 if op + 1 == RECURRENT else 0
+        sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3] = vss, entropy, drift, reached
+
+
+@parallel
+def unchain(records, nodes, dense, order, evidence):
+    """Evidence (n, K) of the records in that order."""
+    for i in nb.prange(order.shape[0]):
+        record = records[order[i]]
+        if record.next <= DENSE:
+            evidence[i] = dense[DENSE - record.next, : evidence.shape[1]]
+            continue
+        evidence[i, record.label] = record.value
+        at = np.int64(record.next)
+        while at >= 0:
+            evidence[i, nodes[at].label] = nodes[at].value
+            at = np.int64(nodes[at].next)
+
+
+@parallel
+def count_chain(records, nodes, dense, order, count):
+    """How many classes the records in that order have evidence of: count[1:] of (n + 1,)."""
+    for i in nb.prange(order.shape[0]):
+        at = np.int64(records[order[i]].next)
+        if at <= DENSE:
+            count[i + 1] = np.count_nonzero(dense[DENSE - at])
+            continue
+        count[i + 1] = 1
+        while at >= 0:
+            count[i + 1] += 1
+            at = np.int64(nodes[at].next)
+
+
+@parallel
+def read_chain(records, nodes, dense, order, starts, label, weight):
+    """Evidence of the records in that order as entries, starts (n + 1,) being the first of each, ascending by class."""
+    for i in nb.prange(order.shape[0]):
+        last = starts[i]
+        record = records[order[i]]
+        if record.next <= DENSE:
+            row = dense[DENSE - record.next]
+            for k in range(row.shape[0]):
+                if row[k] != 0.0:
+                    label[last], weight[last] = k, row[k]
+                    last += 1
+            continue
+        label[last], weight[last] = record.label, record.value
+        at = np.int64(record.next)
+        while at >= 0:
+            k, value = nodes[at].label, nodes[at].value
+            last += 1
+            e = last
+            while e > starts[i] and label[e - 1] > k:
+                label[e], weight[e] = label[e - 1], weight[e - 1]
+                e -= 1
+            label[e], weight[e] = k, value
+            at = np.int64(nodes[at].next)
+
+
+@serial
+def place_observations(
+    rank, index, row, seen_pixels, entries, seen_label, seen_weight, place, entry, frame, pixels, starts, label, weight
+):  # fmt: skip
+    """Write a frame's observations where each voxel's next one goes."""
+    e = 0
+    for i in range(row.shape[0]):
+        voxel = rank[row[i]]
+        at, to = place[voxel], entry[voxel]
+        place[voxel] += 1
+        entry[voxel] += entries[i]
+        frame[at], pixels[at], starts[at] = index, seen_pixels[i], to
+        for k in range(entries[i]):
+            label[to + k] = seen_label[e + k]
+            weight[to + k] = seen_weight[e + k] / seen_pixels[i]
+        e += entries[i]
+
+
+# Compiled loops that add soft scores to the numba backend's map: to dense rows of evidence, one a voxel.
+
+
+@parallel
+def count_rows(row, bounds, records, needed):
+    """How many of the frame's voxels have no dense row yet, by partition."""
+    for p in nb.prange(PARTITIONS):
+        n = 0
+        for v in range(bounds[p], bounds[p + 1]):
+            touch(records, max(row[min(v + AHEAD, bounds[p + 1] - 1)], 0))
+            n += row[v] < 0 or records[max(row[v], 0)].next > DENSE
+        needed[p] = n
+
+
+@parallel
+def update_dense(
+    key, pixels, seen, seen_sums, bounds, frame, row, slot, base, dense_base, slots, records, nodes, dense, sums,
+    drift_of, dominant_before, dominant_after,
+):  # fmt: skip
+    """Add the frame's observations, whose voxels get dense rows from `dense_base` of their partition on.
+
+    seen, seen_sums  row and sums of `ObservedScores`; the others as in `update`
+    """
+    stride = dense.shape[1]
+    flat = dense.reshape(-1)
+    for p in nb.prange(PARTITIONS):
+        out = np.zeros(8)
+        vss = entropy = drift = 0.0
+        reached = 0
+        free = dense_base[p]
+        for v in range(bounds[p], bounds[p + 1]):
+            _touch_ahead_dense(v, bounds[p + 1] - 1, row, records, flat, stride, seen, seen_sums)
+            r = row[v]
+            if r < 0:
+                r = base[p] - r - 1
+                row[v] = r
+                slots[p, slot[v]].row = r
+                begin(records[r], key[v], 0, frame)
+            record = records[r]
+            if record.next > DENSE:
+                _unroll(record, nodes, dense[free])
+                record.next = DENSE - free
+                free += 1
+            op = record.op
+            observe_dense(record, dense[DENSE - record.next], seen_sums[seen[v] : seen[v] + stride], pixels[v], out)
+            vss += out[0]
+            entropy += out[1]
+            drift += out[2]
+            record.drift_sum += out[2]
+            record.self_sum += out[5]
+            record.frame_entropy_sum += out[6]
+            drift_of[v] = out[2] if op > 0 else np.nan
+            dominant_before[v], dominant_after[v] = np.uint16(out[3 if op > 0 else 4]), np.uint16(out[4])
+            record.op = op + 1
+            record.pixels += pixels[v]
+            record.first_frame = min(record.first_frame, frame)
+            record.last_frame = max(record.last_frame, frame)
+            reached += 1 if op + 1 == RECURRENT else 0
+        sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3] = vss, entropy, drift, reached
+
+
+@serial
+def _touch_ahead_dense(v, last, row, records, flat, stride, seen, seen_sums):
+    later = max(row[min(v + AHEAD, last)], 0)
+    touch(records, later)
+    touch(records, later + 1)
+    soon = min(v + AHEAD // 2, last)
+    place = max(DENSE - np.int64(records[max(row[soon], 0)].next), 0) * stride
+    for k in range(0, stride, 8):
+        touch(seen_sums, seen[soon] + k)
+        touch(flat, place + k)
+
+
+@serial
+def _unroll(record, nodes, evidence):
+    """The evidence of a voxel without a dense row into an unused one; its nodes are not used again."""
+    evidence[:] = 0.0
+    if record.op == 0:
+        return
+    evidence[record.label] = record.value
+    at = np.int64(record.next)
+    while at > ALONE:
+        evidence[nodes[at].label] = nodes[at].value
+        at = np.int64(nodes[at].next)
+    record.label = np.argmax(evidence)
+    total = 0.0
+    for k in range(evidence.shape[0]):
+        total += plogp(evidence[k] / record.op)
+    record.value = total

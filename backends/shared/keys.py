@@ -1,0 +1,69 @@
+"""Voxel indices packed into one int64, 21 bits an axis, as they count from the origin of a map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.shared.association import back_project, voxel_index
+from semstab.core.compiled import serial
+from semstab.core.types import Int64
+from semstab.errors import DataError
+from semstab.model.frames import Frame
+
+HALF = 1 << 20
+"""A map reaches that many voxels to either side of its origin."""
+
+
+def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
+    """Voxel indices (n, 3) of packed keys (n,), which sort like (ix, iy, iz)."""
+    mask = 2 * HALF - 1
+    index: Int64 = np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - HALF + np.asarray(origin)
+    return index
+
+
+def columns_of_keys(keys: Int64, order: npt.NDArray[np.integer], origin: npt.ArrayLike) -> dict[str, Any]:
+    """Voxel indices ix, iy, iz (n,) of the packed keys in that order."""
+    ordered, mask = keys[order], 2 * HALF - 1
+    shift = np.asarray(origin) - HALF
+    return {
+        name: ((ordered >> bits & mask) + shift[axis]).astype(np.int32)
+        for axis, (name, bits) in enumerate({"ix": 42, "iy": 21, "iz": 0}.items())
+    }
+
+
+def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:
+    """What to raise where a frame has points too far from the origin, or too far for 32-bit indices altogether."""
+    points = back_project(frame)
+    voxel_index(points, voxel_size, frame)
+    low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))
+    return DataError(
+        f"{frame.where('depth')}: frame {frame.index} spans {low} to {high} m, more than 2^20 voxels of"
+        f" {voxel_size:g} m from the map's origin {(np.asarray(origin) * voxel_size).round(1).tolist()};"
+        " leave out far depth (sky?), check depth and pose units, or use larger voxels"
+    )
+
+
+# The hash of packed voxel keys, and how it cuts observations and maps into partitions.
+
+PARTITIONS = 64
+
+
+@serial
+def mix(key):
+    """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
+    x = np.uint64(key)
+    x ^= x >> np.uint64(30)
+    x *= np.uint64(0xBF58476D1CE4E5B9)
+    x ^= x >> np.uint64(27)
+    x *= np.uint64(0x94D049BB133111EB)
+    x ^= x >> np.uint64(31)
+    return x
+
+
+@serial
+def partition_of(key):
+    """The partition of a key: the top 6 bits of its hash."""
+    return np.int64(mix(key) >> np.uint64(58))

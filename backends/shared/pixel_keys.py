@@ -1,0 +1,167 @@
+"""Compiled loops from the pixels of a row to packed voxel keys."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from semstab.backends.shared.keys import HALF
+from semstab.core.compiled import compiled, serial
+from semstab.core.types import Float64
+
+Floats = npt.NDArray[np.floating]
+
+BLOCK = 256
+"""Pixels whose keys are computed again where one of them is in doubt."""
+
+
+@serial
+def in_voxels(r0, r1, r2, t, x, y, z, size):
+    """A coordinate of a point of the camera in the map, in voxels; the order of operations is the protocol's."""
+    return (((r0 * x + r1 * y) + r2 * z) + t) / size
+
+
+@serial
+def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, out):
+    """Packed keys of a row of pixels, -1 where a pixel does not count; returns 1 where one is out of reach, else 0.
+
+    One loop without branches, which the compiler turns into vector instructions.
+    """
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    low, high = -float(HALF), float(HALF - 1)
+    lost = 0
+    for u in range(depth.shape[0]):
+        d = np.float64(depth[u])
+        ok = (d > 0.0) & (d < np.inf) & (labels[u] != ignore)
+        d = d if ok else 0.0
+        x = ray_x[u] * d
+        y = ray_y * d
+        a = np.floor(in_voxels(r00, r01, r02, t0, x, y, d, size)) - ox
+        b = np.floor(in_voxels(r10, r11, r12, t1, x, y, d, size)) - oy
+        c = np.floor(in_voxels(r20, r21, r22, t2, x, y, d, size)) - oz
+        near = (a >= low) & (a <= high) & (b >= low) & (b <= high) & (c >= low) & (c <= high)
+        lost |= 1 if ok & (not near) else 0
+        good = ok & near
+        i = np.int64(np.int32(a if good else 0.0)) + HALF
+        j = np.int64(np.int32(b if good else 0.0)) + HALF
+        k = np.int64(np.int32(c if good else 0.0)) + HALF
+        out[u] = ((i << 42) | (j << 21) | k) if good else -1
+    return lost
+
+
+@compiled(fastmath={"contract"})
+def keys_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, out):
+    """Packed keys of pixels at depth (ray + a0) + ta along each axis, -1 where one does not count; and any doubt.
+
+    In doubt is a point out of reach, or within `margin` of a voxel's face: here it is rounded otherwise than by the
+    protocol's expression, which has divisions, and may lie on the other side.
+    """
+    inner = 0.5 - margin
+    doubt = outside = 0
+    for u in range(depth.shape[0]):
+        d = np.float64(depth[u])
+        ok = (d > 0.0) & (d < np.inf) & (labels[u] != ignore)
+        d = d if ok else 0.0
+        a = d * (ray_a[u] + a0) + ta
+        b = d * (ray_b[u] + b0) + tb
+        c = d * (ray_c[u] + c0) + tc
+        whole_a, whole_b, whole_c = np.floor(a), np.floor(b), np.floor(c)
+        doubt |= ok & (
+            (abs(a - whole_a - 0.5) > inner) | (abs(b - whole_b - 0.5) > inner) | (abs(c - whole_c - 0.5) > inner)
+        )
+        i, j, k = np.int64(np.int32(whole_a)), np.int64(np.int32(whole_b)), np.int64(np.int32(whole_c))
+        outside |= i | j | k
+        out[u] = ((i << 42) | (j << 21) | k) if ok else -1
+    return doubt | (outside >> 21)
+
+
+@serial
+def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, margin, out):
+    """What `exact_keys_of_row` returns, with the same keys in less time; `frame_terms` makes rays and margin."""
+    a0 = (T[0, 1] * ray_y + T[0, 2]) / size
+    b0 = (T[1, 1] * ray_y + T[1, 2]) / size
+    c0 = (T[2, 1] * ray_y + T[2, 2]) / size
+    ta, tb, tc = T[0, 3] / size - ox + HALF, T[1, 3] / size - oy + HALF, T[2, 3] / size - oz + HALF
+    lost = 0
+    for first in range(0, depth.shape[0], BLOCK):
+        to = min(first + BLOCK, depth.shape[0])
+        d, lab, keys = depth[first:to], labels[first:to], out[first:to]
+        ray_a, ray_b, ray_c = rays[0, first:to], rays[1, first:to], rays[2, first:to]
+        if keys_fused(d, lab, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, keys):
+            lost |= exact_keys_of_row(d, lab, ray_x[first:to], ray_y, T, size, ox, oy, oz, ignore, keys)
+    return lost
+
+
+@serial
+def keep_columns(keys, columns):
+    """Take out, with -1, the keys outside of columns: lowest and highest but one of the first two coordinates."""
+    mask = 2 * HALF - 1
+    for u in range(keys.shape[0]):
+        i, j = keys[u] >> 42, (keys[u] >> 21) & mask
+        inside = (i >= columns[0]) & (i < columns[1]) & (j >= columns[2]) & (j < columns[3])
+        keys[u] = keys[u] if inside else -1
+
+
+def columns_of(within, origin):
+    """What `keep_columns` takes, of an extent or None: (4,), as packed keys count, or (0,) where all are kept."""
+    if within is None:
+        return np.zeros(0, dtype=np.int64)
+    (x0, y0), (x1, y1) = within.low, within.high
+    edges = np.array([x0, x1, y0, y1]) - np.repeat(origin[:2], 2) + HALF
+    return np.clip(edges, 0, 2 * HALF).astype(np.int64)
+
+
+def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int = HALF) -> tuple[Float64, float]:
+    """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of `keys_fused`.
+
+    The margin bounds what rounding can move a point by, voxels. Of a point within reach no term is above
+    8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
+    """
+    rays = T[:3, :1] * ray_x / size
+    return rays, 2.0**-49 * (8.0 * reach + float(np.abs(T[:3, 3]).max()) / size)
+
+
+# Asking for memory before it is needed, in compiled loops.
+
+AHEAD = 16
+"""Rows whose memory is asked for before their turn comes."""
+
+
+@intrinsic
+def touch(_typing: Any, array: Any, _index: Any) -> Any:
+    """touch(array, i): bring row i of an array (n,) into the cache; nothing waits for it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        values = context.make_array(signature.args[0])(context, builder, arguments[0])
+        pointer = cgutils.get_item_pointer(
+            context, builder, signature.args[0], values, [arguments[1]], wraparound=False
+        )
+        ask_for(builder, pointer)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
+def ask_for(builder: Any, pointer: Any) -> None:
+    """Code that asks for the memory at a pointer, to be written; there need be none."""
+    number = ir.IntType(32)
+    kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
+    prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    to_write, keep, data = (ir.Constant(number, value) for value in (1, 3, 1))
+    builder.call(prefetch, [builder.bitcast(pointer, cgutils.voidptr_t), to_write, keep, data])
+
+
+# Doubles as the integers of the same bits, in compiled loops.
+
+
+@intrinsic
+def bits_of(_typing: Any, _value: Any) -> Any:
+    """The bits of a double, as int64; those of numbers from 0 on sort like the numbers."""
+    return types.int64(types.float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))

@@ -1,1 +1,0 @@
-"""From pixels to runs of one voxel and label: keys, words, tiles, and the merging of what they hold."""

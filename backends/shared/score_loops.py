@@ -1,0 +1,442 @@
+"""From the soft scores of a frame to its observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
+from semstab.backends.shared.observations import Observed, ObservedScores, WorkSpace
+from semstab.backends.shared.pixel_keys import ask_for, columns_of, frame_terms, keep_columns, keys_of_row, touch
+from semstab.backends.shared.tile_loops import runs_of_eight
+from semstab.core.compiled import parallel, serial
+from semstab.core.types import Float64, Int64, Mask
+from semstab.model.frames import Frame
+from semstab.model.labels import fixed
+from semstab.model.voxels import Extent
+
+# Sums over the scores of pixels, eight classes at a time, for compiled loops.
+#
+# Scores are flat arrays of float32 or float64, or of half-precision numbers by their bits (uint16), since compiled code
+# knows no such type. They are added up in float64, in an order that depends on the number of classes only. A pixel's
+# last classes are read together with what follows them: behind the last pixel there must be `LANES` numbers of whatever
+# value.
+
+LANES = 8
+
+SOON = 8
+"""Rows of sums that are asked for before their turn comes."""
+
+NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.uint16: ir.HalfType()}
+
+INT, INT32, DOUBLE = ir.IntType(64), ir.IntType(32), ir.DoubleType()
+DOUBLES, INTS = ir.VectorType(DOUBLE, LANES), ir.VectorType(INT, LANES)
+ZEROS = ir.Constant(DOUBLES, [0.0] * LANES)
+
+
+@intrinsic
+def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: Any, _u: Any) -> Any:
+    """scale_eight(scores, at, K, keys, scale, u): 1 / the sum of each of eight pixels' scores, from scores[at] on.
+
+    Leaves it in scale[u : u + 8]; keys[u : u + 8], int64, become -1 where it is not a positive number.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, at, K, _, _, u = arguments
+        pixels = [builder.add(at, builder.mul(K, INT(pixel))) for pixel in range(LANES)]
+        total = _folded(builder, _sums(context, builder, signature.args[0], array, pixels, K))
+        key, scales = (
+            builder.bitcast(builder.gep(_data(context, builder, signature, arguments, i), [u]), kind.as_pointer())
+            for i, kind in ((3, INTS), (4, DOUBLES))
+        )
+        sound = builder.and_(
+            builder.fcmp_ordered(">", total, ZEROS),
+            builder.fcmp_ordered("<", total, ir.Constant(DOUBLES, [float("inf")] * LANES)),
+        )
+        kept = builder.select(sound, builder.load(key, align=8), ir.Constant(INTS, [-1] * LANES))
+        builder.store(kept, key, align=8)
+        builder.store(builder.fdiv(ir.Constant(DOUBLES, [1.0] * LANES), total), scales, align=8)
+        return context.get_dummy_value()
+
+    number = types.intp
+    return types.void(scores, number, number, keys, scale, number), generate
+
+
+@intrinsic
+def add_two(
+    _typing: Any, scores: Any, _at: Any, _K: Any, scale: Any, _u: Any, _end: Any, sums: Any, _to: Any, _fresh: Any
+) -> Any:
+    """add_two(scores, at, K, scale, u, end, sums, to, fresh): add u's scores and the next pixel's to their voxel.
+
+    sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
+    that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
+
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added. Rows of
+    as many lie one behind the other, and a later one, which may not have been written to yet, is asked for.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, at, K, _, u, end, _, to, fresh = arguments
+        pixels = [u, builder.add(u, INT(1))]
+        places = [builder.add(at, builder.mul(K, pixel)) for pixel in pixels]
+        counted = [builder.icmp_signed("<", pixel, end) for pixel in pixels]
+        scales = _data(context, builder, signature, arguments, 3)
+        factors = [
+            spread(builder, builder.select(counts, builder.load(builder.gep(scales, [pixel])), DOUBLE(0.0)), DOUBLES)
+            for pixel, counts in zip(pixels, counted, strict=True)
+        ]
+        row = builder.gep(_data(context, builder, signature, arguments, 6), [to])
+        ahead = builder.mul(builder.and_(builder.add(K, INT(LANES - 1)), INT(-LANES)), INT(SOON))
+
+        def add(values: list[Any], k: Any) -> None:
+            place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
+            total = builder.select(fresh, ZEROS, builder.load(place, align=8))
+            for value, factor, counts in zip(values, factors, counted, strict=True):
+                scaled = builder.fmul(builder.select(counts, value, ZEROS), factor, flags=["contract"])
+                total = builder.fadd(total, scaled, flags=["contract"])
+            builder.store(total, place, align=8)
+            ask_for(builder, builder.gep(row, [builder.add(k, ahead)]))
+
+        _by_eights(context, builder, signature.args[0], array, places, K, add)
+        return context.get_dummy_value()
+
+    number = types.intp
+    return types.void(scores, number, number, scale, number, number, sums, number, types.boolean), generate
+
+
+def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) -> Any:
+    return context.make_array(signature.args[i])(context, builder, arguments[i]).data
+
+
+def _sums(context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any) -> list[Any]:
+    """For each place the vector of sums of every eighth of the K numbers from there on."""
+    totals = [cgutils.alloca_once_value(builder, ZEROS) for _ in places]
+    for total in totals:
+        builder.store(ZEROS, total)
+
+    def add(values: list[Any], _: Any) -> None:
+        for total, value in zip(totals, values, strict=True):
+            builder.store(builder.fadd(builder.load(total), value), total)
+
+    _by_eights(context, builder, kind, array, places, K, add)
+    return [builder.load(total) for total in totals]
+
+
+def _folded(builder: Any, vectors: list[Any]) -> Any:
+    """The sums of the lanes of eight vectors, as one vector: the lanes of each are halved three times, in pairs."""
+    lanes = LANES
+    while len(vectors) > 1:
+        half = lanes // 2
+        first = [i for i in range(2 * LANES) if i % lanes < half]
+        low, high = (ir.Constant(ir.VectorType(INT32, LANES), [i + by for i in first]) for by in (0, half))
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [
+            builder.fadd(builder.shuffle_vector(a, b, low), builder.shuffle_vector(a, b, high)) for a, b in pairs
+        ]
+        lanes = half
+    return vectors[0]
+
+
+def _by_eights(
+    context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any,
+    do: Callable[[list[Any], Any], None],
+) -> None:  # fmt: skip
+    """Code that does something with each eight of the K numbers from each place, the rest filled up by 0.
+
+    do  is given a vector of doubles for each place, and the place of its first one among the K
+    """
+    number, vector = NUMBERS[kind.dtype], ir.VectorType(NUMBERS[kind.dtype], LANES)
+    data = builder.bitcast(context.make_array(kind)(context, builder, array).data, number.as_pointer())
+    starts = [builder.gep(data, [place]) for place in places]
+    size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+    whole = builder.and_(K, INT(-LANES))
+    rest = builder.sub(K, whole)
+
+    def eight(start: Any, k: Any) -> Any:
+        return builder.load(builder.bitcast(builder.gep(start, [k]), vector.as_pointer()), align=size)
+
+    def widened(values: Any) -> Any:
+        return values if vector == DOUBLES else builder.fpext(values, DOUBLES)
+
+    with cgutils.for_range_slice(builder, INT(0), whole, INT(LANES), intp=INT) as (k, _):
+        do([widened(eight(start, k)) for start in starts], k)
+    with builder.if_then(builder.icmp_signed(">", rest, INT(0))):
+        lanes = ir.Constant(INTS, list(range(LANES)))
+        kept, nothing = builder.icmp_signed("<", lanes, spread(builder, rest, INTS)), ir.Constant(vector, [0.0] * LANES)
+        do([widened(builder.select(kept, eight(start, whole), nothing)) for start in starts], whole)
+
+
+def spread(builder: Any, value: Any, vector: Any) -> Any:
+    """A vector of equal values."""
+    one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, INT32(0))
+    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(INT32, vector.count), [0] * vector.count))
+
+
+# Compiled loops from the scores of a frame to the sums of its voxels, by tiles of the image.
+#
+# The image is cut into bands of `ROWS` rows, and each band into tiles so narrow that the sums of their voxels stay in a
+# core's cache. Scores are read from memory once, in the order in which they lie there; those of eight invalid pixels
+# are not. A voxel's pixels are added up band by band, in an order that depends on the image only: the same numbers for
+# any number of threads.
+
+ROWS, COLUMNS = 16, 512
+"""Pixels of a tile; its rows are those of a band."""
+
+TABLE_BITS = 13
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+SHIFT = np.uint64(64 - TABLE_BITS)
+
+AHEAD = 512
+"""Scores that are asked for before their turn comes."""
+
+LINE = 16
+"""Of them, as many as a line of the cache holds in float32."""
+
+
+@parallel
+def sum_scores(
+    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys,
+    tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
+):  # fmt: skip
+    """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
+
+    Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
+
+    labels   (W,) 0 wherever there is depth: scores have no ignore id
+    scores   (H * W * K,), see `vectors`
+    ending   the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
+    within   see `keep_columns`
+    key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
+    lost     (bands,) whether a pixel with depth is out of reach
+    spread   (bands, PARTITIONS) of the voxels by partition
+    """
+    H, W = depth.shape
+    stride = -(-K // LANES) * LANES
+    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+    elsewhere = scores.shape[0] + (COLUMNS + LANES) * K - ending.shape[0]
+    for band in nb.prange(entries.shape[0]):
+        thread = nb.get_thread_id()
+        keys, table = row_keys[thread], tables[thread]
+        first, last = band * ROWS, min(H, (band + 1) * ROWS)
+        for v in range(first, last):
+            lost[band] |= keys_of_row(
+                depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, rays, margin, keys[v - first]
+            )
+            if within.shape[0]:
+                keep_columns(keys[v - first], within)
+        table[:] = -1
+        own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
+        own_sums = sums[band * room * stride : (band + 1) * room * stride]
+        n = np.int64(0)
+        for start in range(0, W, COLUMNS):
+            stop = min(W, start + COLUMNS)
+            words = stretches[thread, 0, : -(-(stop - start) // LANES) * LANES + LANES]
+            for v in range(first, last):
+                if n >= 0:
+                    words[: stop - start] = keys[v - first, start:stop]
+                    words[stop - start :] = -1
+                    at = (v * W + start) * K
+                    near = at + words.shape[0] * K > scores.shape[0]
+                    n = _add_stretch(
+                        ending if near else scores, at - elsewhere if near else at, K, stride, words, scales[thread],
+                        stretches[thread, 1], stretches[thread, 2], table, table_rows[thread], own_key, own_count,
+                        own_sums, n,
+                    )  # fmt: skip
+        entries[band] = n
+        for e in range(n):
+            spread[band, partition_of(own_key[e])] += 1
+
+
+@serial
+def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, table_row, key, count, sums, n):
+    """Add a stretch of pixels to their voxels, of which there are n; how many then, or -1 where there is no room.
+
+    scores, at  their scores begin at scores[at]
+    words       their keys, and at least LANES times -1 behind the last one, up to a multiple of LANES; those of pixels
+                without a prediction become -1
+    """
+    pixels = words.shape[0] - LANES
+    for u in range(0, pixels, LANES):
+        some = words[u] & words[u + 1] & words[u + 2] & words[u + 3]
+        if (some & words[u + 4] & words[u + 5] & words[u + 6] & words[u + 7]) >= 0:
+            for ahead in range(at + u * K + AHEAD, min(at + (u + LANES) * K + AHEAD, scores.shape[0]), LINE):
+                touch(scores, ahead)
+            scale_eight(scores, at + u * K, K, words, scale, u)
+    runs = 0
+    for u in range(0, pixels, LANES):
+        runs = runs_of_eight(words, u, run_word, run_end, runs)
+    begin = np.int64(0)
+    for i in range(runs):
+        k, end = run_word[i], run_end[i]
+        if k >= 0:
+            slot = np.int64((np.uint64(k) * GOLDEN) >> SHIFT)
+            fresh = table[slot] != k
+            if fresh:
+                if n == key.shape[0]:
+                    return np.int64(-1)
+                table[slot], table_row[slot] = k, n
+                key[n], count[n] = k, 0
+                n += 1
+            e = np.int64(table_row[slot])
+            count[e] += end - begin
+            while begin < end:
+                add_two(scores, at, K, scale, begin, end, sums, e * stride, fresh)
+                begin += 2
+                fresh = False
+        begin = end
+    return n
+
+
+@parallel
+def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels, out_row):
+    """Entries by partition, and within one by band and order of appearance; `out_row` is the place of their sums."""
+    for band in nb.prange(entries.shape[0]):
+        cursor = offset[:, band].copy()
+        for e in range(band * room, band * room + entries[band]):
+            p = partition_of(key[e])
+            at = cursor[p]
+            cursor[p] = at + 1
+            out_key[at], out_pixels[at], out_row[at] = key[e], count[e], e * stride
+
+
+@parallel
+def merge_rows(edges, key, pixels, row, again, first, sums, K, found):
+    """Add up the entries of each voxel in place: in its first one, and in the sums of that; how many are `found`.
+
+    again, first  work space: the sums of an entry of a voxel that has one already, and those of its first one
+    """
+    for p in nb.prange(PARTITIONS):
+        low, high = edges[p], edges[p + 1]
+        mask = 15
+        while mask < 2 * (high - low):
+            mask = 2 * mask + 1
+        slot = np.full(mask + 1, -1, dtype=np.int32)
+        n = low
+        repeated = low
+        for i in range(low, high):
+            k = key[i]
+            at = np.int64(mix(k) & np.uint64(mask))
+            while slot[at] >= 0 and key[low + slot[at]] != k:
+                at = (at + 1) & mask
+            if slot[at] < 0:
+                slot[at] = n - low
+                key[n], pixels[n], row[n] = k, pixels[i], row[i]
+                n += 1
+            else:
+                v = low + slot[at]
+                pixels[v] += pixels[i]
+                again[repeated], first[repeated] = row[i], row[v]
+                repeated += 1
+        for i in range(low, repeated):
+            soon = min(i + SOON, repeated - 1)
+            for k in range(0, K, LANES):
+                touch(sums, again[soon] + k)
+                touch(sums, first[soon] + k)
+            to, added = sums[first[i] : first[i] + K], sums[again[i] : again[i] + K]
+            for k in range(K):
+                to[k] += added[k]
+        found[p] = n - low
+
+
+FIRST_ROOM = 1 << 12
+"""Voxels that a band has room for at first."""
+
+SAMPLE = 1 << 10
+"""Voxels, about, that are looked at to tell whether a frame's voxels have most classes."""
+
+
+class Scores:
+    """Observes soft scores; keeps its work space from frame to frame."""
+
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
+        self.voxel_size = voxel_size
+        self.num_classes = num_classes
+        self.within = within
+        self._band_room = FIRST_ROOM
+        self._space = WorkSpace()
+
+    def observe(self, frame: Frame, origin: Int64) -> Observed | ObservedScores | None:
+        """The observations of scores, or None where a pixel with depth is out of reach.
+
+        As dense rows where the voxels have evidence for most of the classes, else by its entries.
+
+        What is restricted is left out at the end: in which order sums are rounded hangs on all of the frame's voxels.
+        """
+        space, (H, W), camera, K = self._space, frame.shape, frame.intrinsics, self.num_classes
+        ray_x = (np.arange(W) - camera.cx) / camera.fx
+        ray_y = (np.arange(H) - camera.cy) / camera.fy
+        rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
+        bands, threads = -(-H // ROWS), nb.get_num_threads()
+        stride = -(-K // LANES) * LANES
+        scores = _flat(frame.scores)
+        behind = (COLUMNS + LANES) * K
+        ending = fixed(np.concatenate([scores[-behind:], np.zeros(behind, dtype=scores.dtype)]))
+        while True:
+            room = min(self._band_room, ROWS * W)
+            key, count = space.room("key", bands * room), space.room("count", bands * room, dtype=np.int32)
+            sums = space.room("sums", bands * room * stride, dtype=np.float64)
+            entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
+            spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
+            sum_scores(
+                fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, K, ray_x, ray_y,
+                fixed(frame.T_wc), self.voxel_size, origin, columns_of(None, origin), rays, margin, room,
+                space.room("keys", threads, ROWS, W), space.room("table", threads, 1 << TABLE_BITS),
+                space.room("table_row", threads, 1 << TABLE_BITS, dtype=np.int32),
+                space.room("stretches", threads, 3, COLUMNS + 2 * LANES),
+                space.room("scale", threads, COLUMNS + LANES, dtype=np.float64), key, count, sums, entries, lost,
+                spread,
+            )  # fmt: skip
+            if lost.any():
+                return None
+            if entries.min() >= 0:
+                break
+            self._band_room *= 4
+        seen = _lean(self._merged(key, count, sums, room, entries, spread))
+        return seen if self.within is None else seen.only(keep_columns_of(seen.key, columns_of(self.within, origin)))
+
+    def _merged(
+        self, key: Int64, count: Any, sums: Float64, room: int, entries: Int64, spread: Int64
+    ) -> ObservedScores:
+        """Add up the entries of each voxel, band after band."""
+        space, total, K = self._space, int(entries.sum()), self.num_classes
+        stride = -(-K // LANES) * LANES
+        offset = np.zeros((PARTITIONS, len(entries)), dtype=np.int64)
+        offset.reshape(-1)[1:] = np.cumsum(spread.T.reshape(-1))[:-1]
+        edges = np.append(offset[:, 0], total)
+        merged = [space.room(f"merged {name}", total) for name in ("key", "pixels", "row")]
+        scatter_rows(key, count, room, stride, entries, offset, *merged)
+        found = np.zeros(PARTITIONS, dtype=np.int64)
+        merge_rows(edges, *merged, space.room("again", total), space.room("first", total), sums, K, found)
+        bounds = np.concatenate([[0], np.cumsum(found)])
+        ends = edges[:-1] + found
+        keys, pixels, row = (space.room(name, int(bounds[-1])) for name in ("keys out", "pixels", "row"))
+        for whole, gaps in zip((keys, pixels, row), merged, strict=True):
+            np.concatenate([gaps[low:high] for low, high in zip(edges, ends, strict=False)], out=whole)
+        return ObservedScores(keys, pixels, row, sums, bounds, K)
+
+
+def keep_columns_of(key: Int64, columns: Int64) -> Mask:
+    """Which of the keys (n,) are within columns, see `keep_columns`."""
+    kept = key.copy()
+    keep_columns(kept, columns)
+    inside: Mask = kept >= 0
+    return inside
+
+
+def _lean(seen: ObservedScores) -> Observed | ObservedScores:
+    """By entries where less than half of the classes of the voxels have evidence, as of scores that were cut off."""
+    some = seen.rows(slice(None, None, max(1, len(seen.key) // SAMPLE)))
+    return seen if 2 * np.count_nonzero(some) >= some.size else seen.sparse()
+
+
+def _flat(scores: Any) -> Any:
+    """Scores one after the other, half-precision ones as their bits; what compiled code does not know, in float64."""
+    kind = scores.dtype if scores.dtype in (np.float16, np.float32) else np.float64
+    values = fixed(scores.astype(kind, copy=False)).reshape(-1)
+    return values.view(np.uint16) if kind == np.float16 else values

@@ -1,1 +1,0 @@
-"""From soft scores to sums by voxel: one pass over the scores, in vectors."""

@@ -1,0 +1,392 @@
+"""Compiled loops from the labels of a frame to its observations, by tiles of the image.
+
+A pixel is one word: its voxel, counted from 2^15 below the camera's along each axis, and its label, 16 bits each; -1
+where it does not count. Pixels become runs of equal words along rows, runs of a tile entries in a small table that
+gives way on a collision, and entries are sorted and added up by partition of the map. All sums are of integers: the
+order in which they are made does not show.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from semstab.backends.shared.keys import HALF, PARTITIONS, partition_of
+from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_row, touch
+from semstab.core.compiled import compiled, parallel, serial
+
+# Runs of equal words, eight at a time, for compiled loops; no branch guesses where a run ends.
+
+LANES = 8
+"""Words that `runs_of_eight` looks at, and room that it needs beyond the runs there are."""
+
+INT = ir.IntType(64)
+WORDS, MASK = ir.VectorType(INT, LANES), ir.VectorType(ir.IntType(1), LANES)
+
+
+@intrinsic
+def runs_of_eight(_typing: Any, word: Any, _at: Any, run_word: Any, run_end: Any, _n: Any) -> Any:
+    """runs_of_eight(word, at, run_word, run_end, n): how many runs there are after words `at` to `at + 7`, n before.
+
+    A run ends with a word that differs from the one that follows, which must be there. All arrays are int64.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        at, n = arguments[1], arguments[4]
+        own, words, ends = (
+            builder.gep(context.make_array(signature.args[i])(context, builder, arguments[i]).data, [first])
+            for i, first in ((0, at), (2, n), (3, n))
+        )
+        _, _, features = context.codegen().magic_tuple()
+        keep = _compressed if "+avx512f" in features else _one_by_one
+        return keep(builder, own, words, ends, at, n)
+
+    return types.intp(word, types.intp, run_word, run_end, types.intp), generate
+
+
+def _compressed(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) -> Any:
+    """By instructions that put the chosen numbers of a vector side by side."""
+    word = builder.load(builder.bitcast(own, WORDS.as_pointer()), align=8)
+    following = builder.load(builder.bitcast(builder.gep(own, [INT(1)]), WORDS.as_pointer()), align=8)
+    last = builder.icmp_unsigned("!=", word, following)
+    spread = builder.insert_element(ir.Constant(WORDS, ir.Undefined), at, ir.IntType(32)(0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    end = builder.add(builder.shuffle_vector(spread, spread, zeros), ir.Constant(WORDS, list(range(1, LANES + 1))))
+    kind = ir.FunctionType(WORDS, [WORDS, WORDS, MASK])
+    compress = cgutils.get_or_insert_function(builder.module, kind, f"llvm.x86.avx512.mask.compress.v{LANES}i64")
+    for values, to in ((word, words), (end, ends)):
+        chosen = builder.call(compress, [values, ir.Constant(WORDS, [0] * LANES), last])
+        builder.store(chosen, builder.bitcast(to, WORDS.as_pointer()), align=8)
+    number = builder.ctpop(builder.bitcast(last, ir.IntType(LANES)))
+    return builder.add(n, builder.zext(number, INT))
+
+
+def _one_by_one(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) -> Any:
+    """Each word where the last run would end, to be written over unless it does."""
+    so_far = INT(0)
+    word = builder.load(own)
+    for lane in range(LANES):
+        following = builder.load(builder.gep(own, [INT(lane + 1)]))
+        builder.store(word, builder.gep(words, [so_far]))
+        builder.store(builder.add(at, INT(lane + 1)), builder.gep(ends, [so_far]))
+        so_far = builder.add(so_far, builder.zext(builder.icmp_unsigned("!=", word, following), INT))
+        word = following
+    return builder.add(n, so_far)
+
+
+NEAR = 1 << 15
+REACH = 2 * NEAR
+"""Words reach `NEAR` voxels to either side of the camera."""
+
+FRACTION = 36
+"""Bits of a coordinate's fraction in a number from `REACH` to twice that."""
+
+FROM = 0x40F0 << 48
+"""The bits of `REACH` as a number."""
+
+ROWS, COLUMNS = 32, 128
+"""Pixels of a tile."""
+
+TABLE_BITS = 11
+DIGIT_BITS = 10
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+SHIFT = np.uint64(64 - TABLE_BITS)
+
+
+@compiled(fastmath={"contract"})
+def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, face, out):
+    """The words of pixels; and any doubt, see `keys_fused`.
+
+    Coordinates are counted from -2^16, half the width of a face included (`face_terms`): the bits of such a number are
+    those of 2^16, with the coordinate and a binary fraction in their places, where it is within reach.
+    """
+    doubt = outside = 0
+    for u in range(depth.shape[0]):
+        d = np.float64(depth[u])
+        ok = (d > 0.0) & (d < np.inf) & (labels[u] != ignore)
+        d = d if ok else 0.0
+        a: Any = bits_of(d * (ray_a[u] + a0) + ta)
+        b: Any = bits_of(d * (ray_b[u] + b0) + tb)
+        c: Any = bits_of(d * (ray_c[u] + c0) + tc)
+        doubt |= ok & (((a & face) == 0) | ((b & face) == 0) | ((c & face) == 0))
+        outside |= (a ^ FROM) | (b ^ FROM) | (c ^ FROM)
+        i, j, k = (a << 12) & (-1 << 48), (b >> 4) & (0xFFFF << 32), (c >> 20) & (0xFFFF << 16)
+        out[u] = (i | j | k | np.int64(labels[u])) if ok else -1
+    return doubt | ((outside >> 52) != 0)
+
+
+def face_terms(margin: float) -> tuple[float, int]:
+    """Half the width of a voxel's face, in whose bounds a pixel is in doubt, and which bits of a fraction are 0 there.
+
+    The margin is that of rounding (`frame_terms`); two more roundings are to 2^-36, and the width is a power of two.
+    """
+    width = min(FRACTION, math.ceil(math.log2(margin * 2.0**FRACTION + 2)))
+    return 2.0 ** (width - FRACTION), (1 << FRACTION) - (2 << width) if width < FRACTION - 1 else 0
+
+
+@serial
+def _words_of_stretch(
+    depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, ray_a, ray_b, ray_c, down, start, face, keys, out
+):  # fmt: skip
+    """The words of a stretch of a row; returns whether a pixel is out of their reach, or out of that of packed keys.
+
+    ray_a, ray_b, ray_c (n,), down (3,), start (3,)  a pixel's coordinates are depth (ray + down) + start
+    """
+    lost = 0
+    if _words_fused(
+        depth, labels, ignore, ray_a, ray_b, ray_c, down[0], down[1], down[2], start[0], start[1], start[2], face, out
+    ):
+        ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+        lost = exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, keys)
+        for u in range(depth.shape[0]):
+            i, j, k = _from_corner(keys[u], corner)
+            lost |= (keys[u] >= 0) & (((i | j | k) >> 16) != 0)
+            out[u] = ((i << 48) | (j << 32) | (k << 16) | np.int64(labels[u])) if keys[u] >= 0 else -1
+    return lost
+
+
+@serial
+def _keep_columns(words, columns, corner):
+    """Take out the words outside of columns, given as packed keys count."""
+    for u in range(words.shape[0]):
+        i, j = ((words[u] >> 48) & 0xFFFF) + corner[0], ((words[u] >> 32) & 0xFFFF) + corner[1]
+        inside = (i >= columns[0]) & (i < columns[1]) & (j >= columns[2]) & (j < columns[3])
+        words[u] = words[u] if inside else -1
+
+
+@serial
+def _from_corner(key, corner):
+    mask = 2 * HALF - 1
+    return (key >> 42) - corner[0], ((key >> 21) & mask) - corner[1], (key & mask) - corner[2]
+
+
+@serial
+def _coordinates(word):
+    return (word >> 48) & 0xFFFF, (word >> 32) & 0xFFFF, (word >> 16) & 0xFFFF
+
+
+@serial
+def _key_of(a, b, c, corner):
+    return ((a + corner[0]) << 42) | ((b + corner[1]) << 21) | (c + corner[2])
+
+
+@serial
+def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
+    """The runs of a stretch of words into the table; what gives way is an entry. Returns how many there are."""
+    runs = 0
+    for u in range(0, word.shape[0] - LANES, LANES):
+        runs = runs_of_eight(word, u, run_word, run_end, runs)
+    begin = 0
+    for i in range(runs):
+        w, end = run_word[i], run_end[i]
+        at = np.int64((np.uint64(w) * GOLDEN) >> SHIFT)
+        there, so_far = table[at], table_count[at]
+        entry[n], count[n] = there, so_far
+        same = there == w
+        n += not same
+        table[at] = w
+        table_count[at] = (so_far if same else 0) + (end - begin)
+        begin = end
+    return n
+
+
+@serial
+def _flush(table, table_count, word, count, n):
+    for at in range(table.shape[0]):
+        word[n], count[n] = table[at], table_count[at]
+        n += table[at] != -1
+        table[at] = -1
+    return n
+
+
+@parallel
+def find_words(
+    depth, labels, ray_x, ray_y, T, size, origin, corner, columns, rays, down, begin, face, ignore, room, stretches,
+    tables, table_counts, word, count, partition, entries, lost, spread, low, high,
+):  # fmt: skip
+    """Entries of each band of ROWS rows: words with counts, some of them twice; their extent and spread by partition.
+
+    Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone. `lost`: a
+    pixel is out of reach of the words. low, high (bands, 4): of the coordinates, and of the label.
+    """
+    H, W = depth.shape
+    for band in nb.prange(entries.shape[0]):
+        thread = nb.get_thread_id()
+        table, table_count = tables[thread], table_counts[thread]
+        words, keys, run_word, run_end = (
+            stretches[thread, 0],
+            stretches[thread, 1],
+            stretches[thread, 2],
+            stretches[thread, 3],
+        )
+        own_word = word[band * room : (band + 1) * room]
+        own_count = count[band * room : (band + 1) * room]
+        n = np.int64(0)
+        for first in range(0, W, COLUMNS):
+            to = min(first + COLUMNS, W)
+            if n + COLUMNS * ROWS + table.shape[0] > room:
+                n = np.int64(-1)
+                break
+            own = words[: -(-(to - first) // LANES) * LANES + 1]
+            for y in range(band * ROWS, min(H, (band + 1) * ROWS)):
+                for u in range(to, min(W, to + COLUMNS), 16):
+                    touch(depth[y], u)
+                touch(labels[y], min(W - 1, to))
+                touch(labels[y], min(W - 1, to + 64))
+                own[to - first :] = -1
+                lost[band] |= _words_of_stretch(
+                    depth[y, first:to], labels[y, first:to], ray_x[first:to], ray_y[y], T, size, origin, corner,
+                    ignore, rays[0, first:to], rays[1, first:to], rays[2, first:to], down[y], begin, face, keys, own,
+                )  # fmt: skip
+                if columns.shape[0]:
+                    _keep_columns(own, columns, corner)
+                n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
+        if n < 0:
+            table[:] = -1
+            entries[band] = -1
+        else:
+            n = _flush(table, table_count, own_word, own_count, n)
+            entries[band] = _describe(
+                own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],
+                high[band],
+            )  # fmt: skip
+
+
+@serial
+def _describe(word, count, n, corner, partition, spread, low, high):
+    """Leave out what does not count; partitions, spread and extent of what is left, whose number is returned."""
+    low[:], high[:] = 1 << 20, -1
+    m = 0
+    for e in range(n):
+        w = word[e]
+        if w != -1:
+            a, b, c = _coordinates(w)
+            p = partition_of(_key_of(a, b, c, corner))
+            word[m], count[m], partition[m] = w, count[e], p
+            spread[p] += 1
+            low[0], low[1], low[2] = min(low[0], a), min(low[1], b), min(low[2], c)
+            high[0], high[1], high[2], high[3] = (
+                max(high[0], a), max(high[1], b), max(high[2], c), max(high[3], w & 0xFFFF),
+            )  # fmt: skip
+            m += 1
+    return m
+
+
+@parallel
+def scatter_words(word, count, partition, room, entries, offset, low, shift, out_word, out_count):
+    """Entries by partition, their words packed to the frame's extent: bits `shift` upwards hold a, b, c, then label."""
+    for band in nb.prange(entries.shape[0]):
+        cursor = offset[:, band].copy()
+        for e in range(band * room, band * room + entries[band]):
+            a, b, c = _coordinates(word[e])
+            at = cursor[partition[e]]
+            cursor[partition[e]] = at + 1
+            out_word[at] = (
+                ((a - low[0]) << shift[0]) | ((b - low[1]) << shift[1]) | ((c - low[2]) << shift[2])
+                | (word[e] & 0xFFFF)
+            )  # fmt: skip
+            out_count[at] = count[e]
+
+
+@serial
+def _sort(word, count, word2, count2, bits, histogram):
+    """Sort by the lowest `bits` bits, as many at a time as the histogram has room for; whether into the second pair."""
+    flipped = False
+    passes = -(-bits // DIGIT_BITS)
+    width = -(-bits // passes)
+    digits = 1 << width
+    for shift in range(0, bits, width):
+        if flipped:
+            source, source_count, target, target_count = word2, count2, word, count
+        else:
+            source, source_count, target, target_count = word, count, word2, count2
+        histogram[:digits] = 0
+        for i in range(source.shape[0]):
+            histogram[(source[i] >> shift) & (digits - 1)] += 1
+        total = 0
+        for digit in range(digits):
+            total, histogram[digit] = total + histogram[digit], total
+        for i in range(source.shape[0]):
+            digit = (source[i] >> shift) & (digits - 1)
+            at = histogram[digit]
+            histogram[digit] = at + 1
+            target[at], target_count[at] = source[i], source_count[i]
+        flipped = not flipped
+    return flipped
+
+
+@parallel
+def merge_words(word, count, word2, count2, edges, bits, label_bits, flipped, voxels, kept):
+    """Sort each partition and add up equal words; numbers of voxels and of entries that are left."""
+    for p in nb.prange(PARTITIONS):
+        low, high = edges[p], edges[p + 1]
+        flipped[p] = _sort(
+            word[low:high],
+            count[low:high],
+            word2[low:high],
+            count2[low:high],
+            bits,
+            np.empty(1 << DIGIT_BITS, np.int32),
+        )
+        w, c = (word2[low:high], count2[low:high]) if flipped[p] else (word[low:high], count[low:high])
+        n = v = 0
+        voxel = np.int64(-1)
+        for i in range(high - low):
+            if n > 0 and w[i] == w[n - 1]:
+                c[n - 1] += c[i]
+                continue
+            v += (w[i] >> label_bits) != voxel
+            voxel = w[i] >> label_bits
+            w[n], c[n] = w[i], c[i]
+            n += 1
+        voxels[p], kept[p] = v, n
+
+
+@parallel
+def emit_voxels(
+    word,
+    count,
+    word2,
+    count2,
+    edges,
+    flipped,
+    bounds,
+    entry_bounds,
+    low,
+    shift,
+    corner,
+    key,
+    pixels,
+    start,
+    label,
+    weight,
+):
+    """The observations: close the gaps between partitions, and unpack the words."""
+    label_mask = (np.int64(1) << shift[2]) - 1
+    b_mask, c_mask = (np.int64(1) << (shift[0] - shift[1])) - 1, (np.int64(1) << (shift[1] - shift[2])) - 1
+    for p in nb.prange(PARTITIONS):
+        w, c = (word2[edges[p] :], count2[edges[p] :]) if flipped[p] else (word[edges[p] :], count[edges[p] :])
+        v = bounds[p] - 1
+        voxel = np.int64(-1)
+        for e in range(entry_bounds[p], entry_bounds[p + 1]):
+            packed, number = w[e - entry_bounds[p]], c[e - entry_bounds[p]]
+            if packed >> shift[2] != voxel:
+                voxel = packed >> shift[2]
+                v += 1
+                key[v] = _key_of(
+                    (packed >> shift[0]) + low[0], ((packed >> shift[1]) & b_mask) + low[1],
+                    ((packed >> shift[2]) & c_mask) + low[2], corner,
+                )  # fmt: skip
+                pixels[v] = 0
+                start[v] = e
+            pixels[v] += number
+            label[e] = packed & label_mask
+            weight[e] = number
+    start[bounds[PARTITIONS]] = entry_bounds[PARTITIONS]

@@ -1,0 +1,305 @@
+"""The torch backend in plain tensor operations, on any device: the fallback of its Triton kernels, and what they match.
+
+Every sum over pixels is one of integers: counts of labels, and scores in units of a fixed fraction. Integer sums do not
+depend on their order, so that the numbers are the same run after run, although on an accelerator the order is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from semstab.backends.shared.keys import HALF
+from semstab.backends.shared.observations import Change
+from semstab.backends.torch_storage import EMPTY, Columns, DepthView, Labels, MapGrid, Scores, VoxelHash
+from semstab.model.results import RECURRENT
+
+NONE, LOST = -1, -2
+"""Instead of a voxel: the pixel has no depth, or its point is out of the map's reach."""
+
+SCORE_BITS, SCORE_BITS_SINGLE = 48, 25
+"""Scores are summed in units of 2^-48, or of 2^-(62 - b) in images of 2^b > 2^14 pixels (2^-39 at 3840x2160); shares
+that were computed in float32 in units of 2^-25, half the distance of the float32 numbers below 1."""
+
+SUMS = len(fields(Change))
+"""How many numbers `update` returns: those of a `Change`, in its order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """The voxels of a view: keys (n,) int64, distinct; and for each pixel its voxel's place there, (H, W) int32.
+
+    In place of the voxel stands NONE, or LOST.
+    """
+
+    keys: torch.Tensor
+    voxel: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class ViewEvidence:
+    """What one backbone says of the n voxels of a view: s_bar = sums / (scale * pixels).
+
+    sums    (K, n) integer
+    pixels  (n,) int64 pixels that count; 0 in voxels that the backbone does not see
+    flags   (3,) int64 what is wrong: the highest label id that a pixel which counts has, where that is no class, else
+            -1 or a class; whether such a pixel is out of reach; whether a score is below 0
+    """
+
+    sums: torch.Tensor
+    pixels: torch.Tensor
+    scale: float
+    flags: torch.Tensor
+
+
+def score_scale(pixels: int, double: bool) -> float:
+    """Units of a score of 1: a power of 2, such that the sum over all pixels fits 63 bits."""
+    return 2.0 ** min(SCORE_BITS if double else SCORE_BITS_SINGLE, 62 - pixels.bit_length())
+
+
+def chunk_of(device: torch.device) -> int:
+    """Numbers that are worked on at a time: few enough for a CPU's cache, enough to fill an accelerator."""
+    return 1 << 16 if device.type == "cpu" else 1 << 22
+
+
+def parts(total: int, size: int) -> Iterator[slice]:
+    """The range in parts of that size, at least 1."""
+    size = max(size, 1)
+    return (slice(start, min(start + size, total)) for start in range(0, total, size))
+
+
+# --- Pixels to voxels -------------------------------------------------------------------------------------------------
+
+
+class Associator:
+    """Finds the voxels of views."""
+
+    def __call__(self, view: DepthView, grid: MapGrid) -> Association:
+        """The voxels of a view, ascending by key, and the one of each pixel."""
+        H, W = view.depth.shape
+        keys_of = _Keys(view, grid)
+        rows = parts(H, chunk_of(view.depth.device) // W)
+        runs = [torch.unique_consecutive(keys_of(part), return_counts=True) for part in rows]
+        key, length = (torch.cat(part) for part in zip(*runs, strict=True))
+        keys, place = torch.unique(key, return_inverse=True)
+        nowhere = int((keys < 0).sum())
+        voxel = torch.where(key < 0, key, place - nowhere).to(torch.int32)
+        pixels = torch.repeat_interleave(voxel, length, output_size=H * W)
+        return Association(keys[nowhere:], pixels.reshape(H, W))
+
+
+class _Keys:
+    """Packed keys of the pixels of a view, NONE without depth, LOST out of reach."""
+
+    def __init__(self, view: DepthView, grid: MapGrid) -> None:
+        self.depth = view.depth
+        self.grid = grid
+        self.terms = (camera_terms if grid.dtype == torch.float64 else camera_terms_single)(view, grid)
+
+    def __call__(self, rows: slice) -> torch.Tensor:
+        """Of some rows of the image, (pixels,) int64."""
+        d = self.depth[rows]
+        ok = (d > 0) & (d < torch.inf)
+        d = torch.where(ok, d, 0)
+        q = self._double(d, rows) if self.grid.dtype == torch.float64 else self._single(d, rows)
+        near = ((q >= -HALF) & (q < HALF)).all(dim=0)
+        i, j, k = torch.where(near, q, 0).to(torch.int64) + HALF
+        key = torch.where(near, (i << 42) | (j << 21) | k, LOST)
+        return torch.where(ok, key, NONE).reshape(-1)
+
+    def _double(self, d: torch.Tensor, rows: slice) -> torch.Tensor:
+        """Voxel indices (3, H, W) that count from the origin, in the protocol's order of operations.
+
+        All operands are tensors: by a number, torch divides on a CUDA device as if it multiplied by the reciprocal.
+        """
+        ray_x, ray_y, T, r, origin = self.terms
+        d = d.to(torch.float64)
+        x = ray_x * d
+        y = ray_y[rows] * d
+        return torch.floor((((T[:, 0] * x + T[:, 1] * y) + T[:, 2] * d) + T[:, 3]) / r) - origin
+
+    def _single(self, d: torch.Tensor, rows: slice) -> torch.Tensor:
+        """The same in float32, counted from the camera's voxel: see `camera_terms_single`."""
+        a, b, start, origin = self.terms
+        return torch.floor(d * (a + b[:, rows]) + start) + origin
+
+
+def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
+    """Rays (W,), (H, 1), the pose (3, 4, 1, 1), voxel size (1,) and origin (3, 1, 1), in float64."""
+    ray_x, ray_y = view.rays
+    T = view.camera.T_wc[:3, :, None, None]
+    origin = np.array(grid.origin)[:, None, None]
+    return _uploaded([ray_x, ray_y[:, None], T, np.array([grid.voxel_size]), origin], grid.dtype, view.depth.device)
+
+
+def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
+    """a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1) in float32: x_w / r = d (a + b) + start, from the camera.
+
+    In units of voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
+    than the distance from the camera, and decides alike in UTM-sized coordinates.
+    """
+    ray_x, ray_y = view.rays
+    R, t = view.camera.T_wc[:3, :3] / grid.voxel_size, view.camera.T_wc[:3, 3] / grid.voxel_size
+    camera = np.floor(t)
+    a = (R[:, :1] * ray_x)[:, None, :]
+    b = (R[:, 1:2] * ray_y + R[:, 2:])[:, :, None]
+    start, offset = (t - camera)[:, None, None], (camera - grid.origin)[:, None, None]
+    return _uploaded([a, b, start, offset], grid.dtype, view.depth.device)
+
+
+def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.device) -> list[torch.Tensor]:
+    """The arrays as tensors on the device, behind one another, in one copy."""
+    flat = torch.tensor(np.concatenate([term.ravel() for term in terms]), dtype=dtype, device=device)
+    parts_of = torch.split_with_sizes(flat, [term.size for term in terms])
+    return [part.reshape(term.shape) for part, term in zip(parts_of, terms, strict=True)]
+
+
+# --- Evidence ---------------------------------------------------------------------------------------------------------
+
+
+def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvidence:
+    """Pixels of each class in each voxel."""
+    n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
+    sums = voxels.new_zeros(K * n)
+    flags = seen.keys.new_tensor([-1, 0, 0])
+    for part in parts(len(voxels), chunk_of(sums.device)):
+        voxel, label = voxels[part], said.ids[part].to(torch.int64)
+        given = (label >= 0) & (label != said.ignore) & (voxel != NONE)
+        wrong = (torch.where(given, label, -1).max(), (given & (voxel == LOST)).any(), flags[2])
+        flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
+        cells = (label * n + voxel)[given & (voxel >= 0) & (label < K)]
+        sums.index_add_(0, cells, sums.new_ones(()).expand(len(cells)))
+    sums = sums.reshape(K, n)
+    return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
+
+
+def sum_scores(seen: Association, said: Scores, num_classes: int) -> ViewEvidence:
+    """Sums of the normalised scores in each voxel."""
+    n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
+    scale = score_scale(len(voxels), double=said.values.dtype == torch.float64 or not said.softmax)
+    sums, pixels = seen.keys.new_zeros(K * n), seen.keys.new_zeros(n)
+    flags = seen.keys.new_tensor([-1, 0, 0])
+    classes = torch.arange(K, device=sums.device)[:, None]
+    for part in parts(len(voxels), chunk_of(sums.device) // K):
+        voxel, values = voxels[part], said.values[:, part]
+        s, usable = shares(values, softmax=said.softmax)
+        usable &= voxel != NONE
+        below = (values < 0) & torch.isfinite(values) & (not said.softmax)
+        wrong = (flags[0], (usable & (voxel == LOST)).any(), below.any())
+        flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
+        usable &= voxel != LOST
+        at, units = voxel[usable].to(torch.int64), torch.floor(s[:, usable] * scale + 0.5).to(torch.int64)
+        sums.index_add_(0, (classes * n + at).reshape(-1), units.reshape(-1))
+        pixels.index_add_(0, at, torch.ones_like(at))
+    return ViewEvidence(sums.reshape(K, n), pixels, scale, flags)
+
+
+def shares(values: torch.Tensor, softmax: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scores or logits (K, P) as shares that sum to 1, and which pixels (P,) have such."""
+    if softmax:
+        s = torch.softmax(values if values.dtype == torch.float64 else values.to(torch.float32), dim=0)
+        return s, torch.isfinite(s[0])
+    values = values.to(torch.float64)
+    total = values.sum(dim=0)
+    return values / total, torch.isfinite(total) & (total > 0)
+
+
+# --- The map ----------------------------------------------------------------------------------------------------------
+
+
+def mix(key: torch.Tensor) -> torch.Tensor:
+    """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
+    key = (key ^ _shifted(key, 30)) * (0xBF58476D1CE4E5B9 - (1 << 64))
+    key = (key ^ _shifted(key, 27)) * (0x94D049BB133111EB - (1 << 64))
+    return key ^ _shifted(key, 31)
+
+
+def _shifted(x: torch.Tensor, bits: int) -> torch.Tensor:
+    """A logical shift to the right, which torch has for unsigned numbers only."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def find(table: VoxelHash, keys: torch.Tensor) -> torch.Tensor:
+    """Rows (n,) int64 of keys (n,), EMPTY for those that the hash does not hold."""
+    rows = torch.full_like(keys, EMPTY)
+    mask = len(table.keys) - 1
+    at, searched = mix(keys) & mask, torch.arange(len(keys), device=keys.device)
+    while len(searched):
+        found = table.keys[at]
+        hit = found == keys[searched]
+        rows[searched[hit]] = table.rows[at[hit]].to(torch.int64)
+        goes_on = ~hit & (found != EMPTY)
+        at, searched = (at[goes_on] + 1) & mask, searched[goes_on]
+    return rows
+
+
+def insert(table: VoxelHash, keys: torch.Tensor, rows: torch.Tensor, first: int = 0) -> None:
+    """Add distinct keys (n,) which the hash does not hold and has slots for, with their rows (n,).
+
+    EMPTY keys are left out, and those whose row is below `first`.
+    """
+    wanted = (keys != EMPTY) & (rows >= first)
+    keys, rows, mask = keys[wanted], rows[wanted].to(torch.int32), len(table.keys) - 1
+    at = mix(keys) & mask
+    while len(keys):
+        free = table.keys[at] == EMPTY
+        table.keys[at[free]] = keys[free]  # several keys may want a slot: one of them gets it
+        placed = free & (table.keys[at] == keys)
+        table.rows[at[placed]] = rows[placed]
+        at, keys, rows = (at[~placed] + 1) & mask, keys[~placed], rows[~placed]
+
+
+def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: int) -> torch.Tensor:
+    """Add one observation to the rows (n,) of the voxels that the evidence sees; returns a `Change` in float64."""
+    observed = torch.nonzero(evidence.pixels)[:, 0]
+    sums = torch.zeros(SUMS, dtype=torch.float64, device=observed.device)
+    for part in parts(len(observed), 4 * chunk_of(observed.device) // columns.num_classes):
+        voxels = observed[part]
+        pixels = evidence.pixels[voxels]
+        sums_of = evidence.sums[:, voxels].T.to(torch.float64).contiguous()
+        s_bar = sums_of / (pixels.to(torch.float64) * evidence.scale)[:, None]
+        sums += _observe(columns, rows[voxels], s_bar, pixels, frame)
+    return sums
+
+
+def _observe(
+    columns: Columns, rows: torch.Tensor, s_bar: torch.Tensor, pixels: torch.Tensor, frame: int
+) -> torch.Tensor:
+    op = columns.op[rows]
+    new = op == 0
+    before = columns.evidence[rows].to(torch.float64)
+    after = (before + s_bar).to(columns.evidence.dtype)
+    p = before / op.clamp(min=1)[:, None]
+    q = after.to(torch.float64) / (op + 1)[:, None]
+    entropy_p, entropy_q = _entropy_bits(p), _entropy_bits(q)
+    divergence = _entropy_bits((p + q) / 2) - (entropy_p + entropy_q) / 2  # Jensen-Shannon, by entropies
+    drift = torch.where(new, 0, divergence.clamp(0, 1))
+    columns.evidence[rows] = after
+    columns.op[rows] = op + 1
+    columns.pixels[rows] += pixels
+    columns.drift_sum[rows] += drift
+    columns.self_sum[rows] += (s_bar * s_bar).sum(dim=1)
+    columns.frame_entropy_sum[rows] += _entropy_bits(s_bar)
+    columns.first_frame[rows] = torch.where(new, frame, columns.first_frame[rows].clamp(max=frame))
+    columns.last_frame[rows] = torch.where(new, frame, columns.last_frame[rows].clamp(min=frame))
+    sums = (
+        pixels.sum(),
+        pixels.new_tensor(len(rows)),
+        new.sum(),
+        drift.sum(),
+        (q.amax(dim=1) - p.amax(dim=1)).sum(),
+        (entropy_q - entropy_p).sum(),
+        (op + 1 == RECURRENT).sum(),
+    )
+    return torch.stack([value.to(torch.float64) for value in sums])
+
+
+def _entropy_bits(p: torch.Tensor) -> torch.Tensor:
+    """Shannon entropy of distributions (n, K), in bits."""
+    return torch.xlogy(p, p).sum(dim=1) * (-1 / math.log(2))

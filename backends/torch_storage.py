@@ -1,0 +1,348 @@
+"""What a map of the torch backend keeps on its device: a hash from voxel keys to rows, and columns of these rows.
+
+Voxel indices are packed into a key with 21 bits an axis, as they count from the map's origin.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.utils.dlpack import from_dlpack
+
+from semstab.core.types import Float64
+from semstab.errors import DataError, one_line
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
+
+GB = 1e9
+
+EMPTY = -1
+"""The key of a free slot."""
+
+FULL = 0.5
+"""Largest share of the hash's slots in use."""
+
+SLOT_BYTES = 8 + 4
+
+MOVED_SLOTS = 1 << 20
+"""Slots that move at a time when the hash grows."""
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """The voxels of a map: edge in metres, the voxel index from which keys count, and the type that points are in."""
+
+    voxel_size: float
+    origin: tuple[int, int, int]
+    dtype: torch.dtype
+
+
+class VoxelHash:
+    """Open addressing with linear probing: keys (S,) int64 and the rows (S,) int32 of those that are not EMPTY."""
+
+    def __init__(self, slots: int, device: torch.device) -> None:
+        self.keys = torch.full((slots,), EMPTY, dtype=torch.int64, device=device)
+        self.rows = torch.zeros(slots, dtype=torch.int32, device=device)
+
+    @property
+    def capacity(self) -> int:
+        """How many voxels it takes."""
+        return int(FULL * len(self.keys))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it takes."""
+        return SLOT_BYTES * len(self.keys)
+
+
+def slots_for(voxels: int) -> int:
+    """Slots of a hash for that many voxels: a power of 2."""
+    return 1 << max(10, (int(voxels / FULL) - 1).bit_length())
+
+
+class Columns:
+    """One backbone's columns of a VoxelTable, (N,) or (N, K), with room for rows to come; all 0 where never seen."""
+
+    NAMES = ("evidence", "op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
+
+    def __init__(self, num_classes: int, evidence: torch.dtype, device: torch.device) -> None:
+        def column(dtype: torch.dtype, *width: int) -> torch.Tensor:
+            return torch.zeros((0, *width), dtype=dtype, device=device)
+
+        self.num_classes = num_classes
+        self.evidence = column(evidence, num_classes)
+        self.op = column(torch.int32)
+        self.drift_sum = column(torch.float64)
+        self.pixels = column(torch.int64)
+        self.first_frame = column(torch.int32)
+        self.last_frame = column(torch.int32)
+        self.self_sum = column(torch.float64)
+        self.frame_entropy_sum = column(torch.float64)
+
+    @property
+    def capacity(self) -> int:
+        """Rows that there is room for in every column."""
+        return min(len(getattr(self, name)) for name in self.NAMES)
+
+    @property
+    def row_bytes(self) -> int:
+        """Memory of a row."""
+        columns = [getattr(self, name) for name in self.NAMES]
+        return sum(column.element_size() * math.prod(column.shape[1:]) for column in columns)
+
+    def grow(self, capacity: int) -> None:
+        """Make room for that many rows. One column is copied at a time, and its old copy freed before the next."""
+        for name in self.NAMES:
+            old = getattr(self, name)
+            if len(old) < capacity:
+                new = torch.zeros((capacity, *old.shape[1:]), dtype=old.dtype, device=old.device)
+                new[: len(old)] = old
+                setattr(self, name, new)
+
+
+class Storage:
+    """The hash, and the columns of each backbone, which share its rows; both grow within a bound on their memory."""
+
+    def __init__(
+        self,
+        num_classes: Mapping[str, int],
+        evidence: torch.dtype,
+        device: torch.device,
+        insert: Callable[[VoxelHash, torch.Tensor, torch.Tensor, int], None],
+        memory_gb: float | None,
+    ) -> None:
+        self.voxels = 0
+        self.hash = VoxelHash(slots_for(0), device)
+        self.columns = {name: Columns(K, evidence, device) for name, K in num_classes.items()}
+        self.memory_gb = memory_gb
+        self._insert = insert
+
+    @property
+    def capacity(self) -> int:
+        """Voxels that there is room for."""
+        return min(self.hash.capacity, *(columns.capacity for columns in self.columns.values()))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it takes on the device."""
+        return self.hash.bytes + sum(columns.capacity * columns.row_bytes for columns in self.columns.values())
+
+    def add(self, keys: torch.Tensor, rows: torch.Tensor, voxels: int) -> None:
+        """Enter those keys (n,) whose row is a new one; with them there are so many voxels."""
+        if voxels > self.voxels:
+            self._insert(self.hash, keys, rows, self.voxels)
+            self.voxels = voxels
+
+    def make_room(self, needed: int, where: str, wanted: int = 0) -> None:
+        """Make room for that many voxels, and for half as many again as there was if there is memory for them.
+
+        Raises DataError, with the maps unchanged, where they would outgrow `memory_gb`, or the device.
+        """
+        if needed <= self.capacity:
+            return
+        limit = math.inf if self.memory_gb is None else self.memory_gb * GB
+        wanted = max(needed, wanted, self.capacity + self.capacity // 2)
+        if self._bytes_to_grow(wanted) > limit:
+            wanted = needed
+        if self._bytes_to_grow(wanted) > limit:
+            raise DataError(
+                f"{where}: to hold {needed:,} voxels the map would take {self._bytes_to_grow(needed) / GB:.3g} GB while"
+                f" it grows, and memory_gb is {self.memory_gb:g}; use larger voxels, raise memory_gb, or make room at"
+                " once (reserve), which takes less"
+            )
+        try:
+            self._grow(wanted)
+        except RuntimeError as error:  # torch.OutOfMemoryError is one; on a CPU it is plain
+            device = self.hash.keys.device
+            raise DataError(
+                f"{where}: the device {device} has no room for {wanted:,} voxels ({one_line(error)}); use larger voxels"
+            ) from error
+
+    def _bytes_to_grow(self, voxels: int) -> int:
+        """The most memory taken while it grows: what it is then, and the column or hash that is copied."""
+        columns = self.columns.values()
+        then = SLOT_BYTES * slots_for(voxels) + voxels * sum(c.row_bytes for c in columns)
+        copied = max(self.hash.bytes, *(c.evidence.element_size() * c.evidence.numel() for c in columns))
+        return then + copied
+
+    def _grow(self, voxels: int) -> None:
+        for columns in self.columns.values():
+            columns.grow(voxels)
+        slots = slots_for(voxels)
+        if slots > len(self.hash.keys):
+            grown = VoxelHash(slots, self.hash.keys.device)
+            for start in range(0, len(self.hash.keys), MOVED_SLOTS):
+                part = slice(start, start + MOVED_SLOTS)
+                self._insert(grown, self.hash.keys[part], self.hash.rows[part], 0)
+            self.hash = grown
+
+
+# What the torch backend fuses: a view (depth, camera and pose) and what backbones say of its pixels, as tensors.
+
+INTEGERS = (torch.uint8, torch.uint16, torch.int8, torch.int16, torch.int32, torch.int64)
+
+Image = torch.Tensor | npt.NDArray[Any]
+"""An image as a tensor on any device, or as an array."""
+
+
+@dataclass(frozen=True, eq=False)
+class TensorPrediction:
+    """What a backbone says of each pixel of a view: one of the three. A batch dimension of 1 is left away.
+
+    labels  (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative id,
+            and 255 (65535 where there are more classes than that)
+    scores  (K, H, W) float, non-negative; normalised per pixel, pixels without a finite positive sum left out
+    logits  (K, H, W) float, as models give them; softmax over the classes, in float32 unless they are float64
+
+    Raises DataError where none or several are given.
+    """
+
+    labels: Image | None = None
+    scores: Image | None = None
+    logits: Image | None = None
+
+    def __post_init__(self) -> None:
+        if len(self._given) != 1:
+            raise DataError(f"a prediction takes labels, scores or logits, one of them; got {self._given or 'none'}")
+
+    @property
+    def kind(self) -> str:
+        """'labels', 'scores' or 'logits'."""
+        return self._given[0]
+
+    @property
+    def image(self) -> Image:
+        """The one that is given."""
+        image: Image = getattr(self, self.kind)
+        return image
+
+    @property
+    def _given(self) -> list[str]:
+        return [name for name in ("labels", "scores", "logits") if getattr(self, name) is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A depth image on the device, with its camera.
+
+    depth   (H, W) float32, contiguous, metres along the optical axis
+    camera  a frame of one empty pixel, or the whole frame: index, intrinsics, pose, and the names of files
+    """
+
+    depth: torch.Tensor
+    camera: Frame
+
+    @classmethod
+    def of(
+        cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device
+    ) -> DepthView:
+        """A view of a depth image on any device, copied where it is elsewhere. Raises DataError as Frame does."""
+        if isinstance(T_wc, torch.Tensor):
+            T_wc = T_wc.detach().cpu().numpy()
+        no_depth, no_label = np.zeros((1, 1), dtype=np.float32), np.zeros((1, 1), dtype=np.uint8)
+        pose = np.asarray(T_wc, dtype=np.float64)
+        camera = Frame(index=index, depth=no_depth, labels=no_label, intrinsics=intrinsics, T_wc=pose)
+        image = without_batch(on_device(depth, device), dimensions=2)
+        if image.ndim != 2 or image.numel() == 0:
+            raise DataError(f"{camera.where('depth')}: depth must be (H, W), got shape {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise DataError(
+                f"{camera.where('depth')}: depth is {_type(image)}; convert it to metres (float32) with its depth scale"
+            )
+        return cls(image.to(torch.float32).contiguous(), camera)
+
+    @classmethod
+    def of_frame(cls, frame: Frame, device: torch.device) -> Self:
+        """The view of a frame, which is valid already."""
+        return cls(on_device(frame.depth, device), frame)
+
+    @cached_property
+    def rays(self) -> tuple[Float64, Float64]:
+        """(u - cx) / fx of each column and (v - cy) / fy of each row."""
+        v, u = (np.arange(size, dtype=np.float64) for size in self.depth.shape)
+        K = self.camera.intrinsics
+        return (u - K.cx) / K.fx, (v - K.cy) / K.fy
+
+    def frame(self, usable: torch.Tensor) -> Frame:
+        """The view as a frame in memory, in which the pixels (H, W) that are usable have the label 0."""
+        labels = torch.where(usable, 0, IGNORE_8BIT).to(torch.uint8)
+        return dataclasses.replace(
+            self.camera, depth=self.depth.cpu().numpy(), labels=labels.cpu().numpy(), scores=None, color=None
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Class ids of a view's P pixels: (P,) integers; `ignore` is one of them that means none, as all below 0 do."""
+
+    ids: torch.Tensor
+    ignore: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Class scores of a view's P pixels, (K, P) of any strides; `softmax` says that they are logits."""
+
+    values: torch.Tensor
+    softmax: bool
+
+
+def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> Labels | Scores:
+    """What a backbone says of the view's pixels, on the view's device; `where` is what an error calls it.
+
+    Raises DataError where the image does not fit the depth image, or is of a wrong type.
+    """
+    kind, device = prediction.kind, view.depth.device
+    image = without_batch(on_device(prediction.image, device), dimensions=2 if kind == "labels" else 3)
+    layout = "(H, W)" if kind == "labels" else "(K, H, W)"
+    fits = image.dtype in INTEGERS if kind == "labels" else image.is_floating_point()
+    if not fits or image.ndim != len(layout.split(",")):
+        wanted = "integers" if kind == "labels" else "float"
+        raise DataError(f"{where}: {kind} must be {wanted} {layout}, got {_type(image)} of shape {tuple(image.shape)}")
+    if image.shape[-2:] != view.depth.shape:
+        (H, W), (h, w) = view.depth.shape, image.shape[-2:]
+        raise DataError(f"{where}: {kind} are {w}x{h} but depth is {W}x{H}; bring them to one size")
+    if kind == "labels":
+        return Labels(image.reshape(-1), _ignored_id(image.dtype, num_classes))
+    return Scores(image.reshape(len(image), -1), softmax=kind == "logits")
+
+
+def evidence_of_frame(frame: Frame, device: torch.device) -> Labels | Scores:
+    """What a frame's labels or scores say of its pixels."""
+    if frame.labels is not None:
+        return Labels(on_device(frame.labels, device).reshape(-1), frame.ignore_id)
+    assert frame.scores is not None
+    scores = on_device(frame.scores, device)
+    return Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)
+
+
+def on_device(image: Image, device: torch.device) -> torch.Tensor:
+    """The image as a tensor on that device; one that is there already, or an array where that is memory, is shared."""
+    if isinstance(image, torch.Tensor):
+        return image.detach().to(device)
+    return from_dlpack(np.ascontiguousarray(image)).to(device)  # unlike from_numpy it takes read-only arrays
+
+
+def without_batch(image: torch.Tensor, dimensions: int) -> torch.Tensor:
+    """The image without a leading batch dimension of 1."""
+    return image[0] if image.ndim == dimensions + 1 and len(image) == 1 else image
+
+
+def _ignored_id(dtype: torch.dtype, num_classes: int) -> int:
+    if dtype == torch.uint8:
+        return IGNORE_8BIT
+    if dtype == torch.uint16 or num_classes > IGNORE_8BIT:
+        return IGNORE_16BIT
+    return IGNORE_8BIT
+
+
+def _type(image: torch.Tensor) -> str:
+    return str(image.dtype).removeprefix("torch.")

@@ -1,0 +1,483 @@
+"""May a new model ship? Rules, judged by what the data show: each passes, fails, or is undecided."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from semstab.comparison.gate_measures import OF_EVIDENCE, GateMeasure, measure_named
+from semstab.comparison.opening import Contender, Entry, open_contender, shared_scenes
+from semstab.comparison.tables import COVERAGE, FLICKER, SBD_EXCESS
+from semstab.config import nearest, read_yaml, validated
+from semstab.errors import ConfigError, DataError
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
+from semstab.statistics.sampling import (
+    LEAST_FRAMES,
+    InfluenceSums,
+    coverage,
+    difference,
+    difference_over_frames,
+    estimate,
+    mean_of,
+    mean_over_frames,
+    of_places_alone,
+    same_flight,
+    value,
+)
+from semstab.statistics.sampling.influence import columns_of
+from semstab.statistics.sampling.intervals import LEAST_DEGREES, TOO_FEW
+
+# The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
+
+Change = Literal["drop", "rise"]
+
+ALL = "*"
+"""Instead of a class' name: a rule of each class."""
+
+GRAMMAR = "[scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"
+
+RULE = re.compile(
+    r"\s*(?:scene\s+(?P<scene>[^:]+?)\s*:\s*)?(?:class\s+(?P<class>.+?)\s*:\s*)?"
+    r"(?P<measure>[A-Za-z][\w\s-]*?)(?:\s+(?P<change>drop|rise))?\s*(?P<relation><=|>=|<|>)\s*"
+    r"(?P<limit>[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(?P<percent>%?)\s*",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What shall hold.
+
+    text     as it was given
+    change   of what: how far the measure fell from the baseline's ('drop'), or rose; its own value where none is named
+    below    whether that shall be below the limit, or above
+    limit    as the measure is given: shares from 0 to 1, flicker in percent
+    """
+
+    text: str
+    measure: GateMeasure
+    change: Change | None
+    below: bool
+    limit: float
+    scene: str | None = None
+    class_name: str | None = None
+
+    def of_each(self, classes: Sequence[str]) -> tuple[Rule, ...]:
+        """The rules that it stands for: itself, or with 'class *' one for each class."""
+        if self.class_name != ALL:
+            return (self,)
+        return tuple(
+            dataclasses.replace(self, text=self.text.replace(ALL, name, 1), class_name=name) for name in classes
+        )
+
+    @property
+    def bounds_a_loss(self) -> bool:
+        """Whether it says how much worse the measure may become."""
+        loss = "drop" if self.measure.quantity.better == "higher" else "rise"
+        return self.below and self.change == loss
+
+
+def parse(text: str) -> Rule:
+    """A rule from its text. Raises ConfigError with the grammar where it is none."""
+    found = RULE.fullmatch(text)
+    if found is None:
+        raise ConfigError(f"rule '{text}': not understood; write {GRAMMAR}, e.g. 'alpha drop < 0.02'")
+    measure = measure_named(found["measure"], f"rule '{text}'")
+    limit = float(found["limit"])
+    if found["percent"] and measure.quantity.unit != "%":
+        limit /= 100
+    change: Change | None = None
+    if found["change"]:
+        change = "drop" if found["change"].lower() == "drop" else "rise"
+    rule = Rule(text.strip(), measure, change, found["relation"][0] == "<", limit, found["scene"], found["class"])
+    _check_rule(rule)
+    return rule
+
+
+def _check_rule(rule: Rule) -> None:
+    name = rule.measure.name
+    if not math.isfinite(rule.limit):
+        raise ConfigError(f"rule '{rule.text}': its number is too large")
+    if rule.class_name is None and not rule.measure.of_all:
+        raise ConfigError(f"rule '{rule.text}': {name} is of a class; write 'class NAME: {rule.text}'")
+    if rule.class_name is not None and not rule.measure.of_class:
+        raise ConfigError(f"rule '{rule.text}': {name} is of all classes; leave 'class {rule.class_name}:' out")
+    if rule.change is None and rule.measure.only_change:
+        raise ConfigError(f"rule '{rule.text}': {name} is relative to a baseline; write '{name} drop < 0.05'")
+
+
+# One rule on one scene, or over all: what the data show of it, and what follows.
+
+Verdict = Literal["passes", "fails", "undecided"]
+Frames = Literal["random", "fixed"]
+
+LEAST = 8
+"""Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
+
+DOUBT = 0.1
+"""Where errors or the quality of frames may reach as far as the data, each end is missed so much less often: what holds
+even then is concluded."""
+
+AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
+NOTHING = "it has no value: nothing that it is of was seen twice"
+UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
+SCORES = "labels beside scores, which spread their evidence: run both as labels"
+FEW = "{frames} frames are too few: fly {least} or more"
+
+
+def verdict(rule: Rule, found: Interval) -> Verdict:
+    """What an interval, each of whose ends is passed with the gate's level, says of a rule.
+
+    Passes where the whole of it keeps to the limit. Fails where none of it does; a loss fails as soon as it is shown
+    and not shown to be smaller than the limit.
+    """
+    if found.undecided or math.isnan(found.low) or math.isnan(found.high):
+        return "undecided"
+    low, high, limit = (found.low, found.high, rule.limit) if rule.below else (-found.high, -found.low, -rule.limit)
+    if high < limit:
+        return "passes"
+    return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
+
+
+def change(
+    new: InfluenceSums,
+    base: InfluenceSums,
+    measure: GateMeasure,
+    k: int | None,
+    level: float,
+    frames: Frames = "random",
+) -> Interval:
+    """New less base, each end of its interval missed with probability `level`."""
+    key, both = measure.key, 1 - 2 * level
+    new, base = comparable(new, base)
+    if key == "coverage":
+        found = coverage(new, base, both)
+    else:
+        paired = frames == "fixed" or same_flight(new, base)
+        found = difference(new, base, key, k, _question(key, k, frames), same_frames=paired, level=both)
+    return of_frames(found, _frames(new, base))
+
+
+def rule_value(
+    new: InfluenceSums, measure: GateMeasure, k: int | None, level: float, frames: Frames = "random"
+) -> Interval:
+    """The number itself, each end of its interval missed with probability `level`."""
+    key = measure.key
+    return of_frames(estimate(new, key, k, _question(key, k, frames), 1 - 2 * level), _frames(new))
+
+
+def _question(key: str, k: int | None, frames: Frames) -> Question:
+    return THIS_MAP if frames == "fixed" or of_places_alone(key, k) else NEXT_FLIGHT
+
+
+def comparable(new: InfluenceSums, base: InfluenceSums) -> tuple[InfluenceSums, InfluenceSums]:
+    """Both without what only one of them knows of the ground truth."""
+    if new.truth == base.truth:
+        return new, base
+    return new.without_truth(), base.without_truth()
+
+
+def doubtful(found: Interval) -> bool:
+    """Whether nothing may be concluded only because errors, or the quality of frames, may reach as far as the data."""
+    final = ("frames are too few", NOTHING, UNKNOWN_FRAMES, SCORES)
+    return bool(found.undecided) and not any(reason in found.undecided for reason in final)
+
+
+def negative(found: Interval) -> Interval:
+    """Of the opposite number."""
+    return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
+
+
+def of_frames(found: Interval, frames: int) -> Interval:
+    """With this gate's own least number of frames: a rule is judged for frames like these."""
+    few = TOO_FEW.format(least=LEAST_FRAMES)
+    reasons = [reason for reason in found.undecided.split("; ") if reason and reason != few]
+    if not reasons and found.question == NEXT_FLIGHT and found.degrees < LEAST_DEGREES:
+        reasons.append(AS_LONG)
+    if math.isnan(found.value):
+        reasons.append(NOTHING)
+    if frames < LEAST:
+        reasons.append(FEW.format(frames=frames, least=LEAST) if frames else UNKNOWN_FRAMES)
+    return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))
+
+
+def _frames(*sums: InfluenceSums) -> int:
+    return min(own.frames * own.step for own in sums)
+
+
+# The settings of a gate: its rules, the level, what is to become of what is undecided.
+
+
+class GateConfig(BaseModel):
+    """What stands in gate.yaml.
+
+    level   the probability with which a rule may fail that holds, or pass that does not
+    frames  'random': rules are judged for other frames like these, and other places; 'fixed': for other places in these
+            very frames, which says nothing of the next flight
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rules: tuple[str, ...] = ()
+    level: float = Field(0.05, ge=1e-4, le=0.25)
+    undecided: Literal["pass", "fail"] = "pass"
+    frames: Frames = "random"
+
+
+def gate_config(
+    file: str | Path | None = None,
+    rules: Sequence[str] = (),
+    level: float | None = None,
+    undecided: str | None = None,
+    frames: str | None = None,
+) -> GateConfig:
+    """From a YAML file, and what is given beside it, which counts more; rules are added to the file's.
+
+    Raises ConfigError, which names the file and the setting.
+    """
+    given = {"level": level, "undecided": undecided, "frames": frames}
+    options = {name: value for name, value in given.items() if value is not None}
+    config = GateConfig() if file is None else validated(GateConfig, read_yaml(file), f"{file}: ")
+    config = validated(GateConfig, {**config.model_dump(), **options, "rules": (*config.rules, *rules)}, "gate: ")
+    if not config.rules:
+        where = f"{file}: rules" if file is not None else "gate"
+        raise ConfigError(f"{where}: there is no rule; write e.g. --rule 'alpha drop < 0.02'")
+    return config
+
+
+# What a gate found: rule by rule, and whether the new run may pass.
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What became of a rule.
+
+    found    what it bounds: the change or the number itself, with one-sided ends at the gate's level
+    new, base  the numbers of both, NaN where there is none
+    """
+
+    rule: Rule
+    verdict: Verdict
+    found: Interval
+    new: float
+    base: float
+
+    @property
+    def about(self) -> str:
+        """What was random: for which other data the ends are."""
+        if self.found.question != NEXT_FLIGHT:
+            return "other places like these, in these very frames"
+        if self.found.frames < LEAST_FRAMES:
+            return f"other places and frames like these {self.found.frames}"
+        return "the next flight"
+
+    @property
+    def reason(self) -> str:
+        """Why, in a few words."""
+        if self.verdict == "passes":
+            return "shown"
+        if self.verdict == "fails":
+            bounded = self.rule.bounds_a_loss and self.found.low <= self.rule.limit
+            return "a loss is shown, and not that it is within the limit" if bounded else "the contrary is shown"
+        return self.found.undecided or "the data show neither"
+
+    def digits(self, value: float) -> str:
+        """A number of the rule's measure."""
+        measure: GateMeasure = self.rule.measure
+        return "-" if math.isnan(value) else f"{value:z.{measure.quantity.digits[0]}f}"
+
+    @property
+    def values(self) -> str:
+        """'0.481 to 0.462, drop 0.019 [0.012, 0.026]'."""
+        ends = f"[{self.digits(self.found.low)}, {self.digits(self.found.high)}]"
+        if self.rule.change is None:
+            return f"{self.digits(self.found.value)} {ends}"
+        change = f"{self.rule.change} {self.digits(self.found.value)} {ends}"
+        if math.isnan(self.base):
+            return change
+        return f"{self.digits(self.base)} to {self.digits(self.new)}, {change}"
+
+
+@dataclass(frozen=True)
+class GateResult:
+    """Everything that a gate found.
+
+    new, against  what was judged, and the baseline, empty where there is none
+    remarks       what a reader has to know beside
+    """
+
+    new: str
+    against: str
+    scenes: tuple[str, ...]
+    level: float
+    undecided: str
+    judgements: tuple[Judgement, ...]
+    remarks: tuple[str, ...] = ()
+
+    def count(self, verdict: Verdict) -> int:
+        """How many rules came out so."""
+        return sum(each.verdict == verdict for each in self.judgements)
+
+    @property
+    def failed(self) -> bool:
+        """Whether a rule fails, or is undecided where that fails."""
+        return self.count("fails") > 0 or (self.undecided == "fail" and self.count("undecided") > 0)
+
+
+__all__ = ["GateConfig", "GateResult", "gate", "gate_config"]
+
+
+def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> GateResult:
+    """Judge a run, or 'FOLDER:BACKBONE', by rules; those on a drop or a rise need a baseline, a run or a small summary.
+
+    Raises ConfigError and DataError, each with the rule or the folder, and what to do.
+    """
+    parsed = [parse(text) for text in config.rules]
+    own = open_contender(new)
+    base = None if against is None else open_contender(against)
+    scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
+    judged: list[Judgement] = []
+    for given in parsed:
+        rules = given.of_each(own.scenes[scenes[0]].classes)
+        for rule in rules:
+            _check(rule, own, base, scenes)
+        ways = _Ways(config.level / len(rules), config.frames)
+        judged += [_judged(rule, own, base, scenes, ways) for rule in rules]
+    return GateResult(
+        _named(own), "" if base is None else _named(base), scenes, config.level, config.undecided, tuple(judged),
+        tuple(_remarks(own, base, scenes)),
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ways:
+    """How a rule is judged: with what error on either side, for which frames."""
+
+    level: float
+    frames: Frames
+
+
+def _named(run: Contender) -> str:
+    return f"{run.backbone} ({run.source})"
+
+
+def _remarks(own: Contender, base: Contender | None, scenes: Sequence[str]) -> list[str]:
+    left = [scene for scene in own.scenes if scene not in scenes]
+    missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
+    said = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
+    return said + ([f"of the baseline alone, and not compared: {', '.join(missing)}"] if missing else [])
+
+
+# --- Before anything is judged ----------------------------------------------------------------------------------------
+
+
+def _check(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[str]) -> None:
+    if rule.change is not None and base is None:
+        raise ConfigError(f"rule '{rule.text}': a {rule.change} is from a baseline; give --against RUN")
+    if rule.scene is not None and rule.scene not in scenes:
+        raise ConfigError(f"rule '{rule.text}': no scene '{rule.scene}'; {nearest(rule.scene, scenes)}")
+    for scene in [rule.scene] if rule.scene else scenes:
+        entries = [run.scenes[scene] for run in (own, base) if run is not None and (run is own or rule.change)]
+        if rule.class_name is not None and rule.class_name not in entries[0].classes:
+            raise ConfigError(
+                f"rule '{rule.text}': no class '{rule.class_name}'; {nearest(rule.class_name, entries[0].classes)}"
+            )
+        for entry in entries:
+            if not _has(rule, entry):
+                name = rule.measure.name
+                raise ConfigError(f"rule '{rule.text}': {entry.where} has no {name} of {scene}; {rule.measure.lacking}")
+        if len({entry.sums.voxel_size for entry in entries}) > 1:
+            sizes = [entry.sums.voxel_size for entry in entries]
+            raise DataError(
+                f"{own.source}: voxels of {sizes[0]:g} m, the baseline's are of {sizes[1]:g} m; run it with"
+                f" --voxel-size {sizes[1]:g}"
+            )
+
+
+def _has(rule: Rule, entry: Entry) -> bool:
+    """Whether a run keeps what a measure is of."""
+    if rule.measure.quantity is FLICKER:
+        return len(entry.flicker) > 1
+    if rule.measure.quantity is COVERAGE:
+        return True
+    columns = columns_of(entry.sums, rule.measure.key, _k(rule, entry))
+    return bool(columns.size) and (rule.measure.quantity is not SBD_EXCESS or bool(columns[:, 1].any()))
+
+
+def _k(rule: Rule, entry: Entry) -> int | None:
+    return None if rule.class_name is None else entry.classes.index(rule.class_name)
+
+
+# --- Rules ------------------------------------------------------------------------------------------------------------
+
+
+def _judged(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[str], ways: _Ways) -> Judgement:
+    """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
+    pairs = [
+        (own.scenes[scene], None if base is None else base.scenes[scene])
+        for scene in ([rule.scene] if rule.scene else scenes)
+    ]
+
+    def at(level: float) -> Interval:
+        chosen = dataclasses.replace(ways, level=level)
+        return mean_of([_found(rule, new, old, chosen) for new, old in pairs], 1 - 2 * level)
+
+    found = at(ways.level)
+    if doubtful(found):
+        strict = dataclasses.replace(at(ways.level * DOUBT), undecided="")
+        found = found if verdict(rule, strict) == "undecided" else strict
+    return Judgement(
+        rule,
+        verdict(rule, found),
+        found,
+        float(np.mean([_value(rule, new) for new, _ in pairs])),
+        float(np.mean([math.nan if old is None or not rule.change else _value(rule, old) for _, old in pairs])),
+    )
+
+
+def _value(rule: Rule, entry: Entry) -> float:
+    if rule.measure.quantity is FLICKER:
+        return float(np.mean(list(entry.flicker.values())))
+    if rule.measure.quantity is COVERAGE:
+        return math.nan
+    return value(entry.sums, rule.measure.key, _k(rule, entry))
+
+
+def _found(rule: Rule, new: Entry, base: Entry | None, ways: _Ways) -> Interval:
+    """What a rule bounds, in one scene."""
+    if rule.change is None:
+        return _own(rule, new, ways)
+    assert base is not None
+    if rule.measure.quantity is FLICKER:
+        found = _flicker(new, base, ways.level)
+    else:
+        found = change(new.sums, base.sums, rule.measure, _k(rule, new), ways.level, ways.frames)
+    if rule.measure.quantity in OF_EVIDENCE and (new.summary.reduced is None) != (base.summary.reduced is None):
+        found = dataclasses.replace(found, undecided=SCORES)
+    return found if rule.change == "rise" else negative(found)
+
+
+def _own(rule: Rule, entry: Entry, ways: _Ways) -> Interval:
+    if rule.measure.quantity is not FLICKER:
+        return rule_value(entry.sums, rule.measure, _k(rule, entry), ways.level, ways.frames)
+    frames, percent = np.array(list(entry.flicker)), np.array(list(entry.flicker.values()))
+    return of_frames(mean_over_frames(frames, percent, 1 - 2 * ways.level), len(frames))
+
+
+def _flicker(new: Entry, base: Entry, level: float) -> Interval:
+    """Paired by frame, where both have the same ones; else each by itself."""
+    shared = sorted(new.flicker.keys() & base.flicker.keys())
+    if len(shared) < 2:
+        raise DataError(
+            f"{new.where} and {base.where}: no frames in common to compare flicker on; run both on the same"
+        )
+    found = difference_over_frames(new.flicker, base.flicker, 1 - 2 * level)
+    return of_frames(found, len(shared))

@@ -1,0 +1,154 @@
+"""What a gate found, for people and programs: lines, Markdown for a pull request, JSON, JUnit XML."""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+from semstab.comparison.gate import GateResult, Judgement, Verdict
+from semstab.core.files import write_text
+from semstab.core.json_form import to_json
+from semstab.errors import ConfigError
+
+SCHEMA = 1
+INDENT = 10
+SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "❔"}
+
+
+def headline(result: GateResult) -> str:
+    """'2 rules pass, 1 fails: the gate fails'."""
+    counts = [(n, verdict) for verdict in ("fails", "undecided", "passes") if (n := result.count(verdict))]
+    said = ", ".join(f"{n} {_plural(verdict, n)}" for n, verdict in counts)
+    treated = f" (which {result.undecided}es)" if result.undecided == "pass" else " (which fails)"
+    said = said.replace("undecided", f"undecided{treated}")
+    return f"{said}: the gate {'fails' if result.failed else 'passes'}"
+
+
+def _plural(verdict: str, n: int) -> str:
+    return verdict if n == 1 or verdict == "undecided" else {"fails": "fail", "passes": "pass"}[verdict]
+
+
+def lines(result: GateResult, width: int = 80) -> Iterator[str]:
+    """For the terminal."""
+    yield from _wrapped(f"gate: {result.new}" + (f" against {result.against}" if result.against else ""), width, 2)
+    yield from _wrapped(f"  {_scenes(result)}; {_ends(result)}", width, 2)
+    for remark in result.remarks:
+        yield from _wrapped(f"  {remark}", width, 2)
+    for each in result.judgements:
+        yield from _wrapped(f"{each.verdict.upper():<9} {each.rule.text}", width, INDENT)
+        yield from _wrapped(f"{'':{INDENT}}{each.values}", width, INDENT)
+        yield from _wrapped(f"{'':{INDENT}}{each.reason} ({each.about})", width, INDENT)
+    yield headline(result)
+
+
+def _wrapped(line: str, width: int, indent: int) -> list[str]:
+    return textwrap.wrap(line, max(width, 40), subsequent_indent=" " * indent, break_on_hyphens=False)
+
+
+def _ends(result: GateResult) -> str:
+    return f"either end of an interval is missed in {100 * result.level:g} % of cases"
+
+
+def _scenes(result: GateResult) -> str:
+    some = ", ".join(result.scenes[:3])
+    return some if len(result.scenes) <= 3 else f"mean of {len(result.scenes)} scenes: {some}, ..."
+
+
+# --- Files ------------------------------------------------------------------------------------------------------------
+
+
+def markdown(result: GateResult) -> str:
+    """A summary for a pull request."""
+    against = f" against {_code(result.against)}" if result.against else ""
+    rows = [
+        f"| {SIGNS[each.verdict]} {each.verdict} | {_code(each.rule.text)} | {each.values} | {_cell(each.reason)}"
+        f" ({each.about}) |"
+        for each in result.judgements
+    ]
+    text = [
+        f"### {SIGNS['fails' if result.failed else 'passes']} semstab gate: {headline(result)}",
+        "",
+        f"{_code(result.new)}{against}, {_cell(_scenes(result))}; {_ends(result)}.",
+        *(f"\n{_cell(remark)}" for remark in result.remarks),
+        "",
+        "| | rule | found | why (for which data) |",
+        "|---|---|---|---|",
+        *rows,
+    ]
+    return "\n".join(text) + "\n"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _code(text: str) -> str:
+    """As code in Markdown, where nothing in it means anything."""
+    return "`" + _cell(text).replace("`", "'") + "`"
+
+
+def as_json(result: GateResult) -> str:
+    """For programs."""
+    rows = [
+        {
+            "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.name,
+            "class": each.rule.class_name, "scene": each.rule.scene, "change": each.rule.change,
+            "limit": each.rule.limit, "new": each.new, "base": each.base, "found": each.found, "reason": each.reason,
+            "about": each.about,
+        }
+        for each in result.judgements
+    ]  # fmt: skip
+    content = {
+        "schema": SCHEMA, "gate": "fails" if result.failed else "passes", "new": result.new,
+        "against": result.against or None, "scenes": result.scenes, "level": result.level,
+        "undecided": result.undecided, "remarks": result.remarks, "rules": [to_json(row) for row in rows],
+    }  # fmt: skip
+    return json.dumps(to_json(content), indent=2) + "\n"
+
+
+def junit(result: GateResult) -> str:
+    """JUnit XML: a test case a rule; one that is undecided is skipped, or a failure where that fails."""
+    undecided_fails = result.undecided == "fail"
+    failures = result.count("fails") + (result.count("undecided") if undecided_fails else 0)
+    skipped = 0 if undecided_fails else result.count("undecided")
+    suite = ElementTree.Element(
+        "testsuite", name="semstab gate", tests=str(len(result.judgements)), failures=str(failures), errors="0",
+        skipped=str(skipped),
+    )  # fmt: skip
+    for each in result.judgements:
+        case = ElementTree.SubElement(suite, "testcase", classname="semstab.gate", name=_xml(each.rule.text), time="0")
+        if each.verdict == "fails" or (each.verdict == "undecided" and undecided_fails):
+            ElementTree.SubElement(case, "failure", message=_xml(f"{each.values}: {each.reason}"))
+        elif each.verdict == "undecided":
+            ElementTree.SubElement(case, "skipped", message=_xml(f"undecided: {each.reason}"))
+        ElementTree.SubElement(case, "system-out").text = _xml(_story(each))
+    ElementTree.indent(suite)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(suite, encoding="unicode") + "\n"
+
+
+def _story(each: Judgement) -> str:
+    return f"{each.values}; {each.reason} ({each.about})"
+
+
+def _xml(text: str) -> str:
+    """Without what XML 1.0 has no way to write."""
+    return re.sub(r"[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
+
+
+WRITERS: Mapping[str, Callable[[GateResult], str]] = {".xml": junit, ".md": markdown, ".json": as_json}
+
+
+def require_formats(files: Sequence[Path]) -> None:
+    """Raise ConfigError for a file whose suffix names no format, before anything is computed."""
+    for file in files:
+        if file.suffix.lower() not in WRITERS:
+            raise ConfigError(f"{file}: format '{file.suffix}' is not known; use .xml (JUnit), .md or .json")
+
+
+def write(result: GateResult, file: Path) -> None:
+    """In the format that the file's suffix names."""
+    write_text(file, WRITERS[file.suffix.lower()](result))

@@ -1,0 +1,474 @@
+"""Any dataset as posed folders: plain files of depth, poses and labels, from which the same voxels come."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from semstab.check.conventions import KNOWN_SCALES
+from semstab.check.reprojection import evenly, reader
+from semstab.config import Config
+from semstab.core.files import (
+    FolderLock,
+    atomic_path,
+    content_key,
+    read_json,
+    remove_leftovers,
+    write_json,
+    write_png,
+    write_text,
+)
+from semstab.core.json_form import from_json
+from semstab.core.prefetch import prefetch
+from semstab.core.types import Float32, Float64, UInt16
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
+from semstab.datasets.files.labels import LABEL_SPACE_FILE
+from semstab.datasets.formats.disk import read_intrinsics
+from semstab.datasets.formats.images import MILLIMETRES
+from semstab.datasets.geometry.cameras import UP_AXES
+from semstab.datasets.posed_folder import SETTINGS_FILE
+from semstab.errors import ConfigError, DataError
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import LabelSpace
+from semstab.model.results import slug
+from semstab.task import frame_indices, selected
+
+# A posed folder that is being written: each file whole or not there, what is there already kept.
+
+SCHEMA = 1
+"""Version of conversion.json."""
+
+CONVERSION_FILE = "conversion.json"
+SCORES_SUFFIX = "-scores"
+"""What posed_folder adds to the name of a folder of scores."""
+
+MAX_UINT16 = 65535
+LONGEST_NAME = 200
+"""Bytes of a folder's name."""
+
+
+@dataclass(frozen=True)
+class DepthFormat:
+    """16-bit PNG, `scale` units in a metre; or where scale is None .npy files of float32 metres."""
+
+    scale: float | None
+
+    @property
+    def suffix(self) -> str:
+        """Of its files."""
+        return ".npy" if self.scale is None else ".png"
+
+    def __str__(self) -> str:
+        return "float32 .npy" if self.scale is None else f"16-bit PNG, {self.scale:g} units a metre"
+
+    def stored(self, depth: Float32, tolerance: float) -> npt.NDArray[Any] | None:
+        """What a file of this format holds; None where a pixel would be off by more than `tolerance` metres."""
+        if self.scale is None:
+            return depth
+        units, error = quantised(depth, self.scale)
+        return units if error <= tolerance else None
+
+
+def quantised(depth: Float32, scale: float) -> tuple[UInt16, float]:
+    """Depth in whole units of 1 / scale metres, invalid pixels 0, and by how many metres the worst pixel is off.
+
+    The error is infinite where depth does not fit into 16 bits, or a valid pixel would become invalid.
+    """
+    valid = (depth > 0) & (depth < np.inf)
+    units = np.rint(depth.astype(np.float64) * scale, where=valid, out=np.zeros(depth.shape))
+    if not valid.any():
+        return units.astype(np.uint16), 0.0
+    if units[valid].min() < 1 or units.max() > MAX_UINT16:
+        return np.zeros(depth.shape, dtype=np.uint16), np.inf
+    back = np.divide(units.astype(np.uint16), scale, dtype=np.float32, casting="same_kind")  # as it is read
+    return units.astype(np.uint16), float(np.abs(back.astype(np.float64) - depth)[valid].max())
+
+
+def depth_format(depths: Sequence[Float32], tolerance: float) -> DepthFormat:
+    """The 16-bit format that holds these images best, exactly if there is one; floats where none is good enough."""
+    scales = sorted(KNOWN_SCALES, key=lambda scale: (scale != MILLIMETRES, scale))
+    errors = {scale: max(quantised(depth, scale)[1] for depth in depths) for scale in scales}
+    best = min(scales, key=lambda scale: errors[scale])
+    return DepthFormat(best if errors[best] <= tolerance else None)
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """What conversion.json says that a later start needs."""
+
+    key: str
+    depth_scale: float | None
+
+    def __post_init__(self) -> None:
+        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
+            raise ValueError(f"depth_scale is {self.depth_scale}")
+
+
+class DepthFormatError(Exception):
+    """A depth image that the folder's 16-bit format cannot hold."""
+
+
+class SceneFolder:
+    """The folder of one scene.
+
+    settings   all that its files depend on; a folder of other settings is not touched
+    tolerance  metres by which stored depth may be off
+
+    Raises ConfigError where the folder holds something else.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], tolerance: float) -> None:
+        self.path = path
+        self._tolerance = tolerance
+        self._settings = dict(settings)
+        self._key = content_key(self._settings)
+        self.form = self._claim()
+        self._intrinsics: Intrinsics | None = None
+        self._lock: FolderLock | None = None
+
+    def begin(self, form: DepthFormat, scene_settings: Mapping[str, Any]) -> None:
+        """Say how depth is stored, in scene.yaml and for a later start; depth of another format is removed."""
+        if self.form is not None and self.form != form:
+            for file in (self.path / "depth").glob(f"*{self.form.suffix}"):
+                file.unlink()
+        if self._lock is None:
+            self._lock = FolderLock(self.path)
+            for folder in self.path.glob("**/"):
+                remove_leftovers(folder)
+        self.form = form
+        said = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
+        write_json(
+            self.path / CONVERSION_FILE,
+            {"schema": SCHEMA, "key": self._key, "depth_scale": form.scale, "settings": self._settings},
+        )
+        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
+
+    def close(self) -> None:
+        """Let another process have it."""
+        if self._lock is not None:
+            self._lock.release()
+
+    @property
+    def frames(self) -> set[str]:
+        """Names of the frames that are there."""
+        return {file.stem for file in (self.path / "depth").glob("[!.]*")}
+
+    def has_geometry(self, name: str) -> bool:
+        """Whether depth, pose, colour and mask of a frame are there: depth is written last."""
+        assert self.form is not None
+        return self._depth_path(name, self.form).exists()
+
+    def has_labels(self, name: str, backbone: str) -> bool:
+        """Whether a frame's labels or scores are there."""
+        return any(self._label_path(name, backbone, soft).exists() for soft in (False, True))
+
+    def is_soft(self, backbone: str) -> bool:
+        """Whether the backbone's scores were written, not labels."""
+        labels, scores = (self._label_path("", backbone, soft).parent for soft in (False, True))
+        return scores.is_dir() and not labels.is_dir()
+
+    def write_geometry(self, name: str, frame: Frame) -> None:
+        """Write what a frame shows beside labels.
+
+        Raises DepthFormatError, or DataError where its intrinsics are not those of the frames before.
+        """
+        assert self.form is not None
+        stored = self.form.stored(frame.depth, self._tolerance)
+        if stored is None:
+            raise DepthFormatError
+        self._require_same_camera(frame)
+        if frame.color is not None:
+            write_png(self.path / "color" / f"{name}.png", np.ascontiguousarray(frame.color[..., ::-1]))
+        if frame.mask is not None:
+            write_png(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
+        write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.T_wc))
+        path = self._depth_path(name, self.form)
+        if self.form.scale is None:
+            with atomic_path(path) as temporary:
+                np.save(temporary, stored)
+        else:
+            write_png(path, stored)
+
+    def write_labels(self, name: str, frame: Frame, backbone: str) -> None:
+        """Write a frame's label ids, or its scores."""
+        path = self._label_path(name, backbone, frame.scores is not None)
+        if frame.scores is None:
+            assert frame.labels is not None
+            write_png(path, frame.labels)
+            return
+        with atomic_path(path) as temporary:
+            np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))
+
+    def write_classes(self, backbone: str, space: LabelSpace) -> None:
+        """Write the classes of a backbone beside its maps."""
+        folder = self._label_path("", backbone, self.is_soft(backbone)).parent
+        space.save(folder / LABEL_SPACE_FILE)
+
+    def read_as(self, backbone: str) -> str:
+        """The name under which the backbone is found in the folder."""
+        return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else folder_name(backbone)
+
+    def _depth_path(self, name: str, form: DepthFormat) -> Path:
+        return self.path / "depth" / f"{name}{form.suffix}"
+
+    def _label_path(self, name: str, backbone: str, soft: bool) -> Path:
+        if soft:
+            return self.path / "scores" / _bare(backbone) / f"{name}.npz"
+        return self.path / "labels" / folder_name(backbone) / f"{name}.png"
+
+    def _require_same_camera(self, frame: Frame) -> None:
+        """One intrinsics.txt serves all frames."""
+        path = self.path / "intrinsics.txt"
+        if self._intrinsics is None and not path.exists():
+            write_text(path, matrix_text(frame.intrinsics.matrix))
+        self._intrinsics = self._intrinsics or read_intrinsics(path)
+        if frame.intrinsics != self._intrinsics:
+            raise DataError(
+                f"{frame.where('depth')}: intrinsics {frame.intrinsics} differ from those of the frames before"
+                f" ({self._intrinsics}), and a posed folder has one camera; convert the frames of each by themselves"
+            )
+
+    def _claim(self) -> DepthFormat | None:
+        """How an earlier start stored depth; None where there was none."""
+        manifest = self.path / CONVERSION_FILE
+        if not manifest.is_file():
+            if self.path.exists() and (not self.path.is_dir() or any(self.path.glob("[!.]*"))):
+                raise ConfigError(f"{self.path}: is there already and holds no conversion; choose another --out")
+            return None
+        try:
+            there = from_json(_Conversion, read_json(manifest), manifest)
+        except DataError as error:
+            raise DataError(f"{manifest}: damaged; delete {self.path}, and the scene is converted again") from error
+        if there.key != self._key:
+            raise ConfigError(
+                f"{self.path}: was converted from other data or with other settings; choose another --out"
+            )
+        return DepthFormat(there.depth_scale)
+
+
+def folder_name(name: str) -> str:
+    """The name itself where a folder can be called so, or else its `slug`."""
+    fits = name.isprintable() and len(name.encode()) <= LONGEST_NAME and not set(name) & set("/\\")
+    return name if fits and name[:1] not in ("", ".", "-") else slug(name)
+
+
+def matrix_text(matrix: Float64) -> str:
+    """A matrix as text, one row a line, that reads back to the same numbers."""
+    return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix)
+
+
+def _bare(backbone: str) -> str:
+    """The folder below scores/: posed_folder adds the suffix to its name."""
+    return folder_name(backbone.removesuffix(SCORES_SUFFIX))
+
+
+__all__ = ["Converted", "convert", "convert_scene"]
+
+PROBED_FRAMES = 3
+"""Frames that are looked at to see whether depth fits into 16 bits; where a later one does not, all are floats."""
+
+Reporter = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What came of a scene.
+
+    folder   where it is
+    frames   how many were selected, of which `written` were not there before
+    depth    how its depth is stored, in words
+    renamed  label sources that have another name in the folder
+    lost     what a posed folder does not hold
+    """
+
+    scene: str
+    folder: Path
+    frames: int
+    written: int
+    depth: str
+    renamed: dict[str, str]
+    lost: tuple[str, ...]
+
+
+def convert(
+    config: Config, out: str | Path, *, depth_error: float = 0.0, progress: Reporter = lambda what, done, total: None
+) -> Iterator[Converted]:
+    """Write the scenes, frames and label sources that a resolved configuration selects to OUT/SCENE, one by one.
+
+    Where no label source is named, all are written, the ground truth too. Files that an earlier start finished are
+    kept. Depth becomes 16-bit PNG where no pixel is off by more than `depth_error` metres, else float32 .npy; with 0
+    the folder gives the voxels of the source. `progress` is told of each frame: what, how many are done, of how many.
+
+    Raises ConfigError for a folder that holds something else, DataError for frames that a posed folder cannot hold.
+    """
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
+        yield convert_scene(dataset.scene(name), config, Path(out) / folder_name(name), depth_error, progress)
+
+
+def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Reporter) -> Converted:
+    """Write one scene; see `convert`."""
+    known = (*scene.backbones, *((GROUND_TRUTH,) if scene.ground_truth else ()))
+    backbones = selected(config.backbones, known, (), "backbone", scene.name)
+    indices = frame_indices(scene, config, backbones)
+    settings = {
+        "dataset": config.dataset.model_dump(mode="json"),
+        "scene": scene.name,
+        "depth_error": depth_error,
+    }
+    folder = SceneFolder(path, settings, depth_error)
+    if others := folder.frames - set(map(_name, indices)):
+        raise ConfigError(f"{path}: holds frame {min(others)}, which is not selected now; choose another --out")
+    _require_places(scene, backbones)
+    work = _Work(scene, indices, backbones, folder, progress)
+    up = _up_axis(scene)
+    said: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
+    said |= ({"up_axis": up} if up else {}) | _georeference(scene)
+    with contextlib.closing(folder):
+        folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
+        try:
+            written = work.write()
+        except DepthFormatError:
+            folder.begin(DepthFormat(None), said)
+            written = work.write()
+    return Converted(
+        scene=scene.name,
+        folder=path,
+        frames=len(indices),
+        written=written,
+        depth=str(folder.form),
+        renamed={name: folder.read_as(name) for name in backbones if folder.read_as(name) != name},
+        lost=tuple(work.lost()),
+    )
+
+
+@dataclass
+class _Work:
+    """The frames of a scene that go into a folder, by label source."""
+
+    scene: Scene
+    indices: Sequence[int]
+    backbones: Sequence[str]
+    folder: SceneFolder
+    progress: Reporter
+    timed: bool = False
+    without_classes: tuple[str, ...] = ()
+
+    @property
+    def sources(self) -> Sequence[str | None]:
+        """The label sources; one, None, where there are no labels."""
+        return self.backbones or (None,)
+
+    def probe(self) -> list[Float32]:
+        """Depth of some frames."""
+        read = reader(self.scene, self.sources[0])
+        return [read(self.indices[position]).depth for position in evenly(len(self.indices), PROBED_FRAMES)]
+
+    def write(self) -> int:
+        """Write what is not there, and say how many frames were not complete."""
+        written = set()
+        for source in self.sources:
+            missing = [index for index in self.indices if not self._has(index, source)]
+            written.update(missing)
+            for done, fetched in enumerate(prefetch(self._reading(source), missing), start=1):
+                self._write_frame(fetched.item, source)
+                self.progress(f"{self.scene.name} · {source or 'geometry'}", done, len(missing))
+            if source is not None:
+                self._write_classes(source)
+        return len(written)
+
+    def lost(self) -> Iterator[str]:
+        """What a posed folder does not hold."""
+        if self.timed:
+            yield "time stamps"
+        if self.scene.up is not None and _up_axis(self.scene) is None:
+            yield "the up direction, which is no axis"
+        for name in self.without_classes:
+            yield f"the classes of {name}, which are not known; write a {LABEL_SPACE_FILE} for them"
+
+    def _has(self, index: int, source: str | None) -> bool:
+        name = _name(index)
+        return self.folder.has_geometry(name) and (source is None or self.folder.has_labels(name, source))
+
+    def _reading(self, source: str | None) -> Callable[[int], Frame]:
+        if source is None:
+            return reader(self.scene, None, color=True)
+        return lambda index: self.scene.frame(index, source, color=not self.folder.has_geometry(_name(index)))
+
+    def _write_frame(self, frame: Frame, source: str | None) -> None:
+        name = _name(frame.index)
+        self.timed = self.timed or frame.timestamp is not None
+        if not self.folder.has_geometry(name):
+            self.folder.write_geometry(name, frame)
+        if source is not None and not self.folder.has_labels(name, source):
+            if frame.scores is not None and f"{source}{SCORES_SUFFIX}" in self.backbones:
+                raise ConfigError(f"{source} and {source}{SCORES_SUFFIX} would get one folder; choose with --backbone")
+            self.folder.write_labels(name, frame, source)
+
+    def _write_classes(self, source: str) -> None:
+        try:
+            space = self.scene.label_space(source)
+        except DataError:
+            self.without_classes += (source,)
+        else:
+            self.folder.write_classes(source, space)
+
+
+def _require_places(scene: Scene, backbones: Sequence[str]) -> None:
+    """Each label source needs a folder of its own."""
+    folders = [folder_name(name) for name in backbones]
+    if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
+        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
+
+
+def _name(index: int) -> str:
+    """The name of a frame's files: frames keep their order, and their number where all are converted."""
+    return f"{index:06d}"
+
+
+def _georeference(scene: Scene) -> dict[str, Any]:
+    """The settings that say where the scene lies on Earth, where that is known."""
+    known = scene.georeference
+    return {} if known is None else {"crs": known.crs, "offset": list(known.offset)}
+
+
+def _up_axis(scene: Scene) -> str | None:
+    """The name of the world's up axis, where it is one."""
+    return next((name for name, axis in UP_AXES.items() if scene.up is not None and (scene.up == axis).all()), None)
+
+
+# A conversion in the terminal: a bar while it works, and a line a scene.
+
+
+@contextmanager
+def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """Frames written of one label source; to be called with what, how many are done, of how many."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
+        work = bar.add_task("starting", total=None)
+        yield lambda what, done, total: bar.update(work, description=what, completed=done, total=total)
+
+
+def print_converted(converted: Converted, console: Console) -> None:
+    """What was written, and what is different or missing in it."""
+    kept = converted.frames - converted.written
+    there = f", {kept} of them from before" if kept else ""
+    console.print(
+        f"{converted.scene}: {converted.frames} frames{there}, depth as {converted.depth}: {converted.folder}",
+        soft_wrap=True,
+    )
+    for old, new in converted.renamed.items():
+        console.print(f"  {old} is called {new} there")
+    for lost in converted.lost:
+        console.print(f"  not kept: {lost}")

@@ -1,0 +1,266 @@
+"""Files that are either there and whole, or not there: written beside, then renamed."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import math
+import os
+import stat
+import struct
+import tempfile
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from semstab.core.json_form import to_json
+from semstab.core.types import UInt8
+from semstab.errors import ConfigError, DataError, one_line
+
+TEMPORARY = ".semstab-"
+"""How names of files begin that are not whole yet."""
+
+MAX_YAML_BYTES = 2**24
+MAX_ALIASED = 10**5
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; rename it to `path` if the block succeeds, else remove it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:  # one from writing, a full disk for example, does not know its file
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+class FolderLock:
+    """A folder that one process owns until `release`, or until it dies. What a killed one left half-written is removed.
+
+    Raises ConfigError where another one has it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.mkdir(parents=True, exist_ok=True)
+        self._handle: int | None = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self.release()
+            raise ConfigError(f"{path}: another process works on it; wait for it, or choose another folder") from error
+        remove_leftovers(path)
+
+    def release(self) -> None:
+        """Let another process have it."""
+        if self._handle is not None:
+            os.close(self._handle)
+        self._handle = None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `atomic_path` left where its process was killed; nobody else may be writing there."""
+    for path in folder.glob(f"{TEMPORARY}*"):
+        path.unlink()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write `text` atomically, in UTF-8."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write `value`, a dataclass for example, atomically as JSON; undefined numbers (NaN, infinity) become null."""
+    write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def csv_text(text: str) -> str:
+    """A name for a cell of a CSV file, in which a spreadsheet sees no formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
+def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
+    """Write a grey or BGR image atomically."""
+    import cv2
+
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def write_stack(
+    path: Path, key: str, layers: Iterable[npt.NDArray[Any]], count: int, dtype: np.dtype[Any], compressed: bool
+) -> None:
+    """An .npz file of one array, of `count` layers of one shape that come one after the other."""
+    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with (
+        zipfile.ZipFile(path, "w", method, compresslevel=1) as archive,
+        archive.open(f"{key}.npy", "w", force_zip64=True) as file,
+    ):
+        for number, layer in enumerate(layers):
+            if number == 0:
+                shape = (count, *layer.shape)
+                header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(file, header)
+            file.write(np.ascontiguousarray(layer, dtype=dtype).data)
+
+
+def cache_folder() -> Path:
+    """Where what can be made again is kept: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
+    if own := os.environ.get("SEMSTAB_CACHE"):
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab"
+
+
+def content_key(settings: Mapping[str, Any]) -> str:
+    """A hash of settings that JSON holds, in any order."""
+    return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def keep_only(written: Collection[Path], folder: Path) -> None:
+    """Remove other files of the same kinds from a folder of results: an earlier start's, which hold no longer."""
+    kinds = {path.suffix for path in written}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.suffix in kinds and path not in written:
+            path.unlink()
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The content of JSON. Raises ValueError where it is none, or nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file; raise DataError with the file's name where it cannot be read."""
+    try:
+        with open_file(path) as file:
+            return parse_json(file.read().decode("utf-8"))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
+
+
+def read_limited(path: str | Path, limit: int) -> bytes:
+    """The content of a file. Raises OSError, too, for what is no file (a pipe, a device), or larger than the limit."""
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"{size} bytes are too many for such a file, at most {limit}")
+        return file.read()
+
+
+def open_file(path: str | Path) -> BufferedReader:
+    """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "no file can be called so")
+    file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  an opener; the caller closes it
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return file
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a pipe at once, though nobody writes to it."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The content of a YAML text, without tags that make objects.
+
+    Raises ConfigError in one line that starts with `where` where it is not valid.
+    """
+    try:
+        loader = yaml.SafeLoader(text)
+        node = loader.get_single_node()
+        values: dict[int, float] = {}
+        if _expanded(node, values) > len(values) + MAX_ALIASED:
+            raise ConfigError(f"{where}: its aliases (*name) stand for more than {MAX_ALIASED} values; write them out")
+        return None if node is None else loader.construct_document(node)
+    except ConfigError:
+        raise
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
+        # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
+        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
+
+
+def _expanded(node: Any, known: dict[int, float]) -> float:
+    """How many values a YAML node stands for with its aliases written out: infinity where it holds itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        parts = getattr(node, "value", ())
+        parts = parts if isinstance(parts, list) else ()
+        children = (child for part in parts for child in (part if isinstance(part, tuple) else (part,)))
+        known[id(node)] = 1 + sum(_expanded(child, known) for child in children)
+    return known[id(node)]
+
+
+# Arrays that are kept for a later start: read as they were written, or not at all.
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+DIGEST = "digest"
+
+DAMAGED = (
+    OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
+    struct.error, tokenize.TokenError, SyntaxError,
+)  # fmt: skip
+"""What numpy raises on a damaged .npz file."""
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, packed: bool = True) -> None:
+    """Write numbers and arrays of numbers by name, atomically, with a digest of all of them; packed: compressed."""
+    made: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    made[DIGEST] = _digest(made)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        (np.savez_compressed if packed else np.savez)(file, **made)
+
+
+def read_arrays(path: Path) -> Arrays | None:
+    """What `write_arrays` wrote; None where it is not there, or not as it was."""
+    try:
+        with path.open("rb") as file, np.load(file) as content:
+            arrays = {name: content[name] for name in content.files}
+    except DAMAGED:
+        return None
+    digest = arrays.pop(DIGEST, None)
+    whole = all(isinstance(array, np.ndarray) for array in arrays.values())  # else bytes, where it is none
+    return arrays if whole and digest is not None and np.array_equal(digest, _digest(arrays)) else None
+
+
+def _digest(arrays: Arrays) -> UInt8:
+    """Of names, types, shapes and numbers."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, array in sorted(arrays.items()):
+        digest.update(repr((name, array.dtype.str, array.shape)).encode() + np.ascontiguousarray(array).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)

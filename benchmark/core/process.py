@@ -1,0 +1,187 @@
+"""What a process that fuses frame after frame asks of its threads, of the system's memory, and of rerun."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
+
+# The memory that a process has and can still take: of the machine, of its control groups, of its own limit.
+
+PROC, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
+
+V1_FILES = ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file"))
+V2_FILES = ("memory.max", "memory.current", ("inactive_file", "active_file"))
+"""Names of a group's limit, of what it uses, and of the entries of memory.stat that say what of that is page cache."""
+
+
+def available_bytes() -> int:
+    """Memory that this process can still take."""
+    import psutil
+
+    return max(0, min([int(psutil.virtual_memory().available), *_of_groups(PROC, CGROUPS), *_of_process()]))
+
+
+def resident_bytes() -> int:
+    """Memory that this process takes."""
+    return int(_process(os.getpid()).memory_info().rss)
+
+
+@functools.cache
+def _process(pid: int):  # type: ignore[no-untyped-def]
+    import psutil
+
+    return psutil.Process(pid)
+
+
+def group_bytes(proc: Path, cgroups: Path) -> int | None:
+    """What the control groups of a process leave to it; None where none of them has a limit.
+
+    proc     as /proc/self: its file `cgroup` names the groups
+    cgroups  as /sys/fs/cgroup: version 2, or version 1 with a folder `memory`
+    """
+    return min(_of_groups(proc, cgroups), default=None)
+
+
+def _of_groups(proc: Path, cgroups: Path) -> Iterator[int]:
+    """Of each group from the process's own up to the root: every one of them bounds those below it."""
+    for controllers, path in _groups(proc):
+        root, files = (cgroups, V2_FILES) if not controllers else (cgroups / "memory", V1_FILES)
+        if controllers and "memory" not in controllers:
+            continue
+        own = root / path.lstrip("/")
+        for folder in (own, *own.parents):  # in a container, the path may be that of the host: then only the root is
+            if folder.is_relative_to(root) and (left := _left(folder, *files)) is not None:
+                yield left
+
+
+def _groups(proc: Path) -> Iterator[tuple[list[str], str]]:
+    """Controllers and path of each group, by lines such as '4:memory:/user' or, of version 2, '0::/user'."""
+    try:
+        lines = (proc / "cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = (*line.split(":", 2), "", "")[:3]
+        yield [name for name in controllers.split(",") if name], path
+
+
+def _left(folder: Path, limit: str, used: str, cache: tuple[str, ...]) -> int | None:
+    """A group's limit less what it uses; page cache is given back when memory is short."""
+    try:
+        most, taken = ((folder / name).read_text().strip() for name in (limit, used))
+        stat = _stat(folder)
+        return None if most == "max" else int(most) - int(taken) + sum(stat.get(name, 0) for name in cache)
+    except (OSError, ValueError):
+        return None
+
+
+def _stat(folder: Path) -> Mapping[str, int]:
+    lines = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
+    return {name: int(value) for name, value in lines}
+
+
+def _of_process() -> Iterator[int]:
+    """What `ulimit -v` leaves of the address space."""
+    try:
+        import resource
+    except ImportError:
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY:
+        yield limit - int(_process(os.getpid()).memory_info().vms)
+
+
+TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
+"""The parameters' numbers in glibc's malloc.h; see mallopt(3)."""
+
+LARGEST_IMAGE = 64 << 20
+"""Bytes up to which freed memory is used again: the depth of a 3840x2160 frame has 33 million."""
+KEPT = 1 << 30
+"""Bytes of freed memory that are kept."""
+
+
+def settle() -> None:
+    """Prepare this process; to be called before any thread is started. Changes no result.
+
+    Threads that wait do not spin, for they would take the time of those that decode the next frames. Memory of a
+    decoded image is used for the next one, instead of being returned to the system, which clears it each time (glibc).
+    Rerun logs nothing of its own to the terminal: what cannot be recorded is said in one line.
+    """
+    os.environ.setdefault("RUST_LOG", "off")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if hasattr(libc := _libc(), "gnu_get_libc_version"):
+        for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, KEPT), (ARENA_MAX, 1)):
+            libc.mallopt(parameter, value)
+
+
+def give_back(*, least: int = 0) -> None:
+    """Return freed memory to the system at once: what `settle` has kept for the next images (glibc).
+
+    least  bytes that the process must have: of a small one what comes next uses it again, and need not clear it
+    """
+    if resident_bytes() >= least and hasattr(libc := _libc(), "malloc_trim"):
+        libc.malloc_trim(0)
+
+
+@functools.cache
+def _libc() -> Any:
+    """The C library; nothing where its memory cannot be settled."""
+    import ctypes
+
+    return ctypes.CDLL(None) if sys.platform == "linux" else None
+
+
+def follow_parent(listening: Connection) -> None:
+    """Let this worker process end with its parent, which holds the other end of a pipe, and leave Ctrl-C to it."""
+    from multiprocessing.connection import wait
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches all processes; the parent decides
+
+    def end_with_parent() -> None:
+        wait([listening])  # readable once the other end is closed: by the parent, or by its death
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+# Wall-clock seconds by stage.
+
+
+class Stopwatch:
+    """Adds up wall-clock seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[Lap]:
+        """Time the block; the yielded lap has its own seconds once it is over."""
+        lap = Lap()
+        started = time.perf_counter()
+        try:
+            yield lap
+        finally:
+            lap.seconds = time.perf_counter() - started
+            self.seconds[stage] += lap.seconds
+
+
+@dataclass
+class Lap:
+    """What one timed block took."""
+
+    seconds: float = math.nan

@@ -1,0 +1,243 @@
+"""What was found of a plan's units, and the result that they make together."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import itertools
+import platform
+import resource
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from semstab.check import Verdict
+from semstab.config import BACKENDS, BASE, Config
+from semstab.core.process import Stopwatch
+from semstab.datasets import GROUND_TRUTH
+from semstab.engine.evaluation import comparison
+from semstab.engine.folder import Folder
+from semstab.engine.units import Plan, PlannedUnit, must_agree
+from semstab.metrics import compare
+from semstab.metrics.agreement import together
+from semstab.model.events import Events
+from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
+from semstab.model.results import Agreement, VoxelAdvice
+from semstab.model.tiles import Tiles, side_by_side
+from semstab.model.voxels import VoxelTable
+from semstab.statistics import BackboneComparison, Looks, claimed_together
+from semstab.statistics.versus.backbones import Region, Regions
+
+
+@dataclass
+class Found:
+    """What is known of the units, by their identity: the content of their files, or why they failed.
+
+    geometry  of the scenes of which something was computed
+    advice    where the voxel size lies in them
+    causes    what was raised in this process, by its message
+    """
+
+    contents: dict[str, UnitContent]
+    kept: int
+    geometry: dict[str, Verdict] = field(default_factory=dict)
+    advice: dict[str, VoxelAdvice] = field(default_factory=dict)
+    errors: dict[str, str] = field(default_factory=dict)
+    causes: dict[str, BaseException] = field(default_factory=dict)
+    watch: Stopwatch = field(default_factory=Stopwatch)
+
+    def inputs(self, plan: Plan) -> dict[str, str]:
+        """The digest of the input of each base unit, and of each source of regions."""
+        return {
+            f"{each.unit.scene}/{each.unit.backbone}": self.contents[each.identity].input
+            for each in plan.every()
+            if each.variation.sweep in (BASE, REGIONS) and each.identity in self.contents
+        }
+
+    def counts(self) -> dict[str, Any]:
+        """How many units there are, were kept from before, computed and failed."""
+        failed = len(self.errors)
+        computed = len(self.contents) - self.kept
+        return {"units": len(self.contents) + failed, "kept": self.kept, "computed": computed, "failed": failed}
+
+
+def result_of(plan: Plan, folder: Folder, found: Found) -> Result:
+    """The result of all units that there are: how they agree, and how backbones compare."""
+    contents, errors = found.contents, found.errors
+    records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
+    tables = Tables(most=len({record.unit.backend for record in records}))
+    with found.watch("agreement"):
+        agreement = (*_samples(plan, contents), *_agreement(plan.config, records, tables))
+        compared = tuple(_compared(plan.config, records, tables))
+    with found.watch("comparisons"):
+        scenes = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
+        comparisons = claimed_together(scenes)
+    return Result(
+        name=plan.config.name,
+        backend=plan.config.backends[0].name,
+        records=records,
+        failures=tuple(
+            Failure(each.unit, each.variation, errors[each.identity])
+            for each in plan.every()
+            if each.identity in errors
+        ),
+        agreement=agreement,
+        comparisons=comparisons,
+        up=_up_axes(plan.units, contents),
+        georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
+        regions=tuple(_regions(plan, contents)),
+        compared=compared,
+        advice=found.advice,
+    )
+
+
+def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, VoxelAdvice]:
+    """Where the voxel size lies in each scene, as it was looked at when its base units were computed."""
+    return {
+        each.unit.scene: content.advice
+        for each in plan.units
+        if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.advice is not None
+    }
+
+
+def _samples(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[Agreement]:
+    """Of units with the reference, on a sample of their voxels."""
+    for each in plan.units:
+        content = contents.get(each.identity)
+        if each.sampled and content is not None and content.checked is not None:
+            yield content.checked
+
+
+def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
+    """Of each pair of backends that must agree, on each scene and backbone that both fused."""
+    checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
+    for group in _by_backend(records).values():
+        there = [record for record in group if record.unit.backend in checked]
+        for a, b in itertools.combinations(there, 2):
+            yield _alike(config, a, b, tables)
+
+
+def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
+    """Of the first backend and each other one, where one of the two need not agree."""
+    free = {backend.name for backend in config.fused_by() if not must_agree(backend)}
+    for first, *others in _by_backend(records).values():
+        for other in others:
+            if free & {first.unit.backend, other.unit.backend}:
+                yield _alike(config, first, other, tables)
+
+
+def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
+    """How far two units agree, voxel by voxel; tile by tile where one is in tiles."""
+    units = a.unit, b.unit
+    maps = [Tiles.open(file, VoxelTable) for record in (a, b) if (file := record.voxels_file) is not None]
+    if not (a.in_tiles or b.in_tiles):
+        return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
+    return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
+
+
+def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
+    """The records at the base settings of each scene and backbone, those of the first backend first."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.variation.sweep in (BASE, BACKENDS):
+            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
+    return groups
+
+
+def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
+    """The base units of each scene beside each other; accuracy where there is ground truth."""
+    base = [record for record in records if record.variation.sweep == BASE]
+    for scene in dict.fromkeys(record.unit.scene for record in base):
+        there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
+        if len(there) > 1:
+            regions = _regions_of(there, config, tables)
+            kept = {record.unit.backbone: record.looks_file for record in there}
+            looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
+            found = comparison(scene, regions, looks if len(looks) == len(there) else None)
+            if found is not None:
+                yield found
+
+
+def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
+    """The maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
+    names = [record.unit.backbone for record in there]
+    in_tiles = any(record.in_tiles for record in there)
+    files = [record.events_file for record in there if config.events]
+    logs: list[Tiles[Any]] = [Tiles.open(file, Events) for file in files if file is not None and file.exists()]
+    logs = logs if len(logs) == len(there) else []
+    truths = [Tiles.open(file, VoxelTable) for record in there if (file := record.truth_file) is not None][:1]
+    maps = [
+        Tiles.open(file, VoxelTable) if in_tiles else Tiles.of(tables.of(record))
+        for record in there
+        if (file := record.voxels_file) is not None
+    ]
+
+    def regions() -> Iterator[Region]:
+        for own in side_by_side([*maps, *logs, *truths]):
+            found, events, truth = (
+                own[: len(maps)],
+                own[len(maps) : len(maps) + len(logs)],
+                own[len(maps) + len(logs) :],
+            )
+            log = dict(zip(names, events, strict=True)) if logs else None
+            yield Region(dict(zip(names, found, strict=True)), log, truth[0] if truth else None)
+
+    return regions
+
+
+def _regions(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[RegionFlicker]:
+    for each in plan.regions:
+        content = contents.get(each.identity)
+        if content is not None and content.regions is not None:
+            yield content.regions
+
+
+def _up_axes(
+    units: Sequence[PlannedUnit], contents: Mapping[str, UnitContent]
+) -> dict[str, tuple[float, float, float]]:
+    """Each scene's up axis, as the base unit of its first backbone has it that knows one."""
+    axes: dict[str, tuple[float, float, float]] = {}
+    for each in units:
+        content = contents.get(each.identity)
+        if each.variation.sweep == BASE and content is not None and content.up is not None:
+            axes.setdefault(each.unit.scene, content.up)
+    return axes
+
+
+# manifest.json: where a run's numbers come from.
+
+SCHEMA = 1
+"""Version of manifest.json."""
+
+REPORTED_PACKAGES = ("numpy", "open3d", "opencv-python-headless", "pyarrow", "rerun-sdk", "trimesh")
+
+
+def manifest(
+    config: Config, inputs: Mapping[str, str], seconds: Mapping[str, float], command: Sequence[str]
+) -> dict[str, Any]:
+    """The content of manifest.json: versions, digests of the inputs, wall-clock seconds by stage, peak memory."""
+    return {
+        "schema": SCHEMA,
+        "semstab": _version("semstab"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {name: _version(name) for name in REPORTED_PACKAGES},
+        "command": list(command),
+        "seed": config.dataset.options.get("seed"),
+        "inputs": dict(inputs),
+        "seconds": dict(seconds),
+        "peak_memory_bytes": _peak_memory(),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _peak_memory() -> int:
+    """Peak resident memory of this process; Linux counts it in kB, macOS in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,312 @@
+"""A given cloud, classified: each point takes what is known of its voxel; the cloud is never whole in memory."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.at_hand import AtHand
+from semstab.core.files import atomic_path
+from semstab.core.types import Float64, Int64
+from semstab.datasets.formats.las_files import opened, points_at_once
+from semstab.errors import ConfigError, DataError
+from semstab.exports import las, ply
+from semstab.exports.voxels import Chosen, Column, Voxels
+from semstab.metrics.agreement import voxel_keys
+from semstab.model.tiles import AT_HAND, Place
+from semstab.model.voxels import VoxelTable
+
+if TYPE_CHECKING:
+    import laspy
+    from scipy.spatial import cKDTree
+
+
+# Which voxel a point belongs to: the one that it lies in, else the nearest within a radius.
+
+NONE = -1
+"""The row of a point that belongs to no voxel."""
+
+
+class VoxelLookup:
+    """Finds voxels of a table by coordinates, those of the scene and an offset; a radius of 0 takes no neighbours."""
+
+    def __init__(self, table: VoxelTable, offset: npt.ArrayLike = (0.0, 0.0, 0.0), radius: float = 0.0) -> None:
+        self.table, self._offset, self._radius = table, np.asarray(offset, dtype=np.float64), radius
+        index = self.table.index.astype(np.int64)
+        self._low, self._high = index.min(axis=0), index.max(axis=0)
+        (self._keys,) = voxel_keys(index)
+
+    @property
+    def bounds(self) -> tuple[Float64, Float64]:
+        """(3,) the lowest and the highest coordinates that may belong to a voxel, metres."""
+        r = self.table.voxel_size
+        return self._low * r + self._offset - self._radius, (self._high + 1) * r + self._offset + self._radius
+
+    def rows(self, points: Float64) -> Int64:
+        """(n,) the voxel of each point (n, 3), a row of the table, or NONE."""
+        return self.nearest(points)[0]
+
+    def nearest(self, points: Float64) -> tuple[Int64, Float64]:
+        """The same, with the distance of its centre, 0 for the voxel that a point lies in."""
+        points = points - self._offset
+        index = np.floor(points / self.table.voxel_size).astype(np.int64)
+        inside = np.flatnonzero(((index >= self._low) & (index <= self._high)).all(axis=1))
+        rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
+        keys = np.ravel_multi_index(tuple((index[inside] - self._low).T), tuple(self._high - self._low + 1))
+        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        met = inside[self._keys[at] == keys]
+        rows[met], apart[met] = at[self._keys[at] == keys], 0.0
+        if self._radius > 0:
+            lost = np.flatnonzero(rows == NONE)
+            rows[lost], apart[lost] = self._around(points[lost])
+        return rows, apart
+
+    def _around(self, points: Float64) -> tuple[Int64, Float64]:
+        """(n,) the voxel whose centre is nearest to each point of the scene, within the radius, and how near."""
+        low, high = (edge - self._offset for edge in self.bounds)
+        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+        rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
+        apart[near], found = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
+        rows[near] = np.where(found < len(self.table), found, NONE)
+        return rows, apart
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.table.centers)
+
+
+CHUNK = 1_000_000
+"""Points at a time."""
+
+MEASURES = ("vss", "op", "category")
+"""What a point takes beside its class where nothing is chosen."""
+
+BEFORE = "classification_before"
+"""The extra dimension that keeps what a LAS cloud was classified as."""
+
+OLD_CODES = 31
+"""The largest code that the point formats before LAS 1.4 have room for."""
+
+
+@dataclass
+class Tally:
+    """How many points there were, how many of them have a voxel, and where they lie."""
+
+    points: int = 0
+    classified: int = 0
+    low: Float64 = field(default_factory=lambda: np.full(3, np.inf))
+    high: Float64 = field(default_factory=lambda: np.full(3, -np.inf))
+
+    def add(self, points: Float64, classified: int) -> None:
+        """A chunk of points (n, 3), of which so many have a voxel."""
+        self.points += len(points)
+        self.classified += classified
+        self.low = np.minimum(self.low, points.min(axis=0, initial=np.inf))
+        self.high = np.maximum(self.high, points.max(axis=0, initial=-np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """What points take of their voxels, (n,) each: the class from 1 on, and the columns; 0 where they have none."""
+
+    label: npt.NDArray[Any]
+    columns: Mapping[str, npt.NDArray[Any]]
+
+
+Finder = Callable[[Float64], Taken]
+Writer = Callable[[Voxels, Path, Path, Finder], None]
+
+
+def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> Tally:
+    """Write the cloud with all its fields, and class, classification (LAS) and the voxels' columns.
+
+    A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else all
+    it takes is 0, class 0 'unclassified'. Classes count from 1.
+    Raises ConfigError for files of different or unknown kinds, DataError for a damaged cloud, or one beside the map.
+    """
+    of_las = partial(_classify_las, asprs=asprs)
+    kinds: dict[str, Writer] = {".las": of_las, ".laz": of_las, ".ply": _classify_ply}
+    write = kinds.get(cloud.suffix.lower())
+    if write is None:
+        raise ConfigError(f"{cloud}: a cloud is a .las, .laz or .ply file")
+    if kinds.get(out.suffix.lower()) is not write:
+        raise ConfigError(f"{out}: {cloud.name} stays what it is; write {out.with_suffix(cloud.suffix)}")
+    if out.exists() and out.samefile(cloud):
+        raise ConfigError(f"{out}: is the cloud itself; choose another file")
+    finder = _Finder(chosen, radius)
+    with atomic_path(out) as temporary:
+        write(chosen.first, cloud, temporary, finder)
+        if not finder.tally.classified:
+            raise _beside(cloud, finder)
+    return finder.tally
+
+
+class _Finder:
+    """Finds what points take, tile by tile; the last few tiles are at hand."""
+
+    def __init__(self, chosen: Chosen, radius: float) -> None:
+        self.chosen, self.tally, self._radius = chosen, Tally(), radius
+        self._lookups = AtHand(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
+
+    def lookup(self, place: Place) -> VoxelLookup:
+        """Of a tile that has voxels."""
+        voxels = self.chosen[place]
+        return VoxelLookup(voxels.table, voxels.offset, self._radius)
+
+    def __call__(self, points: Float64) -> Taken:
+        some, apart = self.chosen.first, np.full(len(points), np.inf)
+        label = np.zeros(len(points), some.classified.dtype)
+        columns = {name: np.zeros(len(points), as_taken(own).dtype) for name, own in some.columns.items()}
+        for place, rows in self._near(points - some.offset):
+            voxels = self.chosen[place]
+            if not len(voxels.table):
+                continue
+            found, distance = self._lookups[place].nearest(points[rows])
+            nearer = distance < apart[rows]
+            to, of = rows[nearer], found[nearer]
+            apart[to], label[to] = distance[nearer], voxels.classified[of]
+            for name, own in columns.items():
+                own[to] = as_taken(voxels.columns[name])[of]
+        self.tally.add(points, int(np.isfinite(apart).sum()))
+        return Taken(label, columns)
+
+    def _near(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
+        """The tiles that may hold the nearest voxels of points (n, 3) of the scene, with the rows (m,) of these."""
+        size, r = self.chosen.size, self.chosen.first.table.voxel_size
+        if size is None:
+            yield (0, 0), np.arange(len(points))
+            return
+        steps = np.linspace(-self._radius, self._radius, 2 + int(2 * self._radius / (size * r)))
+        pairs = [
+            np.column_stack([np.floor((points[:, :2] + shift) / (size * r)).astype(np.int64), np.arange(len(points))])
+            for shift in itertools.product(steps, steps)
+        ]
+        found = np.unique(np.concatenate(pairs), axis=0)
+        places, first = np.unique(found[:, :2], axis=0, return_index=True)
+        for (x, y), rows in zip(places.tolist(), np.split(found[:, 2], first[1:]), strict=True):
+            if (x, y) in self.chosen:
+                yield (x, y), rows
+
+
+def as_taken(column: Column) -> npt.NDArray[Any]:
+    """A column in the type that files have it in."""
+    return ply.as_stored(column.values)
+
+
+def _beside(cloud: Path, finder: _Finder) -> DataError:
+    """What to raise where no point of a cloud has a voxel."""
+    boxes = [finder.lookup(place).bounds for place in finder.chosen.places()]
+    map_box = np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+    there, here = (
+        " to ".join("(" + ", ".join(f"{value:.1f}" for value in corner) + ")" for corner in box)
+        for box in ((finder.tally.low, finder.tally.high), map_box)
+    )
+    georeferenced = finder.chosen.first.georeference is not None
+    mend = "mend the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
+    return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; {mend}")
+
+
+# --- LAS --------------------------------------------------------------------------------------------------------------
+
+
+def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
+    module = las.with_lazrs(cloud)
+    with opened(cloud) as reader:
+        _require_same_crs(voxels, reader.header, cloud)
+        header = _extended(reader.header, voxels)
+        compress = out.suffix.lower() == ".laz"
+        with module.open(out, mode="w", header=header, do_compress=compress) as writer:
+            for points in reader.chunk_iterator(min(CHUNK, points_at_once(reader.header))):
+                writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
+            if extended := _without_copc(reader.evlrs or ()):
+                writer.write_evlrs(type(reader.header.vlrs)(extended))
+
+
+def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:
+    """The cloud's header with the dimensions that its points take."""
+    extended = copy.deepcopy(header)
+    extended.vlrs = type(header.vlrs)(_without_copc(header.vlrs))
+    las.declare(extended, BEFORE, np.uint8, "what was there before")
+    las.declare(extended, "class", voxels.classified.dtype, "1 to K; 0 unclassified")
+    for name, column in voxels.columns.items():
+        las.declare_column(extended, name, column)
+    las.describe(extended, voxels)
+    return extended
+
+
+def _without_copc(records: Iterable[laspy.VLR]) -> list[laspy.VLR]:
+    """The records but those that say in which order a COPC file has its points: it is written as plain LAZ."""
+    return [record for record in records if record.user_id != "copc"]
+
+
+def _classified_points(
+    points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, voxels: Voxels, find: Finder, asprs: Path | None
+) -> laspy.ScaleAwarePointRecord:
+    """A chunk with what its points take."""
+    found = find(np.stack([points.x, points.y, points.z], axis=1))
+    taken = type(points).zeros(len(points), header=header)
+    taken.copy_fields_from(points)
+    if BEFORE not in points.point_format.dimension_names:
+        taken[BEFORE] = points.classification
+    codes = las.codes(voxels, asprs)
+    if header.point_format.id < las.FIRST_OF_1_4:
+        codes[codes > OLD_CODES] = las.UNCLASSIFIED
+    taken.classification = codes[found.label]
+    taken["class"] = found.label
+    for name, values in found.columns.items():
+        taken[name] = values
+    return taken
+
+
+def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> None:
+    """Raise DataError where cloud and run say different projections."""
+    said = header.parse_crs()
+    if said is None or voxels.georeference is None:
+        return
+    from pyproj import CRS
+
+    flat = said.sub_crs_list[0] if said.is_compound else said
+    there, here = (crs.to_epsg() for crs in (flat, CRS.from_wkt(voxels.georeference.crs)))
+    if there is not None and here is not None and there != here:
+        raise DataError(f"{cloud}: is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
+
+
+# --- PLY --------------------------------------------------------------------------------------------------------------
+
+
+def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
+    with cloud.open("rb") as source, out.open("wb") as target:
+        header = ply.Header.read(source, cloud)
+        own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
+        kinds = {"class": voxels.classified.dtype, **{k: as_taken(own).dtype for k, own in voxels.columns.items()}}
+        dtype = np.dtype([*(own | kinds).items()])
+        comments = dict.fromkeys((*header.comments, *ply.legend(voxels)))
+        target.write(ply.Header(dtype, header.count, 0, tuple(comments)).text())
+        for points in _ply_chunks(source, header, cloud):
+            found = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
+            chunk = np.empty(len(points), dtype)
+            for name in own:
+                chunk[name] = points[name]
+            chunk["class"] = found.label
+            for name, values in found.columns.items():
+                chunk[name] = values
+            target.write(chunk.tobytes())
+
+
+def _ply_chunks(source: Any, header: ply.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
+    for first in range(0, header.count, CHUNK):
+        wanted = min(CHUNK, header.count - first)
+        points = np.fromfile(source, header.dtype, wanted)
+        if len(points) < wanted:
+            raise DataError(f"{cloud}: ends after {first + len(points):,} of {header.count:,} points; it is cut short")
+        yield points

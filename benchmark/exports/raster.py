@@ -1,0 +1,223 @@
+"""GeoTIFF: the map from above, with a band of classes and one of each measure; and the classes in their colours."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.files import atomic_path
+from semstab.core.types import Float64, Int64
+from semstab.errors import ConfigError, MissingDependencyError
+from semstab.exports.voxels import Chosen, Column, Voxels, together
+from semstab.metrics import CATEGORIES, categories
+from semstab.model.georeference import INSTALL
+from semstab.model.information import normalise
+from semstab.report.figures.topdown import covered, level_axes
+
+MEASURES = ("vss", "entropy", "op")
+"""The bands of measures where none is chosen."""
+
+LARGEST = 10**10
+"""Cells of a raster."""
+
+WINDOW = 1024
+"""Cells along a side of what is written at a time: whole blocks of the file."""
+
+STABLE = len(CATEGORIES) - 1
+
+
+def write(chosen: Chosen, path: Path, cell: int = 1) -> int:
+    """FILE.tif with bands in single precision (NaN: no voxel), and FILE.class.tif with the classes and their colours.
+
+    A cell is `cell` voxels wide. Its class is that of the summed belief of the topmost voxels of its columns, each
+    measure their mean, height the highest one's centre; the share of stable voxels is that of all voxels below as well.
+    It is written window by window, of which only the tiles that are seen there are in memory; how many voxels there
+    are.
+    Raises ConfigError where the up axis is not known or the raster would be too large, MissingDependencyError.
+    """
+    try:
+        import rasterio
+        from rasterio import Affine
+        from rasterio.windows import Window as Pixels
+    except ImportError as error:
+        raise MissingDependencyError(f"{path}: .tif needs rasterio; {INSTALL}") from error
+    some, seen, voxels = chosen.first, {}, 0
+    for place in chosen.places():
+        seen[place] = _window(chosen[place], cell)
+        voxels += len(chosen[place].table)
+    whole = _fitting(functools.reduce(Window.around, seen.values()))
+    edge, (west, north) = cell * some.table.voxel_size, _corner(some, whole, cell)
+    height, width = whole.shape
+    shape: dict[str, Any] = {
+        "driver": "GTiff", "width": width, "height": height, "transform": Affine(edge, 0, west, 0, -edge, north),
+        "crs": None if some.georeference is None else rasterio.crs.CRS.from_wkt(some.georeference.crs),
+        "compress": "deflate", "tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "if_safer",
+    }  # fmt: skip
+    legend = {str(k): name for k, name in enumerate(("unclassified", *some.classes))}
+    names = ("class", *some.columns, "stable", "height")
+    many: dict[str, Any] = {"count": len(names), "dtype": "float32", "nodata": np.nan, "predictor": 3}
+    kind = np.uint8 if len(legend) <= 2**8 else np.uint16
+    palette = {0: (0, 0, 0, 0)} | {k: (*map(int, color), 255) for k, color in enumerate(some.colors, start=1)}
+    one: dict[str, Any] = {"count": 1, "dtype": kind, "nodata": 0}
+    beside = path.with_suffix(f".class{path.suffix}")
+    with (
+        atomic_path(path) as temporary,
+        atomic_path(beside) as temporary_beside,
+        rasterio.open(temporary, "w", **many, **shape) as file,
+        rasterio.open(temporary_beside, "w", **one, **shape) as classes,
+    ):
+        for window in whole.parts():
+            there = [chosen[place] for place, own in seen.items() if own.meets(window)]
+            bands = _bands(together(there), cell, window) if there else {}
+            at = Pixels(window.low[1] - whole.low[1], whole.high[0] - window.high[0], *reversed(window.shape))
+            nothing = np.full(window.shape, np.nan, np.float32)
+            for number, name in enumerate(names, start=1):
+                file.write(bands[name].values if bands else nothing, number, window=at)
+            label = bands["class"].values if bands else nothing
+            classes.write(np.nan_to_num(label, nan=0).astype(kind), 1, window=at)
+        for number, (name, unit, about) in enumerate(_abouts(some), start=1):
+            file.set_band_description(number, name)
+            file.set_band_unit(number, unit)
+            file.update_tags(number, about=about)
+        file.update_tags(1, **legend)
+        classes.write_colormap(1, palette)
+        classes.set_band_description(1, "class")
+        classes.update_tags(1, **legend)
+    return voxels
+
+
+@dataclass(frozen=True)
+class Window:
+    """Cells of the plane, low <= (ahead, right) <= high."""
+
+    low: tuple[int, int]
+    high: tuple[int, int]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.high[0] - self.low[0] + 1, self.high[1] - self.low[1] + 1
+
+    def around(self, other: Window) -> Window:
+        """The smallest that holds both."""
+        low, high = (
+            tuple(map(of, *ends)) for of, ends in ((min, (self.low, other.low)), (max, (self.high, other.high)))
+        )
+        return Window((low[0], low[1]), (high[0], high[1]))
+
+    def meets(self, other: Window) -> bool:
+        """Whether they share a cell."""
+        return all(self.low[k] <= other.high[k] and other.low[k] <= self.high[k] for k in (0, 1))
+
+    def parts(self) -> Iterator[Window]:
+        """Windows that make it up, of WINDOW cells a side, from the farthest row on, as files have their blocks."""
+        for last in range(self.high[0], self.low[0] - 1, -WINDOW):
+            for first in range(self.low[1], self.high[1] + 1, WINDOW):
+                low = max(self.low[0], last - WINDOW + 1), first
+                yield Window(low, (last, min(self.high[1], first + WINDOW - 1)))
+
+
+def seen_from_above(voxels: Voxels, cell: int = 1) -> tuple[Mapping[str, Column], float, float]:
+    """The bands (H, W) float32 by name, the first row the farthest ahead, and the coordinates of their corner."""
+    whole = _fitting(_window(voxels, cell))
+    return _bands(voxels, cell, whole), *_corner(voxels, whole, cell)
+
+
+def _axes(voxels: Voxels) -> tuple[Float64, Float64, Float64]:
+    if voxels.up is None:
+        raise ConfigError("which way is up is not known; set up_axis of the dataset, and run again")
+    return level_axes(voxels.up)
+
+
+def _covered(voxels: Voxels) -> tuple[Int64, Int64]:
+    """The cells (m, 2) of one voxel's width, and the voxel (m,) that covers each."""
+    right, ahead, above = _axes(voxels)
+    table = voxels.table
+    plane = np.stack([table.centers @ ahead, table.centers @ right], axis=1)
+    return covered(plane, above, table.voxel_size, table.voxel_size)
+
+
+def _window(voxels: Voxels, cell: int) -> Window:
+    """The cells that voxels cover."""
+    cells = _covered(voxels)[0] // cell
+    (low, first), (high, last) = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
+    return Window((low, first), (high, last))
+
+
+def _fitting(window: Window) -> Window:
+    """Raises ConfigError where it has too many cells for a raster."""
+    H, W = window.shape
+    if H * W > LARGEST:
+        raise ConfigError(f"the raster would have {W} x {H} cells; choose larger ones with --cell, or fewer voxels")
+    return window
+
+
+def _corner(voxels: Voxels, whole: Window, cell: int) -> tuple[float, float]:
+    """The coordinates west and north of a raster of these cells."""
+    (right, ahead, _), edge = _axes(voxels), cell * voxels.table.voxel_size
+    west, north = whole.low[1] * edge + voxels.offset @ right, (whole.high[0] + 1) * edge + voxels.offset @ ahead
+    return float(west), float(north)
+
+
+def _abouts(voxels: Voxels) -> Iterator[tuple[str, str, str]]:
+    """Name, unit and explanation of each band."""
+    yield "class", "", "1 to K, of the topmost voxels"
+    for name, column in voxels.columns.items():
+        yield name, column.unit, f"{column.about}, mean of the topmost voxels"
+    yield "stable", "", "share of stable voxels, of all of the column"
+    yield "height", "m", "of the topmost voxel's centre"
+
+
+def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
+    """The bands of a window, by the voxels of the tiles that it shows."""
+    fine, rows = _covered(voxels)
+    inside = ((fine // cell >= window.low) & (fine // cell <= window.high)).all(axis=1)
+    fine, rows = fine[inside], rows[inside]
+    cells, (H, W), (_, _, above) = fine // cell, window.shape, _axes(voxels)
+    height = (voxels.table.centers + voxels.offset) @ above
+    top = _topmost(fine, height[rows])
+    at = (window.high[0] - cells[:, 0]) * W + cells[:, 1] - window.low[1]
+    over, every = _Cells(at[top], rows[top], (H, W)), _Cells(at, rows, (H, W))
+    belief = np.stack([over.mean(part) for part in normalise(voxels.table.evidence).T])
+    label = np.where(over.empty, np.nan, np.nan_to_num(belief).argmax(axis=0) + 1.0)
+    stable = (categories(voxels.table) == STABLE).astype(np.float64)
+    values = {"class": label, **{name: over.mean(column.values) for name, column in voxels.columns.items()}}
+    values |= {"stable": every.mean(stable), "height": over.highest(height)}
+    return {name: Column(values[name].astype(np.float32), unit, about) for name, unit, about in _abouts(voxels)}
+
+
+class _Cells:
+    """Voxels (m,) in the cells (m,) of a raster, counted row by row."""
+
+    def __init__(self, at: Int64, rows: Int64, shape: tuple[int, int]) -> None:
+        self._at, self._rows, self._shape = at, rows, shape
+        self.empty = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape) == 0
+
+    def mean(self, values: npt.NDArray[Any]) -> Float64:
+        """Of values (n,) of the voxels (H, W); NaN where none is defined."""
+        taken = values[self._rows].astype(np.float64)
+        defined, n = ~np.isnan(taken), self.empty.size
+        total = np.bincount(self._at[defined], taken[defined], minlength=n)
+        with np.errstate(invalid="ignore"):
+            mean: Float64 = (total / np.bincount(self._at[defined], minlength=n)).reshape(self._shape)
+        return mean
+
+    def highest(self, values: Float64) -> Float64:
+        """The largest of values (n,) of the voxels (H, W); NaN where there is none."""
+        most = np.full(self.empty.size, -np.inf)
+        np.maximum.at(most, self._at, values[self._rows])
+        return np.where(np.isinf(most), np.nan, most).reshape(self._shape)
+
+
+def _topmost(cells: Int64, height: Float64) -> Int64:
+    """Which entry (m,) is the highest of each cell (m, 2)."""
+    order = np.lexsort((height, cells[:, 1], cells[:, 0]))
+    last = np.append((np.diff(cells[order], axis=0) != 0).any(axis=1), True)
+    topmost: Int64 = order[last]
+    return topmost

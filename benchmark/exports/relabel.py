@@ -1,0 +1,373 @@
+"""Fused labels back into the frames: label maps of a new source, such as pseudo-labels to train with."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semstab.backends.shared.association import Observations, back_project, observe
+from semstab.config import nearest
+from semstab.core.at_hand import AtHand
+from semstab.core.files import write_json
+from semstab.core.prefetch import prefetch
+from semstab.core.types import Float64, Int64, Mask, UInt8, UInt16
+from semstab.datasets.geometry.lenses import Labels
+from semstab.engine.evaluation import truth_task
+from semstab.engine.folder import SETTINGS, load_result
+from semstab.engine.units import make_plan
+from semstab.errors import ConfigError, DataError
+from semstab.exports.join import NONE, VoxelLookup
+from semstab.metrics import CATEGORIES, categories
+from semstab.metrics.agreement import rows_of
+from semstab.model.evidence import Evidence
+from semstab.model.frames import Frame
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.model.measures import dominant
+from semstab.model.records import Record
+from semstab.model.tiles import AT_HAND, Place, Tiles
+from semstab.model.voxels import VoxelTable
+from semstab.predict.folder import PredictionFolder
+from semstab.settings import load_config
+from semstab.statistics import psa
+from semstab.statistics.commit import Commit
+from semstab.task import Task, read
+
+# The class that the map has where a frame looks: one a pixel, where the voxel can be believed.
+
+UNSEEN, UNSTABLE = -1, -2
+"""Instead of a class: no depth or no voxel there; a voxel that is not believed."""
+
+DECIMALS = 9
+"""Of evidence from which a vote was taken: what rounding left decides no tie."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Which voxels are believed.
+
+    min_op         seen by so many frames
+    min_psa        their pairs of frames agree so often; a voxel seen once has no pair
+    categories     of these categories, of any where none is named
+    leave_own_out  without the frame's own vote, and seen by another frame. Drift is that of all votes: it depends on
+                   their order
+    commit         whose label has the evidence that these thresholds ask for
+
+    Raises ConfigError for a category that there is not, and values out of range.
+    """
+
+    min_op: int = 1
+    min_psa: float = 0.0
+    categories: tuple[str, ...] = ()
+    leave_own_out: bool = False
+    commit: Commit | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_psa <= 1:
+            raise ConfigError(f"min_psa = {self.min_psa:g}: agreement lies between 0 and 1")
+        for name in self.categories:
+            if name not in CATEGORIES:
+                raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
+
+    def of(self, table: VoxelTable) -> Mask:
+        """(n,) whether each voxel is."""
+        believed = table.op >= max(self.min_op, 1)
+        if self.min_psa > 0:
+            believed &= np.nan_to_num(psa(table), nan=-1.0) >= self.min_psa
+        if self.categories:
+            with np.errstate(invalid="ignore"):  # the belief of no vote
+                believed &= np.isin(categories(table), [CATEGORIES.index(name) for name in self.categories])
+        if self.commit is not None:
+            believed &= self.commit.decide(table) >= 0
+        return believed
+
+    def settings(self) -> dict[str, object]:
+        """As JSON has it."""
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return own | {"commit": None if self.commit is None else self.commit.model_dump(by_alias=True)}
+
+
+class FusedLabels:
+    """A map, to be asked for the classes that a frame sees; of its tiles those are at hand that frames saw last."""
+
+    def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
+        self._tiles, self._belief, self._K = tiles, belief, num_classes
+        self._lookups: AtHand[Place, VoxelLookup] = AtHand(
+            lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND
+        )
+
+    def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
+        """(H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
+
+        The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.
+        """
+        everywhere = dataclasses.replace(frame, labels=np.zeros(frame.shape, np.uint8), scores=None)
+        points = back_project(everywhere).T
+        found, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
+        own = (
+            observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_own_out else None
+        )
+        for place, pixels in self._tiles.holding(points):
+            found[pixels] = self._labels(self._lookups[place], points[pixels], own)
+        fused[everywhere.valid] = found
+        return fused
+
+    def _labels(self, lookup: VoxelLookup, points: Float64, own: Observations | None) -> Int64:
+        """(n,) what points see of a tile."""
+        found = lookup.rows(points)
+        met = found != NONE
+        rows, inverse = np.unique(found[met], return_inverse=True)
+        seen = rows_of(lookup.table, rows)
+        if own is not None:
+            seen = _without(own, lookup, seen, rows)
+        label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
+        found[met], found[~met] = label[inverse], UNSEEN
+        return found
+
+
+def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
+    """The voxels of a tile that a frame sees, those rows of it, without the frame's own vote."""
+    centers = np.add(own.index, 0.5, dtype=np.float64) * seen.voxel_size
+    found = lookup.rows(centers)
+    here = found != NONE
+    at = np.searchsorted(rows, found[here])
+    evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
+    evidence[at] = np.abs(np.round(evidence[at] - own.s_bar[here], DECIMALS))
+    op[at] -= 1
+    self_sum[at] -= (own.s_bar[here] ** 2).sum(axis=1)
+    return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
+
+
+def labels_of(fused: Int64, ids: Sequence[int]) -> UInt8 | UInt16:
+    """The label map of fused rows: the ids of the classes, or the ignore id of its type."""
+    at = np.where(fused < 0, len(ids), fused)
+    if max(ids) < IGNORE_8BIT:
+        return np.array([*ids, IGNORE_8BIT], np.uint8)[at]
+    return np.array([*ids, IGNORE_16BIT], np.uint16)[at]
+
+
+# What relabelling did: pixels confirmed, changed and dropped, and whether it helped where there is ground truth.
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Of pixels with ground truth: how many, the share that is right, and the mean intersection over union."""
+
+    pixels: int
+    accuracy: float
+    miou: float
+
+    @classmethod
+    def of(cls, confusion: Int64) -> Accuracy:
+        """From (K, K) pixels by true and given class; a class counts for the mean where either has it."""
+        right, n = confusion.diagonal(), int(confusion.sum())
+        union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
+        there = union > 0
+        miou = float((right[there] / union[there]).mean()) if there.any() else math.nan
+        return cls(n, float(right.sum() / n) if n else math.nan, miou)
+
+
+@dataclass(frozen=True)
+class Correctness:
+    """Against ground truth: the labels before; of the pixels that have a label before and after, both; all after.
+
+    all_before, all_after  of all pixels with such a label
+    before, after          of the same pixels, those that kept a label or took another
+    """
+
+    all_before: Accuracy
+    before: Accuracy
+    after: Accuracy
+    all_after: Accuracy
+
+
+@dataclass(frozen=True)
+class Relabelled:
+    """What became of the pixels of a label source; its maps are in `folder`.
+
+    confirmed  have the class that they had      changed   have another one
+    filled     had none                          unseen    had one, and have no depth or no voxel
+    unstable   had one, and their voxel is not believed
+    """
+
+    scene: str
+    backbone: str
+    name: str
+    folder: str
+    frames: int
+    pixels: int
+    confirmed: int
+    changed: int
+    filled: int
+    unseen: int
+    unstable: int
+    leave_own_out: bool = False
+    correctness: Correctness | None = None
+
+    def lines(self) -> Iterator[str]:
+        """What to tell."""
+        yield f"{self.scene}, {self.name}: {self.frames} frames in {self.folder}"
+        counts = [
+            (self.confirmed, "confirmed"),
+            (self.changed, "changed"),
+            (self.filled, "filled in"),
+            (self.unseen, "dropped for want of depth or a voxel"),
+            (self.unstable, "dropped as unstable"),
+        ]
+        yield f"  of {self.pixels:,} pixels " + ", ".join(f"{n / self.pixels:.1%} {what}" for n, what in counts)
+        if not self.leave_own_out:
+            yield "  the stability of these maps says nothing: a voxel has one class in all of them"
+        if self.correctness is not None:
+            c = self.correctness
+            yield (
+                f"  accuracy {c.before.accuracy:.4f} before and {c.after.accuracy:.4f} after, mean IoU"
+                f" {c.before.miou:.4f} and {c.after.miou:.4f}: {c.after.pixels:,} pixels with ground truth and a label"
+                f" in both; all {c.all_before.pixels:,} before: {c.all_before.accuracy:.4f},"
+                f" mean IoU {c.all_before.miou:.4f}"
+            )
+
+
+class Tally:
+    """Pixels, counted frame by frame."""
+
+    def __init__(self, K: int) -> None:
+        self._K = K
+        self.counts = dict.fromkeys(("pixels", "confirmed", "changed", "filled", "unseen", "unstable"), 0)
+        self._confusion = {name: np.zeros((K, K), np.int64) for name in ("all_before", "before", "after", "all_after")}
+
+    def add(self, own: Frame, fused: Int64, truth: Frame | None) -> None:
+        """A frame as it was, its fused rows (H, W), and its ground truth in the same classes."""
+        before = np.where(own.predicted == own.ignore_id, UNSEEN, own.predicted.astype(np.int64))
+        had, has = before >= 0, fused >= 0
+        found = {
+            "pixels": np.ones(fused.shape, np.bool_),
+            "confirmed": had & has & (before == fused),
+            "changed": had & has & (before != fused),
+            "filled": ~had & has,
+            "unseen": had & (fused == UNSEEN),
+            "unstable": had & (fused == UNSTABLE),
+        }
+        for name, where in found.items():
+            self.counts[name] += int(np.count_nonzero(where))
+        if truth is not None and truth.shape == fused.shape:
+            right = truth.predicted.astype(np.int64)
+            known = truth.predicted != truth.ignore_id
+            self._count("all_before", right, before, known & had)
+            self._count("before", right, before, known & had & has)
+            self._count("after", right, fused, known & had & has)
+            self._count("all_after", right, fused, known & has)
+
+    def correctness(self) -> Correctness | None:
+        """None where no pixel had ground truth."""
+        if not self._confusion["all_before"].any():
+            return None
+        return Correctness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})
+
+    def _count(self, name: str, right: Int64, given: Int64, where: Mask) -> None:
+        pairs = right[where] * self._K + given[where]
+        self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
+
+
+__all__ = ["Belief", "Relabelled", "relabel"]
+
+REPORT = "relabelled.json"
+Progress = Callable[[str, int, int], None]
+
+
+def relabel(
+    run: str | Path,
+    out: str | Path,
+    *,
+    belief: Belief | None = None,
+    scene: str | None = None,
+    backbone: str | None = None,
+    backend: str | None = None,
+    name: str | None = None,
+    overwrite: bool = False,
+    progress: Progress = lambda what, done, total: None,
+) -> Relabelled:
+    """Look up the fused class of every pixel of every frame of a unit, and write the maps to OUT/labels/NAME.
+
+    scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
+    name  of the new source, BACKBONE-fused where not given; its classes stand beside its maps
+    belief  which voxels count; the pixels of others are ignored, as are those without depth
+
+    Raises ConfigError, and DataError where the data is no longer what was fused, or its label maps cannot have the
+    depth's pixels.
+    """
+    result = load_result(run)
+    record = result.record(scene=scene, backbone=backbone, backend=backend)
+    task, pixel_stride = _task(Path(run), record, result.manifest["inputs"])
+    chosen, name = belief or Belief(), name or f"{record.unit.backbone}-fused"
+    settings = {"unit": record.key, "backend": record.unit.backend, **chosen.settings()}
+    space = task.mapping.target
+    folder = PredictionFolder(
+        Path(out) / "labels" / name, "labels", settings, {"name": name}, space, overwrite=overwrite
+    )
+    if record.voxels_file is None:
+        raise DataError(f"{run}: kept no voxels of {record.unit.slug}; run it again")
+    tally, truth = Tally(len(space)), truth_task(task)
+    fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), chosen, len(space))
+
+    def work(index: int) -> _Work:
+        frame = read(task, index)
+        return _Work(frame, fused.of(frame, pixel_stride), None if truth is None else _known(truth, index))
+
+    for done, fetched in enumerate(prefetch(work, task.indices), start=1):
+        each = fetched.item
+        maps = labels_of(each.fused, space.ids)
+        if done == 1:
+            _require_same_pixels(task, each.frame.index, maps)
+        folder.write(task.scene.image_name(each.frame.index), record.key, maps, 0.0)
+        tally.add(each.frame, each.fused, each.truth)
+        progress(f"{task.scene.name} · {name}", done, len(task.indices))
+    folder.save()
+    report = Relabelled(
+        task.scene.name, task.backbone, name, str(folder.path), len(task.indices), **tally.counts,
+        leave_own_out=chosen.leave_own_out, correctness=tally.correctness(),
+    )  # fmt: skip
+    write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
+    return report
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """A frame as it was fused, its fused rows (H, W), and its ground truth."""
+
+    frame: Frame
+    fused: Int64
+    truth: Frame | None
+
+
+def _task(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
+    """The unit as it was fused, from inputs of these digests, and its pixel stride.
+
+    Raises DataError where its data has changed since.
+    """
+    plan = make_plan(load_config(run / SETTINGS))
+    scene, backbone = record.unit.scene, record.unit.backbone
+    task = next((task for task in plan.tasks if (task.scene.name, task.backbone) == (scene, backbone)), None)
+    if task is None or task.digest != fused.get(f"{scene}/{backbone}"):
+        raise DataError(f"{run}: the data of {scene}, {backbone} is not what was fused; run it again")
+    return task, plan.config.pixel_stride
+
+
+def _known(truth: Task, index: int) -> Frame | None:
+    """A frame with its ground truth, where it has any."""
+    try:
+        return read(truth, index)
+    except DataError:
+        return None
+
+
+def _require_same_pixels(task: Task, index: int, maps: Labels) -> None:
+    """Raise DataError where a label map of the depth's pixels would be read as one of the image's."""
+    if not np.array_equal(task.scene.predicted(index, labels=maps).predicted, maps):
+        raise DataError(
+            f"{task.scene.name}: its label maps have the pixels of the image, not those of the depth; convert it"
+            " (semstab-bench convert), and run and relabel the posed folder"
+        )

@@ -1,0 +1,308 @@
+"""What `semstab.statistics` says of several backbones' maps of one scene; in JSON as the fields say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from semstab.model.measures import Quantity
+from semstab.model.statistics import UNDEFINED, Estimate, Interval, RuleMeans
+
+ByBackbone = Mapping[str, Estimate]
+
+
+@dataclass(frozen=True)
+class MapCoverage:
+    """What a backbone's map covers. `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
+
+    backbone: str
+    voxels: int
+    observations: int
+    mean_op: float
+    repeated: int
+    recurrent: int
+    common_share: float
+    alone: int
+
+
+@dataclass(frozen=True)
+class Standardised:
+    """Means at a common distribution of OP, by the key of what is compared and backbone.
+
+    edges    upper edges of the strata of OP
+    weights  of the strata
+    thin     the part of the weights that lies in strata which some map hardly has: values there rest on few voxels
+    """
+
+    edges: tuple[int, ...]
+    weights: tuple[float, ...]
+    thin: float
+    values: Mapping[str, ByBackbone]
+
+    def of(self, quantity: Quantity, backbone: str) -> Estimate:
+        """A backbone's mean; undefined for what is no mean over voxels."""
+        return self.values.get(quantity.key, {}).get(backbone, UNDEFINED)
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """A measure of backbone a minus that of b on the voxels that all saw twice or more.
+
+    p_value  that there is none, of the primary measure; p_holm corrects it for all pairs, and all scenes of a study, of
+             which something may be claimed (Holm 1979). The other measures describe: they have intervals and no test
+    question   what interval and p-value answer, see `Interval`
+    undecided  why nothing may be claimed; empty where something may
+    """
+
+    measure: str
+    a: str
+    b: str
+    difference: Estimate
+    p_value: float
+    p_holm: float
+    question: str = ""
+    undecided: str = ""
+
+
+@dataclass(frozen=True)
+class Rank:
+    """A backbone's place, 1 being the best, with the range that holds 95 % of the resamples.
+
+    best is the share of the resamples in which it is first.
+    """
+
+    backbone: str
+    value: float
+    rank: int
+    low: int
+    high: int
+    best: float
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The backbones by one measure on common voxels, the best first."""
+
+    measure: str
+    ranks: tuple[Rank, ...]
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Backbones on the voxels that every one of them observed at least twice.
+
+    primary  the key of what is tested
+    values   what is `compared`, by its key and backbone
+    """
+
+    primary: str
+    voxels: int
+    blocks: int
+    block_size: float
+    values: Mapping[str, ByBackbone]
+    differences: tuple[PairedDifference, ...]
+    rankings: tuple[Ranking, ...]
+
+    def of(self, quantity: Quantity) -> ByBackbone:
+        """The values of what is compared, by backbone."""
+        return self.values[quantity.key]
+
+
+@dataclass(frozen=True)
+class Ignored:
+    """What a backbone left out of the looks that any backbone labelled, and what that may be worth.
+
+    missing            share of their pixels
+    psa_low, psa_high  bounds of its mean PSA, whatever the missing looks would have said (Manski 1990)
+    alpha              between frames, where to leave a place out is a class of its own
+    """
+
+    backbone: str
+    missing: float
+    psa_low: float
+    psa_high: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class CommonLooks:
+    """What was compared: the looks (cell of a voxel, frame) that all backbones labelled, each with the same weight.
+
+    voxels, observations  sampled ones that they are of
+    decided               whether each look was reduced to its largest class: labels were compared with scores
+    order                 of the backbones by the primary measure on these looks, the best first
+    order_ignored         the same where to leave a place out is a class of its own
+    bounded               whether the bounds of PSA keep its order of the backbones, whatever was left out
+    """
+
+    voxels: int
+    observations: int
+    decided: bool
+    ignored: tuple[Ignored, ...]
+    order: tuple[str, ...]
+    order_ignored: tuple[str, ...]
+    bounded: bool
+
+    @property
+    def depends(self) -> bool:
+        """Whether the order depends on what was left out."""
+        return self.order != self.order_ignored or not self.bounded
+
+
+@dataclass(frozen=True)
+class RuleComparison:
+    """The backbones under each rule of fusion, on their common voxels with OP >= 2.
+
+    values         by rule and backbone
+    orders         by the key of what is compared and rule, the best backbone first
+    order_changes  by key, whether the order depends on the rule
+    """
+
+    voxels: int
+    values: Mapping[str, Mapping[str, RuleMeans]]
+    orders: Mapping[str, Mapping[str, tuple[str, ...]]]
+    order_changes: Mapping[str, bool]
+
+
+@dataclass(frozen=True)
+class BackboneComparison:
+    """Several backbones' maps of one scene beside each other."""
+
+    scene: str
+    schema: int
+    seed: int
+    backbones: tuple[str, ...]
+    coverage: tuple[MapCoverage, ...]
+    standardised: Standardised
+    paired: Paired
+    looks: CommonLooks | None
+    fusion_rules: RuleComparison | None
+
+
+# What differs between runs; in JSON as the fields say. Undefined numbers are NaN.
+
+Basis = Literal["looks", "voxels", "cubes", "flights"]
+"""What was paired: looks (a place in a frame) that all made; voxels that all saw twice or more; cubes of space, each
+map with all its voxels; nothing, each flight by itself."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A measure in a run, beside that in the base.
+
+    measure     its key
+    of          the class whose places it is of; empty: all
+    difference  the run's less the base's, with its interval, the question that this answers, and the p-value that there
+                is none
+    p_holm      that p-value corrected for all that stand in one list with it (Holm 1979)
+    change      what is said of it: 'better', 'worse', or nothing
+    """
+
+    measure: str
+    of: str
+    base: float
+    other: float
+    difference: Interval
+    p_holm: float
+    change: Literal["better", "worse", ""]
+
+
+@dataclass(frozen=True)
+class Blame:
+    """A frame, and its share of what was lost."""
+
+    frame: int
+    share: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """Neighbouring voxels of a class that got worse.
+
+    number   from 1 on, the largest loss first; in the column `place`
+    what     'agreement': frames agree less; 'truth': right before, wrong now
+    of       the class that both runs together give these voxels, or the true one
+    instead  the class that the blamed looks give
+    voxels   how many
+    loss     mean over them: of agreement between frames, or 1
+    centre   metres, as the run has coordinates
+    size     metres from end to end
+    rivals   places that improved by as much or more, in all: what chance gives where nothing got worse
+    frames   to blame, the worst first; empty where the looks were not kept
+    """
+
+    number: int
+    what: Literal["agreement", "truth"]
+    of: str
+    instead: str
+    voxels: int
+    loss: float
+    centre: tuple[float, float, float]
+    size: float
+    rivals: int
+    frames: tuple[Blame, ...]
+
+
+@dataclass(frozen=True)
+class Against:
+    """A run against the base on one scene, or on all.
+
+    compared  voxels whose change is known
+    worse, better  voxels whose frames agree less, or more, by a fifth or more
+    blamed    frames, of all places together
+    columns   file of each voxel's change and place, relative to the folder
+    """
+
+    other: str
+    contrasts: tuple[Contrast, ...]
+    by_class: tuple[Contrast, ...] = ()
+    compared: int = 0
+    worse: int = 0
+    better: int = 0
+    places: tuple[Place, ...] = ()
+    blamed: tuple[Blame, ...] = ()
+    columns: Path | None = None
+
+
+@dataclass(frozen=True)
+class SceneComparison:
+    """The runs on one scene.
+
+    remarks   what cannot be compared here, and why
+    voxels    that all saw twice or more; 0 where they are not known
+    frames    that they come from, about
+    """
+
+    scene: str
+    basis: Basis
+    remarks: tuple[str, ...]
+    voxels: int
+    frames: int
+    coverage: tuple[MapCoverage, ...]
+    looks: CommonLooks | None
+    against: tuple[Against, ...]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A run as it was named, the file or folder it was read from, and its label source."""
+
+    name: str
+    source: Path
+    backbone: str
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """Runs beside the first one, the base.
+
+    overall  macro means over the scenes, each counting once
+    """
+
+    schema: int
+    base: str
+    runs: tuple[Compared, ...]
+    overall: tuple[Against, ...]
+    scenes: tuple[SceneComparison, ...]

@@ -1,0 +1,225 @@
+"""The log of observations, from which a map's rows can be computed again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64, Int32, Int64
+from semstab.errors import DataError
+from semstab.model import parquet
+from semstab.model.evidence import Evidence
+from semstab.model.information import entropy_bits, js_divergence, normalise
+from semstab.model.voxels import (
+    INDEX,
+    OF_EVENTS,
+    OF_VOXELS,
+    VoxelTable,
+    freeze,
+    in_order,
+    index_columns,
+    require_memory,
+)
+
+COMPUTED = [name for name in OF_VOXELS if name not in (*INDEX, "evidence")]
+"""Of a voxel's row, from its observations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """The log of observations: m rows, one a (voxel, frame), grouped by voxel and in order of integration within one.
+
+    ix, iy, iz  (n,) int32 the voxels, sorted
+    voxel       (m,) int32 row into them, ascending
+    frame       (m,) int32 frame index
+    evidence    (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse
+    pixels      (m,) int32 pixels behind it
+    voxel_size  r, metres
+    classes     the K class names, where they are known
+    """
+
+    ix: Int32
+    iy: Int32
+    iz: Int32
+    voxel: npt.NDArray[np.integer]
+    frame: Int32
+    evidence: Evidence
+    pixels: npt.NDArray[np.integer]
+    voxel_size: float
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze(self, INDEX, self.ix)
+        freeze(self, OF_EVENTS, self.voxel)
+        further = self.voxel[1:][self.voxel[1:] != self.voxel[:-1]]
+        if not np.array_equal(np.append(self.voxel[:1], further), np.arange(len(self.ix))):
+            raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
+
+    def __len__(self) -> int:
+        return len(self.voxel)
+
+    @property
+    def K(self) -> int:
+        """Number of classes."""
+        return self.evidence.K
+
+    @cached_property
+    def bounds(self) -> Int64:
+        """(n + 1,) first row of each voxel, then how many rows there are."""
+        from semstab.model.kernels import bound_groups
+
+        bounds = np.zeros(len(self.ix) + 1, np.int64)
+        bound_groups(self.voxel, bounds)
+        return bounds
+
+    @property
+    def starts(self) -> Int64:
+        """(n,) first row of each voxel."""
+        return self.bounds[:-1]
+
+    @property
+    def ends(self) -> Int64:
+        """(n,) the row after each voxel's last."""
+        return self.bounds[1:]
+
+    def table(self) -> VoxelTable:
+        """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
+        parts = [log._columns() for log in self._few_at_a_time()]
+        columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in COMPUTED}
+        evidence = Evidence.joined([part["evidence"] for part in parts])
+        index = {name: getattr(self, name) for name in INDEX}
+        return VoxelTable(**index, **columns, evidence=evidence, voxel_size=self.voxel_size, classes=self.classes)
+
+    def _columns(self) -> dict[str, Any]:
+        starts, s_bar = self.starts, self.evidence[:]
+        return {
+            "op": np.diff(np.append(starts, len(self))).astype(np.int32),
+            "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
+            "drift_sum": _sum_by_voxel(self.drift(), starts),
+            "pixels": _sum_by_voxel(self.pixels.astype(np.int64), starts),
+            "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
+            "last_frame": np.maximum.reduceat(self.frame, starts) if len(self) else self.frame,
+            "self_sum": _sum_by_voxel((s_bar**2).sum(axis=1), starts),
+            "frame_entropy_sum": _sum_by_voxel(entropy_bits(s_bar), starts),
+        }
+
+    def _few_at_a_time(self) -> Iterator[Events]:
+        """The logs of voxels one after the other, of as many as have little evidence when it is dense."""
+        edges = np.array([some.start for some in self.evidence.chunks()])
+        cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
+        for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
+            own, of = slice(self.bounds[first], self.bounds[last]), slice(first, last)
+            columns: dict[str, Any] = {name: getattr(self, name)[of] for name in INDEX}
+            columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
+            yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
+
+    def beliefs(self) -> Float64:
+        """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
+        accumulated = self.evidence[:]
+        age = np.arange(len(self)) - self.starts[self.voxel]
+        by_age = np.argsort(age, kind="stable")
+        ends = np.cumsum(np.bincount(age, minlength=1))
+        for rows in np.split(by_age, ends)[1:]:
+            accumulated[rows] += accumulated[rows - 1]
+        return normalise(accumulated)
+
+    def drift(self) -> Float64:
+        """(m,) D_JS(p^(t), p^(t-1)) in bits, that each observation caused at its voxel; 0 for a voxel's first."""
+        belief = self.beliefs()
+        drift = np.zeros(len(self))
+        again = np.flatnonzero(np.diff(self.voxel, prepend=-1) == 0)
+        drift[again] = js_divergence(belief[again], belief[again - 1])
+        return drift
+
+    def coarsen(self, factor: int) -> Events:
+        """The log on voxels `factor` times as large, in order of frame index within a voxel.
+
+        s_bar of a frame is the mean over its pixels, so the mean of the finer voxels' s_bar weighted by their pixels.
+        """
+        index = np.stack([self.ix, self.iy, self.iz], axis=1) // factor
+        coarse, parent = np.unique(index, axis=0, return_inverse=True)
+        pairs = np.stack([parent.ravel()[self.voxel], self.frame], axis=1)
+        pairs, rows = np.unique(pairs, axis=0, return_inverse=True)
+        pixels = np.zeros(len(pairs), dtype=np.int64)
+        evidence = np.zeros((len(pairs), self.evidence.K))
+        np.add.at(pixels, rows.ravel(), self.pixels)
+        np.add.at(evidence, rows.ravel(), self.evidence[:] * self.pixels[:, None])
+        return Events(
+            **index_columns(coarse),
+            voxel=pairs[:, 0].astype(np.int64),
+            frame=pairs[:, 1].astype(np.int32),
+            evidence=Evidence.of(evidence / pixels[:, None]),
+            pixels=pixels,
+            voxel_size=self.voxel_size * factor,
+            classes=self.classes,
+        )
+
+    def rows(self, voxels: Int64) -> Events:
+        """The log of these of its voxels (r,), ascending."""
+        first = self.bounds[voxels]
+        count = self.bounds[voxels + 1] - first
+        number = np.repeat(np.arange(len(voxels), dtype=np.int32), count)
+        rows = np.repeat(first - np.cumsum(count) + count, count)
+        rows += np.arange(len(rows))
+        own: dict[str, Any] = {name: getattr(self, name)[voxels] for name in INDEX}
+        own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
+        return replace(self, **own, voxel=number, evidence=self.evidence.take(rows))
+
+    def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
+        """Write Parquet, atomically: one row an observation, with its voxel's index."""
+
+        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
+            own = {name: getattr(self, name)[some] for name in OF_EVENTS}
+            return own | {name: getattr(self, name)[self.voxel[some]] for name in INDEX}
+
+        parts = map(columns, self.evidence.chunks())
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Events]) -> Events:
+        """One log of the voxels of several that share none."""
+        if len(parts) == 1:
+            return parts[0]
+        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in INDEX}
+        order = in_order(index)
+        count = np.concatenate([np.diff(np.append(part.starts, len(part))) for part in parts])
+        first = np.cumsum(count) - count
+        number = np.repeat(np.arange(len(order)), count[order])
+        rows = np.arange(len(number)) + (first[order] - np.cumsum(count[order]) + count[order])[number]
+        return cls(
+            **{name: values[order] for name, values in index.items()},
+            voxel=number,
+            frame=np.concatenate([part.frame for part in parts])[rows],
+            evidence=Evidence.joined([part.evidence for part in parts]).take(rows),
+            pixels=np.concatenate([part.pixels for part in parts])[rows],
+            voxel_size=parts[0].voxel_size,
+            classes=parts[0].classes,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Events:
+        """Read what `save` wrote, a file or a folder of tiles, all of it.
+
+        Raises DataError where a file is missing, damaged or of another kind, or a log in tiles is larger than memory.
+        """
+        files = parquet.files_of(path)
+        if len(files) > 1:
+            require_memory(Path(path), files)
+        return cls.joined([cls._read(file) for file in files])
+
+    @classmethod
+    def _read(cls, path: Path) -> Events:
+        with parquet.reading(path):
+            content = parquet.read(path, OF_EVENTS | INDEX)
+            first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
+            return cls(**content | {name: content[name][first] for name in INDEX})
+
+
+def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:
+    return np.add.reduceat(values, starts, axis=0) if len(starts) else values

@@ -1,0 +1,151 @@
+"""Compiled loops over the pixels of labelled frames: one pass each where numpy takes five."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from semstab.core.compiled import serial
+
+
+@serial
+def mark_valid(depth: Any, labels: Any, ignore: int, out: Any) -> None:
+    """Mark the pixels with a valid depth and a label; all arrays are (n,)."""
+    ignored = labels.dtype.type(ignore)
+    for i in range(out.size):
+        out[i] = (depth[i] > np.float32(0)) & (depth[i] < np.float32(math.inf)) & (labels[i] != ignored)
+
+
+@serial
+def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
+    """The number of pixels that are valid in both frames, and of those among them whose labels differ."""
+    both = changed = 0
+    for i in range(valid.size):
+        common = valid[i] & other_valid[i]
+        both += common
+        changed += common & (labels[i] != other_labels[i])
+    return both, changed
+
+
+@serial
+def count_changed_at(at: Any, valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
+    """Of the valid pixels those that see a valid pixel of the other view, `at`, and those whose label differs there."""
+    seen = changed = 0
+    for i in range(len(at)):
+        j = max(at[i], 0)
+        both = valid[i] & other_valid[j] & (at[i] >= 0)
+        seen += both
+        changed += both & (labels[i] != other_labels[j])
+    return seen, changed
+
+
+@serial
+def has_other(labels: Any, count: int, ignore: int) -> bool:
+    """Whether a map of ids (n,) holds one that is neither below `count` nor the ignore id."""
+    first, ignored = labels.dtype.type(count), labels.dtype.type(ignore)
+    other = False
+    for i in range(labels.size):
+        other |= (labels[i] >= first) & (labels[i] != ignored)
+    return other
+
+
+# Compiled loops over rows of evidence: one pass over their entries where NumPy takes many over dense rows.
+
+
+@serial
+def concentrate(
+    starts: Any,
+    label: Any,
+    weight: Any,
+    rest: Any,
+    K: int,
+    known: bool,
+    largest: Any,
+    lead: Any,
+    bits: Any,
+    dominant: Any,
+    squares: Any,
+) -> None:
+    """Fill largest, lead, bits, dominant and squares (n,), see `Concentration`.
+
+    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty. Where bits are
+    known they are left as they are.
+    """
+    for i in range(starts.shape[0] - 1):
+        first, end = starts[i], starts[i + 1]
+        unseen = rest[i] if rest.shape[0] else 0.0
+        others = K - (end - first)
+        total, square = others * unseen, others * unseen * unseen
+        top, second, best, gap = -1.0, 0.0, 0, 0
+        for e in range(first, end):
+            w = weight[e] if weight[e] != 0.0 else unseen
+            total += w
+            square += w * w
+            if w > top:
+                second, top, best = max(top, 0.0), w, label[e]
+            elif w > second:
+                second = w
+            gap += 1 if label[e] == gap else 0  # the lowest class without an entry
+        if others > 0:
+            if unseen > top or (unseen == top and gap < best):
+                second, top, best = (unseen if others > 1 else max(top, 0.0)), unseen, gap
+            elif unseen > second:
+                second = unseen
+        squares[i], dominant[i] = square, best
+        largest[i], lead[i] = top / total, top / total - second / total
+        if known:
+            continue
+        bits[i] = 0.0
+        if end - first > 1 or unseen > 0.0:
+            spread = 0.0
+            for e in range(first, end):
+                p = (weight[e] if weight[e] != 0.0 else unseen) / total
+                if p > 0.0:
+                    spread -= p * np.log2(p)
+            if unseen > 0.0 and others > 0:
+                spread -= others * (unseen / total) * np.log2(unseen / total)
+            bits[i] = max(spread, 0.0)
+
+
+@serial
+def copy_rows(first: Any, label: Any, weight: Any, starts: Any, to_label: Any, to_weight: Any) -> None:
+    """Copy the entries of rows from first (n,) on to where starts (n + 1,) say."""
+    for i in range(first.shape[0]):
+        for e in range(starts[i], starts[i + 1]):
+            at = first[i] + e - starts[i]
+            to_label[e], to_weight[e] = label[at], weight[at]
+
+
+@serial
+def add_by_group(
+    group: Any, one: Any, two: Any, three: Any, four: Any, voxels: Any, block: int, sums: Any, defined: Any
+) -> None:
+    """Add four columns (n,), of what is not NaN, to the sums (4, G) of each group (n,), and count it; -1 is no group.
+
+    A row counts as so many voxels (n,), as one where that is empty; rounding adds up within a block of rows only.
+    """
+    part, count = np.zeros((sums.shape[1], 4)), np.zeros((sums.shape[1], 4))
+    weighted = voxels.shape[0] > 0
+    for first in range(0, group.shape[0], block):
+        for i in range(first, min(first + block, group.shape[0])):
+            g, many = group[i], voxels[i] if weighted else 1.0
+            if g < 0:
+                continue
+            for c, value in enumerate((one[i], two[i], three[i], four[i])):
+                known = value == value  # noqa: PLR0124 - NaN is not
+                part[g, c] += many * value if known else 0.0
+                count[g, c] += many if known else 0.0
+        for g in range(sums.shape[1]):
+            for c in range(4):
+                sums[c, g] += part[g, c]
+                defined[c, g] += count[g, c]
+                part[g, c] = count[g, c] = 0.0
+
+
+@serial
+def bound_groups(of: Any, bounds: Any) -> None:
+    """Fill bounds[1:] of (n + 1,) with where each of n groups ends; of (m,) are numbers from 0 on, ascending."""
+    for row in range(of.shape[0]):
+        bounds[of[row] + 1] = row + 1

@@ -1,0 +1,199 @@
+"""Voxel tables and logs of observations as Parquet: columns, and in the metadata what they belong to."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.arrays import column, values_of
+from semstab.core.files import atomic_path, parse_json
+from semstab.errors import DataError, one_line
+from semstab.model.evidence import Evidence
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+SCHEMA = 1
+
+TILE = re.compile(r"tile=(-?\d+)_(-?\d+)\.parquet")
+"""Files of a folder that hold a map together."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Columns of voxels that a file holds alone: those with ix // size = x and iy // size = y.
+
+    size  voxels along its edge, a power of 2
+    map   names the map that it is a part of
+    """
+
+    x: int
+    y: int
+    size: int
+    map: str
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        return f"tile={self.x}_{self.y}.parquet"
+
+
+def write(
+    path: str | Path,
+    parts: Iterable[Mapping[str, npt.NDArray[Any]]],
+    kind: str,
+    voxel_size: float,
+    classes: Sequence[str],
+    tile: Tile | None = None,
+) -> None:
+    """Columns (n,) and (n, K), part after part, one at least; atomically."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    about = {"schema": SCHEMA, "kind": kind, "voxel_size": voxel_size, "classes": classes}
+    if tile is not None:
+        about |= {"tile": [tile.x, tile.y], "tile_size": tile.size, "map": tile.map}
+    with atomic_path(path) as temporary, ExitStack() as open_files:
+        writer = None
+        for columns in parts:
+            content = pa.table({name: _to_arrow(values) for name, values in columns.items()})
+            content = content.replace_schema_metadata({"semstab": json.dumps(about)})
+            writer = writer or open_files.enter_context(pq.ParquetWriter(temporary, content.schema, compression="zstd"))
+            writer.write_table(content)
+
+
+def files_of(path: str | Path) -> list[Path]:
+    """The files of a table: itself, or the tiles in a folder, by x and y.
+
+    Raises DataError where a tile is none of the others' map.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    found = sorted((int(x), int(y), file) for file in path.iterdir() for x, y in TILE.findall(file.name))
+    files = [file for _, _, file in found]
+    if not files:
+        raise DataError(f"{path}: a folder without tiles (tile=X_Y.parquet); run it again")
+    marks = [(file, _about(file)) for file in files]
+    for (file, about), (x, y, _) in zip(marks, found, strict=True):
+        if (about.get("map"), about.get("tile_size")) != (marks[0][1].get("map"), marks[0][1].get("tile_size")):
+            raise DataError(f"{file}: is a tile of another map than {files[0].name}; remove it, or run it again")
+        if about.get("tile") != [x, y]:
+            raise DataError(f"{file}: holds tile {about.get('tile')}; it was renamed, or is damaged")
+    return files
+
+
+def tile_of(path: Path) -> Tile:
+    """Which tile a file is. Raises DataError where it is none."""
+    about = _about(path)
+    with reading(path):
+        x, y = about["tile"]
+        return Tile(x, y, about["tile_size"], about["map"])
+
+
+def voxel_size_of(path: Path) -> float:
+    """The edge of a table's voxels, metres."""
+    about = _about(path)
+    with reading(path):
+        return float(about["voxel_size"])
+
+
+def _about(path: Path) -> dict[str, Any]:
+    import pyarrow.parquet as pq
+
+    with reading(path):
+        content = parse_json((pq.read_schema(path).metadata or {})[b"semstab"])
+        if not isinstance(content, dict):
+            raise ValueError("its metadata are no mapping")
+        return content
+
+
+def rows_in(files: Iterable[Path]) -> int:
+    """How many rows files have. Raises DataError as `reading` does."""
+    import pyarrow.parquet as pq
+
+    total = 0
+    for file in files:
+        with reading(file):
+            total += pq.read_metadata(file).num_rows
+    return total
+
+
+def names_in(path: str | Path) -> list[str]:
+    """The columns of single numbers that a table in a file, or in tiles, has."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file = files_of(path)[0]
+    with reading(file):
+        return [field.name for field in pq.read_schema(file) if not pa.types.is_nested(field.type)]
+
+
+def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+    """Columns (n,) of a file by name. Raises DataError where one is not there."""
+    import pyarrow.parquet as pq
+
+    with reading(path), pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+        content = file.read(columns=list(names))
+        return {name: values_of(content.column(name)) for name in names}
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Whatever is wrong with a file's content is a DataError of one line that names the file."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
+        raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
+
+
+def read(path: str | Path, names: Iterable[str]) -> dict[str, Any]:
+    """Columns by name, voxel_size and classes; what it raises becomes a DataError in `reading`."""
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as content:
+        about = parse_json((content.schema_arrow.metadata or {})[b"semstab"])
+        if about["schema"] != SCHEMA:
+            raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
+        parts: dict[str, list[Any]] = {name: [] for name in names}
+        for group in range(content.num_row_groups):
+            rows = content.read_row_group(group, columns=list(parts))
+            for name, values in parts.items():
+                values.append(_to_numpy(rows.column(name)))
+    columns = {name: _joined(values) for name, values in parts.items()}
+    return columns | {"voxel_size": float(about["voxel_size"]), "classes": tuple(about["classes"])}
+
+
+def _joined(parts: list[Any]) -> Any:
+    return Evidence.joined(parts) if isinstance(parts[0], Evidence) else np.concatenate(parts)
+
+
+def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
+    import pyarrow as pa
+
+    if values.ndim == 1:
+        return column(values)
+    return pa.FixedSizeListArray.from_arrays(column(values.ravel()), values.shape[1])
+
+
+def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:
+    """Values (n,); rows of classes are sparse."""
+    import pyarrow as pa
+
+    if column.null_count:
+        raise DataError("a column has missing values")
+    if pa.types.is_fixed_size_list(column.type):
+        flat = pa.chunked_array([part.flatten() for part in column.chunks], column.type.value_type)
+        return Evidence.of(values_of(flat).reshape(-1, column.type.list_size))
+    return values_of(column)

@@ -1,0 +1,451 @@
+"""What `semstab.statistics` says of a map; in JSON as the fields say.
+
+Undefined numbers are NaN; a section that could not be computed is None.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from semstab.core.json_form import INLINE
+from semstab.model.measures import Measure, MeasureMeans
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % confidence interval; NaN where undefined."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def percent(self) -> Estimate:
+        """Of a share, in percent."""
+        return Estimate(100 * self.value, 100 * self.low, 100 * self.high)
+
+
+UNDEFINED = Estimate(math.nan, math.nan, math.nan)
+
+Question = Literal["this map", "the next flight"]
+THIS_MAP: Question = "this map"
+NEXT_FLIGHT: Question = "the next flight"
+
+
+@dataclass(frozen=True)
+class Interval(Estimate):
+    """A value with its interval, and what that answers.
+
+    question    'this map': other places like these, in these very frames; 'the next flight': other frames, too
+    frames      that were sampled, about; 0 where they are not known
+    places      cubes of space that hold something that counts
+    block_size  edge of the blocks in which errors may depend on each other, metres
+    degrees     of freedom of the standard error
+    undecided   why nothing may be claimed, and what to fly; empty where something may
+    p_value     of a difference: that there is none
+    """
+
+    question: Question = THIS_MAP
+    frames: int = 0
+    places: int = 0
+    block_size: float = math.nan
+    degrees: float = math.nan
+    undecided: str = ""
+    p_value: float = math.nan
+
+    @property
+    def decided(self) -> bool:
+        """Whether something may be claimed."""
+        return not self.undecided
+
+
+UNKNOWN = Interval(math.nan, math.nan, math.nan)
+
+Level = Literal[
+    "stable", "partly stable", "usable", "unstable", "undecided", "too coarse", "misleading", "no verdict",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StabilityVerdict:
+    """What the evidence says of a backbone on a scene: a level, see ADVICE, and the line that gives the reason."""
+
+    level: Level
+    line: str
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """The voxels with OP >= 2: how many they are, and of all voxels."""
+
+    voxels: int
+    share: float
+
+
+@dataclass(frozen=True)
+class BlockCut:
+    """How many cubes of space hold voxels with OP >= 2, and the edge of the blocks in which alpha's errors may depend.
+
+    size in metres: four times as far as errors were found to reach.
+    """
+
+    count: int
+    size: float
+
+
+@dataclass(frozen=True)
+class ClassAgreement:
+    """Agreement on one class against all others, over the voxels with OP >= 2; NaN where undefined.
+
+    observations is the evidence for the class in these voxels, in frames.
+    """
+
+    name: str
+    observations: float
+    kappa: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class FrameAgreement:
+    """Do frames agree about a place? Over the voxels with OP >= 2.
+
+    within, between  the parts of 1 - PSA that are there within a frame, and between frames
+    alpha_between    alpha of the evidence of frames: forgives what is within one
+    each_place       the same with each voxel counting once, however often it was seen: weights that flights share
+    """
+
+    psa: Interval
+    kappa: Interval
+    alpha: Interval
+    vss: Interval
+    within: Interval
+    between: Interval
+    alpha_between: Interval
+    each_place: Interval
+    classes: tuple[ClassAgreement, ...]
+
+
+@dataclass(frozen=True)
+class ClassReach:
+    """`Reach` of one class against all others.
+
+    places   the evidence for it in the whole map's voxels with OP >= 2, in voxels
+    matters  whether the verdict depends on it
+    """
+
+    name: str
+    places: float
+    matters: bool
+    alpha: float
+    ceiling: float
+    reached: Interval
+
+
+@dataclass(frozen=True)
+class LagBin:
+    """Pairs of looks at a place that are `low` to `high` apart, `mean` in the mean.
+
+    alpha    between frames, of these pairs and beyond their own chance
+    ceiling  the same of labels that do not depend on the view
+    """
+
+    low: float
+    high: float
+    mean: float
+    pairs: int
+    alpha: Interval
+    ceiling: float
+
+
+@dataclass(frozen=True)
+class Correlogram:
+    """Agreement beyond chance by how far apart two looks are; bins with few pairs are left out.
+
+    time      frames
+    angle     degrees between the directions of view
+    range     ratio of the distances to the place, the larger one above
+    baseline  metres between the cameras
+    standard  the pairs with 5 to 15 degrees between them, for models and flights to be compared at
+    """
+
+    time: tuple[LagBin, ...]
+    angle: tuple[LagBin, ...]
+    range: tuple[LagBin, ...]
+    baseline: tuple[LagBin, ...]
+    standard: LagBin
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Alpha between frames beside its ceiling, that of labels which do not depend on the view, in sampled voxels.
+
+    Intervals are as those of `Judged`.
+
+    by       whose labels those are
+    voxels   sampled ones with OP >= 2
+    reached  alpha / ceiling: what is left to the model, whatever the size of the voxels
+    """
+
+    by: str
+    voxels: int
+    alpha: Interval
+    ceiling: Interval
+    reached: Interval
+    classes: tuple[ClassReach, ...]
+
+    @property
+    def worst(self) -> ClassReach | None:
+        """The class that matters whose frames agree least; one of which nothing is known first."""
+        matter = [row for row in self.classes if row.matters]
+        return min(matter, key=lambda row: (not math.isnan(row.reached.value), row.reached.value), default=None)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The numbers that a verdict rests on, with intervals for the next flight: other frames and places like these.
+
+    Where frames are not known, or too few to tell, the intervals are for this map, as their `question` says. vss is at
+    OP >= 3; the last two are undefined without ground truth.
+    """
+
+    psa: Interval
+    alpha: Interval
+    alpha_between: Interval
+    vss: Interval
+    accuracy: Interval
+    wrong_of_stable: Interval
+
+
+@dataclass(frozen=True)
+class Flipping:
+    """Places about which frames do not agree: with OP >= 2, and two frames agree with a probability below 0.8.
+
+    share    of these places, each counting by how likely it is one, for this map
+    seen     the part of them that four frames or more saw: of fewer looks it cannot be told whether errors come again
+             at the same places
+    a, b     the two classes between which most of them flip, with the part of all flips that is between these
+    """
+
+    share: Interval
+    seen: float
+    a: str = ""
+    b: str = ""
+    part: float = math.nan
+
+
+@dataclass(frozen=True)
+class DriftTests:
+    """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
+
+    sbd_p, trend_p   whether stretches of time could have come in any order: so many `stretches`, over `voxels`
+    trend_excess     the trend less that in random order
+    trending_voxels  of the tested ones: their disagreement goes one way in time
+    """
+
+    sbd_p: float
+    trend: float
+    trend_null: float
+    trend_excess: Interval
+    trend_p: float
+    stretches: int
+    voxels: int
+    tested_voxels: int
+    unusual_sbd_voxels: int
+    trending_voxels: int
+
+
+@dataclass(frozen=True)
+class FlipRates:
+    """Share of the steps at which the predicted class changes, that in random order; frames since the last change."""
+
+    rate: Interval
+    null: Interval
+    excess: Interval
+    frames_since: Interval
+
+
+@dataclass(frozen=True)
+class DriftStatistics:
+    """SBD in bits beside that of the same observations in random order, over the `voxels` where that is known."""
+
+    voxels: int
+    sbd: Interval
+    null: Interval
+    excess: Interval
+    tests: DriftTests | None = None
+    flips: FlipRates | None = None
+
+
+@dataclass(frozen=True)
+class EntropyParts:
+    """Mean entropy of the belief, and of that what is there within each frame and between them."""
+
+    entropy: Interval
+    within: Interval
+    between: Interval
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The pairwise disagreement 1 - PSA over voxels with OP >= 2 in both maps, and whose it is.
+
+    share is geometry's part of the total. Negative parts of the model mean that its labels agree better than the
+    view-independent ones: it errs alike in all views.
+    """
+
+    voxels: int
+    total: Estimate
+    geometry: Estimate
+    model: Estimate
+    share: Estimate
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """One bin of the reliability diagram: voxels whose largest belief lies in (low, high]."""
+
+    low: float
+    high: float
+    voxels: int
+    confidence: float
+    accuracy: float
+
+
+@dataclass(frozen=True)
+class Correctness:
+    """How right the fused labels of a group of voxels are; NaN where no voxel has a true class.
+
+    miou   mean over the classes that are true or predicted somewhere, of intersection over union
+    ece    expected calibration error: mean |accuracy - confidence| over 15 bins of the largest belief, by voxels
+    brier  mean over voxels of sum_k (p_k - y_k)^2, 0 to 2
+    """
+
+    name: str
+    voxels: int
+    accuracy: float
+    miou: float
+    ece: float
+    brier: float
+
+
+@dataclass(frozen=True)
+class Quadrants:
+    """Shares of the voxels with OP >= 3 and a true class that are stable or not, right or wrong.
+
+    wrong_of_stable is the share of the stable voxels that are wrong: what to expect where the map looks safe.
+    """
+
+    voxels: int
+    stable_right: Interval
+    stable_wrong: Interval
+    unstable_right: Interval
+    unstable_wrong: Interval
+    wrong_of_stable: Interval
+
+
+@dataclass(frozen=True)
+class CorrectnessStatistics:
+    """Right beside stable; strata has all voxels with a true class first, then each stratum of OP."""
+
+    accuracy: Interval
+    strata: tuple[Correctness, ...]
+    reliability: tuple[Reliability, ...]
+    quadrants: Quadrants
+
+
+@dataclass(frozen=True)
+class RuleMeans:
+    """Means over the voxels with OP >= 2 under a rule of fusion; how right it is where ground truth tells, else NaN."""
+
+    means: MeasureMeans = field(metadata=INLINE)
+    accuracy: float = math.nan
+    miou: float = math.nan
+    ece: float = math.nan
+    brier: float = math.nan
+
+    def __getitem__(self, measure: Measure) -> float:
+        return self.means[measure]
+
+
+@dataclass(frozen=True)
+class RuleOutcome:
+    """What a rule of fusion makes of a map; relabelled_share is the part of the voxels that get another class."""
+
+    rule: str
+    values: RuleMeans = field(metadata=INLINE)
+    relabelled_share: float
+
+
+@dataclass(frozen=True)
+class StratumStatistics:
+    """Means over a stratum of OP."""
+
+    name: str
+    voxels: int
+    means: MeasureMeans = field(metadata=INLINE)
+    psa: float
+    sbd_null: float
+    sbd_excess: float
+    entropy_within: float
+    entropy_between: float
+
+
+@dataclass(frozen=True)
+class BeyondCoin:
+    """What a coin tossed as often as places were seen would not show; 0 for it, whatever the OP.
+
+    disagreement  PSA of the places that two frames saw less that of the places that more saw
+    settling      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
+    """
+
+    disagreement: Interval
+    settling: Interval
+
+
+# --- One map ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """All that the statistics say of one map."""
+
+    schema: int
+    name: str
+    seed: int
+    K: int
+    voxel_size: float
+    voxels: int
+    observations: int
+    repeated: Repeated
+    blocks: BlockCut
+    verdict: StabilityVerdict
+    agreement: FrameAgreement
+    flipping: Flipping | None
+    judged: Judged
+    reach: Reach | None
+    correlogram: Correlogram | None
+    drift: DriftStatistics
+    uncertainty: EntropyParts
+    geometry: Losses | None
+    correctness: CorrectnessStatistics | None
+    fusion_rules: tuple[RuleOutcome, ...] | None
+    strata: tuple[StratumStatistics, ...]
+    beyond_coin: BeyondCoin
+
+    @property
+    def order_known(self) -> bool:
+        """Whether a quarter of the places seen twice say what a random order of their observations gives.
+
+        Of soft scores without a log only a few do, and not just any.
+        """
+        return 4 * self.drift.voxels >= self.repeated.voxels
+
+    @property
+    def sections(self) -> int:
+        """How many of the sections that need more than the map could be computed."""
+        return sum(section is not None for section in (self.geometry, self.correctness, self.fusion_rules))

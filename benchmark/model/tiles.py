@@ -1,0 +1,104 @@
+"""A map by its tiles: which of them hold some voxels, and the voxels of a region, a few tiles in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from semstab.core.at_hand import AtHand
+from semstab.core.types import Float64, Int64
+from semstab.model import parquet
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
+
+AT_HAND = 1 << 22
+"""Voxels of tiles that stay in memory."""
+
+Place = tuple[int, int]
+
+
+T = TypeVar("T", VoxelTable, Events)
+
+
+class Tiles(Generic[T]):
+    """The tiles of a map, or of its log, by place; one in a single file has one, which holds all.
+
+    size        edge of a tile in voxels, None for that one
+    voxel_size  metres
+    """
+
+    def __init__(self, load: Mapping[Place, Callable[[], T]], size: int | None, voxel_size: float) -> None:
+        self.size, self.voxel_size = size, voxel_size
+        self._load: Mapping[Place, Callable[[], T]] = load
+        self._tables: AtHand[Place, T] = AtHand(lambda place: self._load[place](), len, AT_HAND)
+
+    @classmethod
+    def open(cls, path: str | Path, kind: type[T]) -> Tiles[T]:
+        """Those of a file, or of a folder of tiles. Raises DataError where it is damaged."""
+        files = parquet.files_of(path)
+        voxel_size = parquet.voxel_size_of(files[0])
+        if not Path(path).is_dir():
+            return cls({(0, 0): partial(kind.load, files[0])}, None, voxel_size)
+        tiles = {file: parquet.tile_of(file) for file in files}
+        load = {(tile.x, tile.y): partial(kind.load, file) for file, tile in tiles.items()}
+        return cls(load, tiles[files[0]].size, voxel_size)
+
+    @classmethod
+    def of(cls, table: T) -> Tiles[T]:
+        """A table as the one tile of its map."""
+        return cls({(0, 0): lambda: table}, None, table.voxel_size)
+
+    def __iter__(self) -> Iterator[Place]:
+        return iter(self._load)
+
+    def __getitem__(self, place: Place) -> T:
+        return self._tables[place]
+
+    def holding(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
+        """The tiles in which some of these points (n, 3) of the scene lie, metres, with the rows (m,) of these."""
+        if self.size is None:
+            yield (0, 0), np.arange(len(points))
+            return
+        index = np.floor(points[:, :2] / self.voxel_size).astype(np.int64)
+        places, of = np.unique(index // self.size, axis=0, return_inverse=True)
+        order = np.argsort(of.ravel(), kind="stable")
+        rows = np.split(order, np.cumsum(np.bincount(of.ravel(), minlength=len(places)))[:-1])
+        for (x, y), own in zip(places.tolist(), rows, strict=True):
+            if (x, y) in self._load:
+                yield (x, y), own
+
+    def region(self, place: Place, size: int) -> T:
+        """The voxels of a wider tile of that size, a multiple of the own one."""
+        if self.size is None:
+            table = self[0, 0]
+            return table.rows(np.flatnonzero((table.ix // size == place[0]) & (table.iy // size == place[1])))
+        inside = [own for own in self if self._in_wider(own, size) == place]
+        first = self[next(iter(self))] if not inside else self[inside[0]]
+        return type(first).joined([self[own] for own in inside]) if inside else first.rows(np.zeros(0, np.int64))
+
+    def wider(self, size: int) -> set[Place]:
+        """The wider tiles of that size that hold a voxel."""
+        if self.size is not None:
+            return {self._in_wider(own, size) for own in self}
+        table = self[0, 0]
+        pairs = np.unique(np.stack([table.ix // size, table.iy // size], axis=1), axis=0)
+        return {(x, y) for x, y in pairs.tolist()}
+
+    def _in_wider(self, place: Place, size: int) -> Place:
+        assert self.size is not None
+        return place[0] * self.size // size, place[1] * self.size // size
+
+
+def side_by_side(maps: Sequence[Tiles[Any]]) -> Iterator[tuple[Any, ...]]:
+    """The voxels of several maps region by region, by the widest of their tiles; of maps in single files at once."""
+    sizes = [own.size for own in maps if own.size is not None]
+    if not sizes:
+        yield tuple(own[0, 0] for own in maps)
+        return
+    size = max(sizes)
+    for place in sorted({place for own in maps for place in own.wider(size)}):
+        yield tuple(own.region(place, size) for own in maps)

@@ -1,0 +1,334 @@
+"""What fusion leaves behind: one row a voxel."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.process import available_bytes
+from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.errors import DataError, MissingDependencyError
+from semstab.model import parquet
+from semstab.model.evidence import Evidence
+from semstab.model.measures import MeasureMeans, dominant, measures
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+
+# Columns as tables of Arrow and pandas, and the small tables that a notebook shows.
+
+Cell = str | int | float
+
+
+def to_arrow(columns: Mapping[str, Any]) -> pa.Table:
+    """The columns; what is undefined is null."""
+    import pyarrow as pa
+
+    return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
+
+
+def to_pandas(columns: Mapping[str, Any]) -> pd.DataFrame:
+    """The columns; names are categories. Raises MissingDependencyError without pandas."""
+    try:
+        import pandas  # noqa: F401  what Arrow needs for it
+    except ImportError as error:
+        raise MissingDependencyError("data frames need pandas; pip install pandas, or take to_arrow()") from error
+    return to_arrow(columns).to_pandas()
+
+
+def named(rows: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.DictionaryArray:
+    """A column of names by their rows."""
+    import pyarrow as pa
+
+    return pa.DictionaryArray.from_arrays(rows.astype(np.int32), list(names))
+
+
+def as_html(title: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
+    """A table with a caption; whatever names hold is shown as it is."""
+    head = "".join(f"<th>{html.escape(header)}</th>" for header in headers)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    caption = f'<caption style="text-align: left; white-space: nowrap">{html.escape(title)}</caption>'
+    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def number(value: float, digits: int) -> str:
+    """With so many decimals; '-' where there is none."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _text(cell: Cell) -> str:
+    return f"{cell:,}" if isinstance(cell, int) else str(cell)
+
+
+# The columns of voxels and of observations, and what both tables do with them.
+
+Types = dict[str, type[np.generic]]
+
+BYTES_A_VOXEL = 200
+"""Of a table that is put together from tiles: twice what it takes."""
+
+INDEX: Types = {"ix": np.int32, "iy": np.int32, "iz": np.int32}
+OF_VOXELS: Types = INDEX | {
+    "op": np.int32, "evidence": np.float64, "drift_sum": np.float64, "pixels": np.int64, "first_frame": np.int32,
+    "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
+}  # fmt: skip
+OF_EVENTS: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64, "pixels": np.int32}
+"""Of both by name: where a voxel is, and what its row and that of an observation have."""
+
+
+def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
+    """Voxel indices (n, 3) as the columns ix, iy, iz."""
+    return dict(zip(INDEX, index.T.astype(np.int32), strict=True))
+
+
+def in_order(index: Mapping[str, npt.NDArray[Any]]) -> Int64:
+    """The order of voxels by ix, iy, iz."""
+    order: Int64 = np.lexsort([index[name] for name in reversed(INDEX)])
+    return order
+
+
+def require_memory(path: Path, files: Sequence[Path]) -> None:
+    """Raise DataError where a map in tiles does not fit into the memory that is free."""
+    voxels, free = parquet.rows_in(files), available_bytes()
+    if (needed := voxels * BYTES_A_VOXEL) > free:
+        raise DataError(
+            f"{path}: {voxels / 1e6:.3g} million voxels in {len(files)} tiles take {needed / 1e9:.2g} GB at once, and"
+            f" {free / 1e9:.2g} GB are free; take them tile by tile (VoxelTable.iter_tiles, or DuckDB on its files)"
+        )
+
+
+def freeze(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
+    """Make a table's columns arrays of their types that cannot be written to, as long as that one.
+
+    Raises DataError where one is not.
+    """
+    for name, dtype in types.items():
+        given = getattr(table, name)
+        if len(given) != len(like):
+            raise DataError(f"{type(table).__name__}: column '{name}' has {len(given)} rows, expected {len(like)}")
+        object.__setattr__(table, name, _evidence(table, given) if name == "evidence" else _frozen(given, dtype))
+
+
+def _frozen(given: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    column: npt.NDArray[Any] = np.ascontiguousarray(given, dtype=dtype).view()
+    column.setflags(write=False)
+    return column
+
+
+def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
+    shape = np.shape(given)
+    if len(shape) != 2:
+        raise DataError(f"{type(table).__name__}: evidence of shape {shape}, expected one row of K classes each")
+    return Evidence.of(given)
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelTable:
+    """The fused map: n voxels sorted by (ix, iy, iz). Everything reported about a voxel is a function of its row.
+
+    ix, iy, iz         (n,) int32 voxel index, floor(x_w / r)
+    op                 (n,) int32 observation persistence: the number of frames that saw the voxel
+    evidence           (n, K) accumulated evidence e(q), the sum over frames of s_bar; kept sparse
+    drift_sum          (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits
+    pixels             (n,) int64 pixels that fell into the voxel, all frames
+    first_frame        (n,) int32 lowest frame index that saw it
+    last_frame         (n,) int32 highest frame index that saw it
+    self_sum           (n,) float64 sum over frames of ||s_bar||^2
+    frame_entropy_sum  (n,) float64 sum over frames of the entropy of s_bar, bits
+    voxel_size         r, metres
+    classes            the K class names, where they are known
+    copies             (n,) how many voxels each row stands for, where they are not one each: see `statistics.kinds`
+
+    Raises DataError where columns disagree in length or rows are not sorted and distinct.
+    """
+
+    ix: Int32
+    iy: Int32
+    iz: Int32
+    op: Int32
+    evidence: Evidence
+    drift_sum: Float64
+    pixels: Int64
+    first_frame: Int32
+    last_frame: Int32
+    self_sum: Float64
+    frame_entropy_sum: Float64
+    voxel_size: float
+    classes: tuple[str, ...] = ()
+    copies: Float64 | None = None
+
+    def __post_init__(self) -> None:
+        freeze(self, OF_VOXELS, self.ix)
+        if self.classes and len(self.classes) != self.K:
+            raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
+        ascends = self.iz[1:] > self.iz[:-1]
+        for column in (self.iy, self.ix):  # a column decides where those before it are equal
+            ascends = (column[1:] > column[:-1]) | ((column[1:] == column[:-1]) & ascends)
+        if not ascends.all():
+            raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
+
+    def __len__(self) -> int:
+        return len(self.ix)
+
+    @property
+    def K(self) -> int:
+        """Number of classes."""
+        return self.evidence.K
+
+    @property
+    def index(self) -> Int32:
+        """(n, 3) int32 voxel indices."""
+        return np.stack([self.ix, self.iy, self.iz], axis=1)
+
+    @property
+    def centers(self) -> Float64:
+        """(n, 3) world coordinates of the voxel centres, metres."""
+        return (self.index.astype(np.float64) + 0.5) * self.voxel_size
+
+    def rows(self, rows: Any) -> VoxelTable:
+        """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in OF_VOXELS if name != "evidence"}
+        copies = None if self.copies is None else self.copies[rows]
+        return replace(self, **columns, evidence=self.evidence.take(rows), copies=copies)
+
+    @property
+    def voxels(self) -> Float64:
+        """(n,) how many voxels each row stands for."""
+        return np.ones(len(self)) if self.copies is None else self.copies
+
+    def measured(self) -> VoxelTable:
+        """The same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
+        return self if self.evidence.known is not None else replace(self, evidence=self.evidence.measured())
+
+    def to_arrow(self) -> pa.Table:
+        """Columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
+        return to_arrow(self._columns())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The same as a data frame. Raises MissingDependencyError without pandas."""
+        return to_pandas(self._columns())
+
+    def _columns(self) -> dict[str, Any]:
+        names = self.classes or tuple(str(k) for k in range(self.K))
+        x, y, z = self.centers.T
+        evidence = self.evidence[:]
+        return {
+            "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
+            "class": named(dominant(self), names),
+            **{measure.key: measure.of(self) for measure in measures()},
+            "pixels": self.pixels, "first_frame": self.first_frame, "last_frame": self.last_frame,
+            **{f"evidence_{name}": evidence[:, k] for k, name in enumerate(names)},
+        }  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        """The means of all voxels and of the recurrent ones, in a notebook."""
+        values = {measure: measure.of(self) for measure in measures()}
+        rows: list[list[Cell]] = []
+        for name, where in (("all", self.op > 0), ("OP >= 3", self.op >= 3)):
+            means = MeasureMeans.over(values, self.op, where)
+            numbers = (number(means[measure], measure.digits[0]) for measure in measures())
+            rows.append([name, int(np.count_nonzero(where)), *numbers])
+        title = f"{len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes"
+        return as_html(title, ["", "voxels", *(measure.title for measure in measures())], rows)
+
+    def save(
+        self,
+        path: str | Path,
+        extra: Mapping[str, npt.NDArray[Any]] | None = None,
+        computed: Mapping[str, Callable[[VoxelTable], npt.NDArray[Any]]] | None = None,
+        tile: parquet.Tile | None = None,
+    ) -> None:
+        """Write Parquet, atomically, some rows after the others; as a tile of a larger map, where one is named.
+
+        `extra` columns (n,), and what is `computed` from the rows that are written, go along for other programs and are
+        not read back.
+        """
+
+        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
+            part = self.rows(some)
+            own = {name: np.asarray(getattr(part, name)) for name in OF_VOXELS}
+            made = {name: of(part) for name, of in (computed or {}).items()}
+            return own | made | {name: values[some] for name, values in (extra or {}).items()}
+
+        parts = map(columns, self.evidence.chunks())
+        parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)
+
+    @classmethod
+    def load(cls, path: str | Path) -> VoxelTable:
+        """Read what `save` wrote, a file or a folder of tiles, all of it.
+
+        Raises DataError where a file is missing, damaged or of another kind, or a map in tiles is larger than memory.
+        """
+        files = parquet.files_of(path)
+        if len(files) > 1:
+            require_memory(Path(path), files)
+        return cls.joined([cls._read(file) for file in files])
+
+    @classmethod
+    def iter_tiles(cls, path: str | Path) -> Iterator[VoxelTable]:
+        """The tiles of a map one after the other, by x and y; of a map in one file that file."""
+        return map(cls._read, parquet.files_of(path))
+
+    @classmethod
+    def columns(cls, path: str | Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+        """Single columns (n,) by name, also measures and what else the file has, in the order of `load`.
+
+        Raises DataError where one is not there.
+        """
+        files, sorting = parquet.files_of(path), tuple(INDEX)
+        wanted = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
+        parts = [parquet.columns(file, wanted) for file in files]
+        found = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+        order = in_order(found) if len(files) > 1 else slice(None)
+        return {name: found[name][order] for name in names}
+
+    @classmethod
+    def joined(cls, parts: Sequence[VoxelTable]) -> VoxelTable:
+        """One table of the voxels of several that share none."""
+        if len(parts) == 1:
+            return parts[0]
+        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in INDEX}
+        order = in_order(index)
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in OF_VOXELS
+            if name != "evidence"
+        }
+        evidence = Evidence.joined([part.evidence for part in parts]).take(order)
+        return replace(parts[0], **columns, evidence=evidence)
+
+    @classmethod
+    def _read(cls, path: Path) -> VoxelTable:
+        with parquet.reading(path):
+            return cls(**parquet.read(path, OF_VOXELS))
+
+
+# A part of space that a map is restricted to: whole columns of voxels.
+
+
+@dataclass(frozen=True)
+class Extent:
+    """The voxels with low <= (ix, iy) < high, whatever their iz.
+
+    origin  voxel of the first camera of the whole map, where that is known: soft scores are rounded as they are there
+    """
+
+    low: tuple[int, int]
+    high: tuple[int, int]
+    origin: tuple[int, int, int] | None = None
+
+    def holds(self, index: npt.NDArray[np.integer]) -> Mask:
+        """Whether each of the voxels of these indices (3, n) is one of them: (n,)."""
+        ix, iy = index[0], index[1]
+        inside: Mask = (ix >= self.low[0]) & (ix < self.high[0])
+        inside &= (iy >= self.low[1]) & (iy < self.high[1])
+        return inside

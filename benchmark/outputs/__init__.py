@@ -1,1 +1,0 @@
-"""What is made of a result: terminal, tables, figures, report, recording."""

@@ -1,0 +1,390 @@
+"""What steadies a model's labels: `parse("ema:0.6")` makes a filter, `Filtered` puts some over a backbone."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
+from semstab.backbones.border import Wrapped
+from semstab.core.registry import Entry, Registry
+from semstab.core.types import Float32, UInt16
+from semstab.errors import ConfigError
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace, ignore_id
+from semstab.pixels.warp import carry, warp
+
+Belief = Float32
+"""(H, W, K) float32: what is believed of each pixel, sums to 1 over the classes; to 0 where nothing is said."""
+
+REGISTRY = Registry(
+    "filter",
+    {
+        "ema": Entry("semstab.predict.filters:Ema", "KEEP: average at the pixel; KEEP is the share of before"),
+        "ema-warped": Entry("semstab.predict.filters:EmaWarped", "KEEP: the same of the place, by depth and pose"),
+        "vote": Entry("semstab.predict.filters:Vote", "N: majority of the pixel's last N labels"),
+        "vote-warped": Entry("semstab.predict.filters:VoteWarped", "N: the same of the place, by depth and pose"),
+        "guided": Entry(
+            "semstab.predict.filters:Guided",
+            "PIXELS: guided filter: borders follow those of the image",
+        ),
+        "threshold": Entry(
+            "semstab.predict.filters:Threshold",
+            "SCORE: ignore where no class has it; needs scores",
+        ),
+        "map-prior": Entry(
+            "semstab.predict.map_prior:MapPrior",
+            "METRES: times the belief of the map so far, in such voxels",
+        ),
+    },
+)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """The number behind a filter's name: what it is, its usual value, from and up to what; whether it is whole."""
+
+    what: str
+    usual: float
+    low: float
+    high: float
+    whole: bool = False
+
+    def read(self, text: str, where: str) -> float:
+        """The number in a text. Raises ConfigError that begins with `where`."""
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not self.low <= value <= self.high or (self.whole and value != int(value)):
+            kind = "a whole number" if self.whole else "a number"
+            raise ConfigError(f"{where}: {self.what} is {kind} from {self.low:g} to {self.high:g}; got '{text}'")
+        return value
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What a filter may look at beside the belief.
+
+    frame  depth and pose at the image's pixels, where the filter wants geometry
+    """
+
+    image: Image
+    frame: Frame | None = None
+
+    @property
+    def geometry(self) -> Frame:
+        """The frame of a filter that wants geometry."""
+        assert self.frame is not None
+        return self.frame
+
+
+class Filter(ABC):
+    """Beliefs in, beliefs out, image by image; one is made for each sequence. `REGISTRY` names its subclasses.
+
+    parameter       what stands behind the colon
+    sequential      whether it remembers the images before
+    wants_geometry  whether it looks at depth and pose
+    wants_color     whether it looks at the image
+    needs_scores    whether labels alone will not do; else a label counts as certain
+    """
+
+    parameter: ClassVar[Parameter]
+    sequential: ClassVar[bool] = False
+    wants_geometry: ClassVar[bool] = False
+    wants_color: ClassVar[bool] = False
+    needs_scores: ClassVar[bool] = False
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    @abstractmethod
+    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+        """The belief after what it does; the array that it is given stays as it is."""
+
+
+@dataclass(frozen=True)
+class FilterSpec:
+    """A filter by name with its number: 'ema:0.6'."""
+
+    name: str
+    value: float
+    kind: type[Filter]
+
+    def __call__(self) -> Filter:
+        """A new one, which remembers nothing."""
+        return self.kind(self.value)
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.value:g}"
+
+
+def parse(text: str) -> FilterSpec:
+    """'ema:0.6', or 'ema' with its usual number.
+
+    Raises ConfigError for an unknown name or a number that it cannot have.
+    """
+    name, _, value = text.strip().partition(":")
+    kind = cast("type[Filter]", REGISTRY.load(name))
+    number = kind.parameter.read(value, f"filter '{text}'") if value else kind.parameter.usual
+    return FilterSpec(name, number, kind)
+
+
+def one_hot(rows: npt.NDArray[Any], K: int) -> Belief:
+    """Beliefs that are certain: (H, W) rows 0..K-1, K where nothing is said."""
+    belief = np.zeros((rows.size, K + 1), dtype=np.float32)
+    belief[np.arange(rows.size), rows.reshape(-1)] = 1
+    return belief[:, :K].reshape(*rows.shape, K)
+
+
+def normalised(belief: Belief) -> Belief:
+    """Shares of each pixel's sum, in place; 0 where that is 0."""
+    total = belief.sum(axis=2, keepdims=True)
+    np.divide(belief, total, out=belief, where=total > 0)
+    return belief
+
+
+# A chain of filters over a backbone, which is a backbone again.
+
+
+class Filtered(Wrapped):
+    """What a backbone says, after filters in their order. Where it says nothing, nothing is said.
+
+    Filters see its scores where it has any; else its labels count as certain. Raises ConfigError for a backbone without
+    classes, and for one without scores where the first filter needs them.
+    """
+
+    def __init__(self, inner: Backbone, filters: Sequence[FilterSpec], name: str) -> None:
+        super().__init__(inner)
+        if inner.label_space is None:
+            raise ConfigError(f"--filter {filters[0]}: '{name}' finds regions without classes; leave the filter out")
+        if filters[0].kind.needs_scores and not inner.gives_scores:
+            raise ConfigError(
+                f"--filter {filters[0]}: it needs scores, and '{name}' gives labels alone; leave it out, or put one"
+                " before it that makes shares of them, such as vote:5"
+            )
+        self.filters = tuple(filters)
+        self.space = inner.label_space
+        self.gives_scores = True
+        self.sequential = inner.sequential or any(spec.kind.sequential for spec in filters)
+        self.wants_geometry = inner.wants_geometry or any(spec.kind.wants_geometry for spec in filters)
+        self.seconds: list[float] = []
+        """Of CPU time that the filters took for each image so far."""
+        self._begin(())
+
+    def reset(self) -> None:
+        """Forget all images."""
+        super().reset()
+        self._begin(())
+
+    def predict(
+        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    ) -> list[Prediction]:
+        """See `Backbone`; an image of another size begins anew."""
+        found = self.ask(images, self.inner.gives_scores, geometry)
+        frames: Sequence[Frame | None] = geometry or [None] * len(images)
+        return [self._filtered(*each, scores) for each in zip(found, images, frames, strict=True)]
+
+    def identity(self) -> dict[str, Any]:
+        """That of the inner backbone, and the filters."""
+        return {**self.inner.identity(), "filters": [str(spec) for spec in self.filters]}
+
+    def _begin(self, shape: tuple[int, ...]) -> None:
+        self._chain = [make() for make in self.filters]
+        self._shape = shape
+
+    def _filtered(self, prediction: Prediction, image: Image, frame: Frame | None, scores: bool) -> Prediction:
+        if image.shape != self._shape:
+            self._begin(image.shape)
+        started = time.thread_time()
+        belief = belief_of(prediction, self.space)
+        said = belief.any(axis=2, keepdims=True)
+        for one in self._chain:
+            belief = one(belief, Shown(image, frame)) * said
+        labels = labels_of(belief, self.space, prediction.labels)
+        self.seconds.append(time.thread_time() - started)
+        return Prediction(labels, belief if scores else None)
+
+
+def belief_of(prediction: Prediction, space: LabelSpace) -> Belief:
+    """Its scores, 0 where the label is ignored; of labels alone, each of them certain."""
+    ignored = prediction.labels == ignore_id(prediction.labels)
+    if prediction.scores is not None:
+        return np.where(ignored[..., None], np.float32(0), prediction.scores)
+    K = len(space)
+    row_of_id = np.full(1 << 8 * prediction.labels.itemsize, K, dtype=np.intp)
+    row_of_id[list(space.ids)] = np.arange(K)
+    return one_hot(np.where(ignored, K, row_of_id[prediction.labels]), K)
+
+
+def labels_of(belief: Belief, space: LabelSpace, like: npt.NDArray[Any]) -> Labels:
+    """The likeliest class of each pixel, by its id in maps such as `like`; the ignore id where nothing is said."""
+    ids = np.array([*space.ids], dtype=like.dtype)[belief.argmax(axis=2)]
+    ids[~belief.any(axis=2)] = ignore_id(like)
+    return ids if like.dtype == np.uint8 else narrowed(ids, np.iinfo(np.uint16).max)
+
+
+# Unsure pixels are left out.
+
+
+class Threshold(Filter):
+    """Nothing is said where the largest score is below the threshold."""
+
+    parameter = Parameter("the score from which a pixel counts", 0.6, 0, 1)
+    needs_scores = True
+
+    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+        """See `Filter`."""
+        sure = belief.max(axis=2, keepdims=True) >= np.float32(self.value)
+        return np.where(sure, belief, np.float32(0))
+
+
+# Exponential averages of beliefs: at the pixel, or at the place.
+
+
+class Ema(Filter):
+    """b_t = keep b_{t-1} + (1 - keep) p_t at each pixel, whatever it shows; it begins with p_t."""
+
+    parameter = Parameter("the share that is kept of the belief before", 0.6, 0, 0.999)
+    sequential = True
+
+    def __init__(self, value: float) -> None:
+        super().__init__(value)
+        self._before: Belief | None = None
+
+    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+        """See `Filter`."""
+        self._before = belief if self._before is None else mixed(self._before, belief, self.value)
+        return self._before
+
+
+class EmaWarped(Filter):
+    """The same of each place: b_{t-1} is looked up where the pixel's surface point was, by depth and pose.
+
+    A pixel begins anew where that point was hidden or out of view, or where there is no depth.
+    """
+
+    parameter = Ema.parameter
+    sequential = True
+    wants_geometry = True
+
+    def __init__(self, value: float) -> None:
+        super().__init__(value)
+        self._before: tuple[Belief, Frame] | None = None
+
+    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+        """See `Filter`."""
+        now = shown.geometry
+        if self._before is not None:
+            belief = mixed(carry(*self._before, now), belief, self.value)
+        self._before = belief, now
+        return belief
+
+
+def mixed(before: Belief, now: Belief, keep: float) -> Belief:
+    """keep * before + (1 - keep) * now; one of them alone where the other says nothing."""
+    weight = np.where(now.any(axis=2), np.where(before.any(axis=2), keep, 0.0), 1.0).astype(np.float32)[..., None]
+    return weight * before + (1 - weight) * now
+
+
+# Borders of classes that follow those of the image: the guided filter (He, Sun and Tang 2013, TPAMI).
+
+EPSILON = 0.05**2
+"""Variance of grey values, black 0 and white 1, from which an edge is kept rather than smoothed over."""
+
+Grey = npt.NDArray[Any]
+"""(H, W) float32."""
+
+
+class Guided(Filter):
+    """Each class's belief as a linear function of the grey value in every window of that radius, averaged.
+
+    Means over windows of (2 radius + 1)^2 pixels: the time does not depend on the radius. Pixels of which nothing is
+    said have no part.
+    """
+
+    parameter = Parameter("the radius of the windows in pixels", 8, 1, 500, whole=True)
+    wants_color = True
+
+    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+        """See `Filter`."""
+        import cv2
+
+        grey = cv2.cvtColor(shown.image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
+        said = belief.any(axis=2).astype(np.float32)
+        count = np.maximum(self._sum(said), 1)
+        mean = self._sum(grey * said) / count
+        variance = self._sum(grey * grey * said) / count - mean * mean
+        filtered = np.empty_like(belief)
+        for k in range(belief.shape[2]):
+            p = np.ascontiguousarray(belief[..., k])
+            mean_p = self._sum(p) / count
+            a = (self._sum(grey * p) / count - mean * mean_p) / (variance + EPSILON)
+            b = mean_p - a * mean
+            filtered[..., k] = (self._sum(a * said) * grey + self._sum(b * said)) / count
+        return normalised(np.maximum(filtered, 0))
+
+    def _sum(self, values: Any) -> Grey:
+        """Over the window of each pixel."""
+        import cv2
+
+        side = 2 * int(self.value) + 1
+        return np.asarray(cv2.boxFilter(values, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT))
+
+
+# Majorities of the last labels: at the pixel, or at the place.
+
+Rows = UInt16
+
+
+class Vote(Filter):
+    """Each class's share of the last N labels at the pixel, this one included: no later frame is looked at.
+
+    Where classes tie, the newer labels win.
+    """
+
+    parameter = Parameter("how many labels vote", 5, 2, 1000, whole=True)
+    sequential = True
+
+    def __init__(self, value: float) -> None:
+        super().__init__(value)
+        self._last: deque[tuple[Rows, Frame | None]] = deque(maxlen=int(value))
+
+    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+        """See `Filter`."""
+        K, N = belief.shape[2], int(self.value)
+        rows = np.where(belief.any(axis=2), belief.argmax(axis=2), K).astype(np.uint16)
+        self._last.append((rows, shown.frame))
+        counts = np.zeros((rows.size, K + 1), dtype=np.float32)
+        pixels = np.arange(rows.size)
+        for age, seen in enumerate(self._seen_now(shown, K)):
+            counts[pixels, seen.reshape(-1)] += 1 + (N - age) / (N * (N + 1))  # of all N together less than 1
+        return normalised(counts[:, :K].reshape(belief.shape))
+
+    def _seen_now(self, shown: Shown, nothing: int) -> Iterator[Rows]:
+        """The last label maps at the pixels of this one, the newest first; `nothing` where one says nothing."""
+        return (rows for rows, _ in reversed(self._last))
+
+
+class VoteWarped(Vote):
+    """The same of each place: the last N - 1 frames are asked for the pixel's surface point, by depth and pose.
+
+    A frame that did not see the point has no vote.
+    """
+
+    wants_geometry = True
+
+    def _seen_now(self, shown: Shown, nothing: int) -> Iterator[Rows]:
+        (rows, _), *before = reversed(self._last)
+        yield rows
+        for past, frame in before:
+            assert frame is not None
+            yield warp(past, frame, shown.geometry, fill=nothing)[0]

@@ -1,0 +1,216 @@
+"""A folder of predictions: the maps, their classes, and what they depend on, so that others never mix with them."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png, write_stack
+from semstab.core.json_form import from_json
+from semstab.core.types import Float32
+from semstab.datasets.files.labels import LABEL_SPACE_FILE
+from semstab.datasets.files.options import inside
+from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
+from semstab.datasets.geometry.lenses import fitted
+from semstab.errors import ConfigError, DataError
+from semstab.model.labels import LabelSpace
+
+SCHEMA = 1
+"""Version of predictions.json."""
+
+MANIFEST_FILE = "predictions.json"
+SAVE_SECONDS = 5.0
+"""How much work a killed process may lose at most."""
+
+Kind = Literal["labels", "scores", "regions"]
+ScoreType = Literal["float16", "float32"]
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """A frame's map: the digest of its image, and how long the model took for it."""
+
+    image: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Manifest:
+    """What predictions.json says that a later start needs."""
+
+    key: str
+    settings: Mapping[str, Any]
+    frames: Mapping[str, _Predicted]
+
+
+class PredictionFolder:
+    """labels/NAME, scores/NAME or regions/NAME of a scene; what an earlier start of the same finished is kept.
+
+    path      the folder
+    kind      of maps: PNG ids, .npz scores (K, H, W), PNG region ids
+    settings  all that the maps depend on beside the image, for JSON
+    about     what else the manifest says
+    space     the classes; None for regions
+    top_k     how many scores a pixel keeps; None for all
+
+    Raises ConfigError where the folder holds maps of other settings or of other origin.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        kind: Kind,
+        settings: Mapping[str, Any],
+        about: Mapping[str, Any],
+        space: LabelSpace | None,
+        *,
+        score_type: ScoreType = "float16",
+        top_k: int | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        self.path = path
+        self.kind = kind
+        self._suffix = ".npz" if kind == "scores" else ".png"
+        self._score_type = np.dtype(score_type)
+        self._compressed = top_k is not None  # most of it is 0
+        said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
+        if top_k is not None and kind == "scores":
+            said["top_k"] = top_k
+        self._content: dict[str, Any] = {
+            "schema": SCHEMA,
+            "kind": kind,
+            "key": content_key(said),
+            "settings": said,
+            **about,
+        }
+        self._frames: dict[str, _Predicted] = self._claim(overwrite)
+        self._space = space
+        self._saved = -math.inf
+        self._lock: FolderLock | None = None
+
+    def has(self, name: str, image: str) -> bool:
+        """Whether the map of that frame is there, predicted from an image of that digest."""
+        return name in self._frames and self._frames[name].image == image and self.file(name).is_file()
+
+    def file(self, name: str) -> Path:
+        """Where a frame's map is. Raises DataError for a name that leads out of the folder."""
+        return inside(self.path, self.path, f"{name}{self._suffix}", f"image {name[:80]!r}")
+
+    def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
+        """Keep a frame's map of ids (H, W)."""
+        self._claimed()
+        write_png(self.file(name), values)
+        self._done(name, image, seconds)
+
+    def write_scores(self, name: str, image: str, maps: Iterable[npt.NDArray[Any]], seconds: float) -> None:
+        """Keep a frame's scores, which come class by class (H, W); one of them is in memory at a time."""
+        self._claimed()
+        with atomic_path(self.file(name)) as temporary:
+            write_stack(temporary, "scores", maps, len(self._space or ()), self._score_type, self._compressed)
+        self._done(name, image, seconds)
+
+    def save(self) -> None:
+        """Write the classes and the manifest, once there is a map: what is not in the manifest is predicted again."""
+        if self._frames:
+            self._save()
+
+    def close(self) -> None:
+        """Save it, and let another process have it."""
+        self.save()
+        if self._lock is not None:
+            self._lock.release()
+
+    def _claimed(self) -> None:
+        if self._lock is None:
+            self._lock = FolderLock(self.path)
+            self._save()  # before the first map: without it, maps are taken for somebody else's
+
+    def _done(self, name: str, image: str, seconds: float) -> None:
+        self._frames[name] = _Predicted(image, round(seconds, 4))
+        if time.monotonic() - self._saved > SAVE_SECONDS:
+            self.save()
+
+    def _save(self) -> None:
+        if self._space is not None:
+            self._space.save(self.path / LABEL_SPACE_FILE)
+        write_json(self.path / MANIFEST_FILE, self._content | {"frames": self._frames})
+        self._saved = time.monotonic()
+
+    def _claim(self, overwrite: bool) -> dict[str, _Predicted]:
+        """The frames that an earlier start finished."""
+        manifest = self.path / MANIFEST_FILE
+        if not manifest.is_file():
+            suffixes = SCORE_SUFFIXES if self.kind == "scores" else LABEL_SUFFIXES
+            if any(file.suffix.lower() in suffixes for file in _files(self.path)):
+                raise ConfigError(f"{self.path}: holds maps that were not predicted here; choose another --name")
+            return {}
+        try:
+            there = from_json(_Manifest, read_json(manifest), manifest)
+        except DataError as error:
+            raise DataError(
+                f"{manifest}: no manifest of predictions; delete the folder, or choose another --name"
+            ) from error
+        if there.key == self._content["key"]:
+            return dict(there.frames)
+        if not overwrite:
+            change = _first_change(there.settings, self._content["settings"])
+            raise ConfigError(
+                f"{self.path}: holds predictions with other settings ({change}); choose another --name, or --overwrite"
+            )
+        for file in (*map(self.file, there.frames), manifest):
+            file.unlink(missing_ok=True)
+        return {}
+
+
+def _files(path: Path) -> list[Path]:
+    return [file for file in path.iterdir() if not file.name.startswith(".")] if path.is_dir() else []
+
+
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """The first setting that differs, with both values, in a few words."""
+    for key in [*new, *(key for key in old if key not in new)]:
+        if old.get(key) != new.get(key):
+            there, here = (_short(values.get(key)) for values in (old, new))
+            return f"{key}: {there} there, {here} here"
+    return "another version"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# Soft scores class by class, as they go to disk: one map in memory at a time, or few where the largest are kept.
+
+Maps = Callable[[], Iterator[Float32]]
+"""Gives the scores (H, W) of each class in order, anew at each call."""
+
+
+def resized(maps: Maps, shape: tuple[int, ...], where: str) -> Maps:
+    """The maps at the pixels of an image (H, W) of the same view; linear. Raises DataError for another view."""
+    return lambda: (fitted(each[..., None], shape, where)[..., 0] for each in maps())
+
+
+def largest_only(maps: Maps, count: int) -> Maps:
+    """The maps with 0 in the place of all but each pixel's largest scores; more than `count` where some are equal."""
+
+    def kept() -> Iterator[Float32]:
+        largest: list[Float32] = []  # in falling order, (H, W) each
+        for each in maps():
+            rest = each
+            for k, value in enumerate(largest):
+                largest[k], rest = np.maximum(value, rest), np.minimum(value, rest)
+            if len(largest) < count:
+                largest.append(rest)
+        for each in maps():
+            yield np.where(each >= largest[-1], each, np.float32(0))
+
+    return kept

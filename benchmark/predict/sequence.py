@@ -1,0 +1,328 @@
+"""A model over a sequence: label maps, scores or regions on disk, resumable, with what they depend on beside them."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import importlib.metadata
+import io
+import itertools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from semstab.backbones import Backbone, Streamed, ask, streamed
+from semstab.core.files import content_key, csv_text, write_text
+from semstab.core.prefetch import prefetch
+from semstab.datasets.formats.images import read_labels
+from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
+from semstab.pixels.warp import warp
+from semstab.predict.folder import Kind, PredictionFolder, ScoreType, largest_only, resized
+from semstab.predict.images import ImageSequence, Picture, first_images, picture
+
+# How much regions without classes change from frame to frame: the series of a sequence.
+
+COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))
+
+
+@dataclass(frozen=True)
+class RegionSeries:
+    """One change a pair of successive frames: at the same pixel coordinates, and with camera motion taken out.
+
+    frames       names, one more than there are changes
+    plain        previous and current map as they are
+    compensated  the previous map warped by depth and pose; empty where these are not known
+    """
+
+    frames: tuple[str, ...]
+    plain: tuple[RegionChange, ...]
+    compensated: tuple[RegionChange, ...]
+
+    @property
+    def flicker_percent(self) -> float:
+        """Mean over the pairs; NaN where there are none."""
+        return macro_mean([change.flicker_percent for change in self.plain])
+
+    @property
+    def compensated_flicker_percent(self) -> float:
+        """The same with camera motion taken out; NaN where it is not known."""
+        return macro_mean([change.flicker_percent for change in self.compensated])
+
+    def write(self, path: Path) -> None:
+        """One row a pair and kind, as CSV; an undefined number is an empty field."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(("kind", *COLUMNS))
+        for kind, changes in (("plain", self.plain), ("compensated", self.compensated)):
+            for (before, now), change in zip(itertools.pairwise(self.frames), changes, strict=False):
+                cells = ["" if value != value else value for value in asdict(change).values()]  # noqa: PLR0124  NaN
+                writer.writerow((kind, csv_text(before), csv_text(now), *cells))
+        write_text(path, text.getvalue())
+
+
+def region_series(sequence: ImageSequence, indices: Sequence[int], file: Callable[[str], Path]) -> RegionSeries:
+    """Compare the region maps of successive frames, which `file` finds by a frame's name."""
+    names = tuple(sequence.image_name(index) for index in indices)
+    plain, compensated = [], []
+    for (a, b), (before, now) in zip(itertools.pairwise(indices), itertools.pairwise(names), strict=True):
+        previous, current = read_labels(file(before)), read_labels(file(now))
+        if previous.shape != current.shape:
+            continue
+        plain.append(matched_region_flicker(previous, current))
+        source, target = sequence.predicted(a, labels=previous), sequence.predicted(b, labels=current)
+        if source is not None and target is not None:
+            brought, visible = warp(source.predicted, source, target)
+            compensated.append(matched_region_flicker(brought, target.predicted, visible))
+    return RegionSeries(names, tuple(plain), tuple(compensated))
+
+
+REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers", "onnxruntime")
+
+
+SCORE_BYTES = 1 << 28
+"""Memory for the scores of an image; more are taken class by class, where a backbone gives them so."""
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """How a sequence is predicted.
+
+    name        what the predictions are called
+    scores      also keep soft scores, in `score_type`
+    top_k       of these only the largest of each pixel, so many; None for all
+    batch       images that the model sees at once
+    threads     threads that decode images ahead
+    overwrite   replace predictions of other settings
+    command     what was typed, for the manifest
+    """
+
+    name: str
+    scores: bool = False
+    score_type: ScoreType = "float16"
+    top_k: int | None = None
+    batch: int = 1
+    threads: int | None = None
+    overwrite: bool = False
+    command: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class SequenceReport:
+    """What was done: where it is, how many frames, how fast.
+
+    folders        that were written
+    predicted      frames that the model saw; `kept` ones were there from before
+    model_seconds  in the model; `seconds` in all, decoding and writing included
+    regions        of a model without classes, what changed from frame to frame
+    """
+
+    sequence: str
+    folders: tuple[Path, ...]
+    predicted: int
+    kept: int
+    model_seconds: float
+    seconds: float
+    regions: RegionSeries | None = None
+
+    @property
+    def frames_per_second(self) -> float:
+        """Of the predicted ones, all included; NaN where there were none."""
+        return self.predicted / self.seconds if self.predicted else float("nan")
+
+
+class PredictionObserver:
+    """Watches a prediction; override what is of interest."""
+
+    def sequence_started(self, name: str, frames: int) -> None:
+        """A sequence of so many selected frames is begun."""
+
+    def frame_done(self, kept: bool) -> None:
+        """One frame further: predicted, or kept from before."""
+
+
+def predict_sequence(
+    sequence: ImageSequence,
+    backbone: Backbone,
+    indices: Sequence[int],
+    out: Path,
+    options: SequenceOptions,
+    observers: Sequence[PredictionObserver] = (),
+) -> SequenceReport:
+    """Predict the images of these indices into out/labels/NAME, and out/scores/NAME; regions into out/regions/NAME.
+
+    A backbone that adapts to a sequence is fitted to the sequence's first images. Frames that an earlier start of the
+    same finished are kept; an image whose content changed is predicted again. A sequential backbone that lacks a frame
+    is shown all of them again from the first one.
+
+    Raises ConfigError where the folder holds other predictions, DataError that names an image; what was finished stays.
+    """
+    for observer in observers:
+        observer.sequence_started(sequence.name, len(indices))
+    started = time.perf_counter()
+    backbone = backbone.fit(first_images(sequence, backbone.fit_frames))
+    work = _Work(sequence, backbone, indices, out, options, observers)
+    with contextlib.closing(work):
+        anew = backbone.sequential and not all(work.kept(picture) for picture in work.pictures())
+        for picture in work.pictures():
+            work.take(picture, anew)
+        work.flush()
+    seconds = time.perf_counter() - started
+    series = None
+    if backbone.label_space is None:
+        series = region_series(sequence, indices, work.folders[0].file)
+        series.write(work.folders[0].path / "changes.csv")
+    return work.report(seconds, series)
+
+
+class _Work:
+    """The sequence on its way: pictures that wait for a full batch, folders, and counts."""
+
+    def __init__(
+        self,
+        sequence: ImageSequence,
+        backbone: Backbone,
+        indices: Sequence[int],
+        out: Path,
+        options: SequenceOptions,
+        observers: Sequence[PredictionObserver],
+    ) -> None:
+        self.sequence, self.backbone, self.options, self.observers = sequence, backbone, options, observers
+        self.indices = indices
+        self.folders = _folders(sequence, backbone, indices, out, options)
+        self._waiting: list[Picture] = []
+        self._predicted = self._kept = 0
+        self._model_seconds = 0.0
+
+    def pictures(self) -> Iterator[Picture]:
+        """What the model is shown, in order; what a sequential one says depends on all that it was shown before."""
+        if self.backbone.sequential:
+            self.backbone.reset()
+        so_far = ""
+        read = partial(picture, self.sequence, backbone=self.backbone)
+        with contextlib.closing(
+            prefetch(read, self.indices, threads=self.options.threads, size=lambda item: item.nbytes)
+        ) as ahead:
+            for fetched in ahead:
+                item = fetched.item
+                if self.backbone.sequential:
+                    so_far = content_key({"after": so_far, "shown": item.digest})
+                    item = dataclasses.replace(item, digest=so_far)
+                yield item
+
+    def kept(self, picture: Picture) -> bool:
+        """Whether an earlier start finished it."""
+        return all(folder.has(picture.name, picture.digest) for folder in self.folders)
+
+    def take(self, picture: Picture, anew: bool) -> None:
+        """Keep what is finished, unless everything is made anew; predict the rest in batches of one size."""
+        if not anew and self.kept(picture):
+            self._kept += 1
+            self._tell(kept=True)
+            return
+        if self._waiting and self._waiting[0].pixels.shape != picture.pixels.shape:
+            self.flush()
+        self._waiting.append(picture)
+        if len(self._waiting) >= self.options.batch:
+            self.flush()
+
+    def flush(self) -> None:
+        """Predict what waits."""
+        pictures, self._waiting = self._waiting, []
+        if not pictures:
+            return
+        started = time.perf_counter()
+        geometry = [frame for picture in pictures for frame in picture.geometry]
+        images = [picture.pixels for picture in pictures]
+        if self._too_large(pictures[0]):
+            found = [self.backbone.stream(image) for image in images]
+        else:
+            found = [
+                streamed(prediction)
+                for prediction in ask(self.backbone, images, scores=self.options.scores, geometry=geometry)
+            ]
+        seconds = time.perf_counter() - started
+        self._model_seconds += seconds
+        for shown, prediction in zip(pictures, found, strict=True):
+            self._write(shown, prediction, seconds / len(pictures))
+            self._predicted += 1
+            self._tell(kept=False)
+
+    def close(self) -> None:
+        """Say in the manifests what is finished, also after an error or an interruption."""
+        for folder in self.folders:
+            folder.close()
+
+    def report(self, seconds: float, series: RegionSeries | None) -> SequenceReport:
+        """What was done."""
+        paths = tuple(folder.path for folder in self.folders)
+        return SequenceReport(
+            self.sequence.name, paths, self._predicted, self._kept, self._model_seconds, seconds, series
+        )
+
+    def _too_large(self, picture: Picture) -> bool:
+        """Whether all scores of an image would take too much memory, and the backbone can give them one by one."""
+        size = 4 * picture.pixels.shape[0] * picture.pixels.shape[1] * len(self.backbone.label_space or ())
+        return self.options.scores and self.backbone.streams and size > SCORE_BYTES
+
+    def _write(self, picture: Picture, found: Streamed, seconds: float) -> None:
+        """At the pixels that the scene's label files have."""
+        alike = self.sequence.labels_like_depth
+        frame = self.sequence.predicted(picture.index, labels=found.labels) if alike else None
+        for folder in self.folders:
+            if folder.kind != "scores":
+                labels = found.labels if frame is None else frame.predicted
+                folder.write(picture.name, picture.digest, labels, seconds)
+                continue
+            maps = found.maps if frame is None else resized(found.maps, frame.shape, picture.name)
+            maps = maps if self.options.top_k is None else largest_only(maps, self.options.top_k)
+            folder.write_scores(picture.name, picture.digest, maps(), seconds)
+
+    def _tell(self, kept: bool) -> None:
+        for observer in self.observers:
+            observer.frame_done(kept)
+
+
+def _folders(
+    sequence: ImageSequence, backbone: Backbone, indices: Sequence[int], out: Path, options: SequenceOptions
+) -> list[PredictionFolder]:
+    space, settings = backbone.label_space, backbone.identity()
+    if backbone.sequential:
+        settings = {**settings, "frames": _selection([sequence.image_name(index) for index in indices])}
+    about = {"command": list(options.command), "packages": _versions(), "batch": options.batch}
+    kinds: list[Kind] = ["regions"] if space is None else ["labels"]
+    if options.scores:
+        kinds.append("scores")
+    return [
+        PredictionFolder(
+            out / kind / options.name,
+            kind,
+            settings,
+            about,
+            space,
+            score_type=options.score_type,
+            top_k=options.top_k,
+            overwrite=options.overwrite,
+        )
+        for kind in kinds
+    ]
+
+
+def _selection(names: Sequence[str]) -> str:
+    """Which frames a sequential backbone saw, in a few words that are equal where all of them are."""
+    digest = content_key({"names": list(names)})[:8]
+    return f"{len(names)} from {names[0]} to {names[-1]} ({digest})" if names else "none"
+
+
+def _versions() -> dict[str, str | None]:
+    """Of the packages that compute; None for those that are not installed."""
+    versions: dict[str, Any] = {"semstab": importlib.metadata.version("semstab")}
+    for package in REPORTED_PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return versions

@@ -1,0 +1,185 @@
+"""Where a recording goes: into a file, and to a viewer while the run goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import socket
+import ssl
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import rerun as rr
+
+from semstab.core.files import open_file
+from semstab.errors import ConfigError
+
+APPLICATION = "semstab"
+DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
+CHOICES = "FILE.rrd, spawn, connect, rerun+http://HOST:PORT/proxy, serve, or off"
+
+FOOTER, FOOTER_BYTES = b"RRF2FOOT", 64
+"""How a recording ends, among its last bytes."""
+
+ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
+"""How long a viewer may take to answer, and one that is started to listen."""
+
+HTTP2_SETTINGS = b"\x04"
+HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + HTTP2_SETTINGS + bytes(5)
+"""What a client begins with, an empty frame of settings included; a server answers with such a frame (RFC 9113)."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file, and 'spawn', 'serve' or the URL of a viewer to which the recording is streamed as well."""
+
+    file: Path
+    viewer: str | None = None
+    name: str | None = None
+    """Of a recording of which the file is a part; it has none where it is whole."""
+    final: Path | None = None
+    """The whole recording, of which the file is a part."""
+
+    @classmethod
+    def parse(cls, text: str | None, default: Path) -> Target:
+        """What `--rerun` says; `default` is the file where it names none. Raises ConfigError for anything else."""
+        if text is None:
+            return cls(default)
+        if text in ("spawn", "serve"):
+            return cls(default, text)
+        word, _, url = text.strip().partition(" ")
+        if word == "connect" or re.match(r"rerun(\+https?)?://", text):
+            url = (url.strip() or DEFAULT_URL) if word == "connect" else text
+            if not re.fullmatch(r"rerun(\+https?)?://[^/]+/proxy", url):
+                raise ConfigError(f"--rerun {text}: write the address as rerun+http://HOST:PORT/proxy")
+            return cls(default, url)
+        if not text.endswith(".rrd"):
+            raise ConfigError(f"--rerun {text}: use {CHOICES}")
+        return cls(Path(text))
+
+    @property
+    def live(self) -> bool:
+        """Whether somebody may watch while the run goes on."""
+        return self.viewer is not None
+
+    def open(self) -> rr.RecordingStream:
+        """A stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
+        stream = rr.RecordingStream(APPLICATION, recording_id=self.name)
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            # In place, not renamed when it is whole: a viewer can follow the run, and a killed run leaves a recording.
+            if self.viewer is None:
+                stream.save(self.file)
+            else:
+                self.file.touch()
+                stream.set_sinks(self._viewer(), rr.FileSink(self.file))
+        except (OSError, RuntimeError) as error:
+            raise ConfigError(f"{self.file}: the recording cannot be written ({error})") from error
+        stream.set_log_tick_enabled(False)
+        stream.set_log_time_enabled(False)
+        return stream
+
+    @property
+    def viewer_url(self) -> str | None:
+        """Where the viewer listens, or what serves it does; None where there is none."""
+        return DEFAULT_URL if self.viewer in ("spawn", "serve") else self.viewer
+
+    def drop(self, recording: str | None) -> None:
+        """Take a recording out of the viewer. Who is served cannot be told to, and keeps it beside others."""
+        from rerun.experimental import ViewerClient
+
+        if self.viewer_url is not None and self.viewer != "serve":
+            with contextlib.suppress(OSError):  # what listens there need not be a viewer
+                ViewerClient(self.viewer_url).close(store_ids=[f"Recording:{APPLICATION}:{recording}"])
+
+    def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
+        if self.viewer == "serve":
+            address = _address(DEFAULT_URL)
+            if not _is_free(address):
+                raise ConfigError(f"--rerun serve: port {address[1]} is taken; end what listens there, or use connect")
+            return rr.GrpcServerSink(*address)
+        url = str(self.viewer_url)
+        if self.viewer == "spawn" and _is_free(_address(url)):
+            _spawn(url)
+        if (reason := _why_no_viewer(url)) is not None:
+            raise ConfigError(f"{url}: no rerun viewer listens there ({reason}); start one with: rerun")
+        return rr.GrpcSink(url)
+
+
+def is_whole(file: Path) -> bool:
+    """Whether a recording was closed: one that was cut by a kill, or by a full disk, has no footer."""
+    try:
+        with open_file(file) as recording:
+            recording.seek(-min(FOOTER_BYTES, recording.seek(0, os.SEEK_END)), os.SEEK_END)
+            return FOOTER in recording.read()
+    except OSError:
+        return False
+
+
+def rerun_program() -> str:
+    """The program that came with the SDK. Raises ConfigError where it is missing."""
+    beside = Path(sys.executable).with_name("rerun")
+    found = str(beside) if beside.exists() else shutil.which("rerun")
+    if found is None:
+        raise ConfigError("the rerun viewer is not installed; pip install rerun-sdk, or record into a file")
+    return found
+
+
+def viewer_command() -> list[str]:
+    """What starts the viewer, for this machine only. Raises ConfigError where it is missing."""
+    return [rerun_program(), "--bind", "127.0.0.1"]
+
+
+def _spawn(url: str) -> None:
+    """Start a viewer that outlives this process, and wait until it answers. Raises ConfigError where it ends before."""
+    command = [*viewer_command(), "--port", str(_address(url)[1])]
+    environment = os.environ | {"RERUN_APP_ONLY": "true"}
+    viewer = subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    deadline = time.monotonic() + SPAWN_SECONDS
+    while _is_free(_address(url)) and time.monotonic() < deadline:
+        if viewer.poll() is not None:
+            raise ConfigError(
+                f"--rerun spawn: the viewer ended at once (exit code {viewer.returncode}); without a display use serve,"
+                " or record into a file"
+            )
+        time.sleep(0.05)
+    viewer.returncode = 0  # it outlives this process: no warning that nobody waited for its end
+
+
+def _address(url: str) -> tuple[str, int]:
+    parts = urlsplit(url)
+    return parts.hostname or "", parts.port or 9876
+
+
+def _is_free(address: tuple[str, int]) -> bool:
+    with contextlib.closing(socket.socket()) as probe:
+        return probe.connect_ex(address) != 0
+
+
+def _why_no_viewer(url: str) -> str | None:
+    """None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
+    try:
+        host, port = _address(url)
+        plain = socket.create_connection((host, port), timeout=ANSWER_SECONDS)
+        with plain, plain if url.startswith("rerun+http:") else _encrypted(plain, host) as connection:
+            connection.sendall(HTTP2_PREFACE)
+            answer = connection.recv(9)
+    except (OSError, ValueError) as error:
+        return str(error)
+    return None if answer[3:4] == HTTP2_SETTINGS else "something else does"
+
+
+def _encrypted(connection: socket.socket, host: str) -> ssl.SSLSocket:
+    """Only to ask who is there: the SDK checks the certificate."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    context.set_alpn_protocols(["h2"])
+    return context.wrap_socket(connection, server_hostname=host)

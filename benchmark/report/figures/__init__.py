@@ -1,0 +1,236 @@
+"""The study's figures, PNG and SVG, at the widths of a paper's column and page; matplotlib is imported when used."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from semstab.core.files import keep_only
+from semstab.core.process import follow_parent
+from semstab.model.measures import measures
+from semstab.model.records import OVERVIEW, Record, Result
+from semstab.model.results import slug
+from semstab.report.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
+from semstab.report.figures.distributions import (
+    Histograms,
+    draw_ecdf,
+    draw_persistence,
+    draw_sweep,
+    informative,
+    together,
+)
+from semstab.report.figures.judgement import statistics_figures
+from semstab.report.figures.maps import Overview, Views, draw_overview, draw_stability
+from semstab.report.figures.remedies import remedy_figure
+from semstab.report.figures.style import Figure
+from semstab.report.remedies import of_interest, remedies
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+
+# A second process that draws figures. It loads what drawing needs while frames are still fused.
+
+
+class DrawingProcess:
+    """Started at once; it ends with `close`, or with its parent."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        listening, self._alive = context.Pipe(duplex=False)
+        self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(listening,))
+        self._given: list[Future[None]] = []
+        with contextlib.suppress(BrokenProcessPool):
+            self._given.append(self._pool.submit(_load))
+
+    def draw(self, result: Result, folder: Path, views: Views, names: Sequence[str]) -> Callable[[], bool]:
+        """Begin to draw the figures of those names of a result in the folder.
+
+        What is returned waits for them, and says whether they are there: not where the process died, or never came to
+        life, as in a script that cannot be imported.
+        """
+        drawing = None
+        with contextlib.suppress(BrokenProcessPool, RuntimeError):
+            drawing = self._pool.submit(_draw, result, folder, views, names)
+            self._given.append(drawing)
+
+        def drawn() -> bool:
+            with contextlib.suppress(BrokenProcessPool):
+                return drawing is not None and drawing.result() is None
+            return False
+
+        return drawn
+
+    def close(self) -> None:
+        """End the process, also where it is at work; one that is idle ends by itself, without a word."""
+        if all(future.done() for future in self._given):
+            self._pool.shutdown()
+        self._alive.close()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _begin(listening: Connection) -> None:
+    follow_parent(listening)
+
+
+def _load() -> None:
+    import pyarrow.parquet  # noqa: F401
+
+
+def _draw(result: Result, folder: Path, views: Views, names: Sequence[str]) -> None:
+    found = {figure.name: figure for figure in figures(result, folder, views)}
+    for name in names:
+        found[name].save(folder / "figures")
+
+
+__all__ = ["Figure", "Views", "figures", "write_figures"]
+
+
+def write_figures(
+    result: Result, folder: str | Path, views: Views | None = None, beside: DrawingProcess | None = None
+) -> list[Path]:
+    """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
+
+    What `views` lacks of a unit is read from its voxels. A process `beside` this one draws about half of them. Other
+    figures there are removed.
+    """
+    target = Path(folder) / "figures"
+    views = views or Views()
+    wanted = figures(result, folder, views)
+    units = list(dict.fromkeys(figure.unit for figure in wanted if figure.unit))
+    elsewhere = [] if beside is None else [*units[:3], *units[4::2]]  # three take as long as all that show no map
+    others = sorted((figure for figure in wanted if figure.unit in elsewhere), key=lambda figure: figure.unit)
+    own = sorted((figure for figure in wanted if figure.unit not in elsewhere), key=lambda figure: figure.unit)
+    drawn = None if beside is None else beside.draw(result, Path(folder), views, [figure.name for figure in others])
+    for figure in own:
+        figure.save(target)
+    if drawn is not None and not drawn():
+        for figure in others:
+            figure.save(target)
+    written = [path for figure in wanted for path in figure.paths(target)]
+    keep_only(written, target)
+    return written
+
+
+def figures(result: Result, folder: str | Path, views: Views | None = None) -> list[Figure]:
+    """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
+    views = views or Views()
+    found = remedies(result)
+    result = of_interest(result)
+    kept = [record for record in result.select() if record.voxels_file is not None]
+    return [
+        *(remedy_figure(each, slug("remedies", each.model)) for each in found),
+        *_overviews(result, kept, views, Path(folder) / OVERVIEW),
+        *_distributions(kept, views),
+        *_maps(result, kept, views),
+        *_sweeps(result),
+        *statistics_figures(result, kept, views),
+    ]
+
+
+def _overviews(result: Result, kept: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
+    """One a backbone, of the first scene that has a saved frame."""
+    for backbone, records in by_backbone(kept).items():
+        for record in records:
+            path = folder / f"{slug(record.unit.scene, backbone)}.npz"
+            if record.unit.scene in result.up and path.exists():
+                yield _overview(record, result.up[record.unit.scene], views, path)
+                break
+
+
+def _overview(record: Record, up: tuple[float, float, float], views: Views, path: Path) -> Figure:
+    scene, backbone = record.unit.scene, record.unit.backbone
+    return Figure(
+        slug("overview", scene, backbone),
+        f"Overview: {scene}, {backbone}",
+        "A frame, its prediction, and the map that all sampled frames were fused into, seen from above, beneath a"
+        " ceiling where there is one, or from the side where more of it shows: the dominant"
+        " class of the topmost voxels, in the prediction's colours.",
+        f"A camera image of {scene}, the classes that {backbone} predicts for it, and the fused map from above in the"
+        " same colours.",
+        lambda: draw_overview(views.above(record, up), Overview.load(path)),
+        unit=record.unit.slug,
+    )
+
+
+def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
+    if not kept:
+        return
+
+    @functools.cache
+    def of_all() -> dict[str, dict[str, Histograms]]:
+        """By backbone and scene."""
+        return {
+            backbone: {record.unit.scene: views.sums(record).measures for record in records}
+            for backbone, records in by_backbone(kept).items()
+        }
+
+    def ecdf(backbone: str) -> Canvas:
+        ends = informative(found for scenes in of_all().values() for found in scenes.values())
+        return draw_ecdf(of_all()[backbone], ends)
+
+    for backbone in by_backbone(kept):
+        yield Figure(
+            slug("ecdf", backbone),
+            f"The measures by scene: {backbone}",
+            "Empirical distributions over the voxels of each scene, of measures of which more is better as what they"
+            " lack: 1 - VSS is disagreement. SBD is that of the voxels seen twice or more. Dashed: the recurrent voxels"
+            " of all scenes. The x axes are the same for each backbone and end where 99% of the voxels of every scene"
+            " are reached.",
+            f"A panel a measure of cumulative curves, one a scene, for {backbone}: how many voxels have how much.",
+            partial(ecdf, backbone),
+        )
+    yield Figure(
+        "persistence",
+        "The measures against observation persistence",
+        "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
+        " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
+        "For each backbone, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
+        lambda: draw_persistence({name: together(scenes.values()) for name, scenes in of_all().items()}),
+    )
+
+
+def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
+    panels = " and ".join(measure.title for measure in measures() if measure.panel)
+    for record in kept:
+        scene, backbone = record.unit.scene, record.unit.backbone
+        if scene in result.up:
+            yield Figure(
+                slug("stability_map", scene, backbone),
+                f"Stability from above: {scene}, {backbone}",
+                "The topmost voxel of each column along the up axis, beneath a ceiling where there is one, or of a wall"
+                f" the foremost: (a) its stability category, then {panels}; grey: seen once, which says nothing. Values"
+                " beyond a scale, which has an arrow there, look like its end.",
+                f"Maps of {scene} from above with the stability category, {panels} of {backbone}'s voxels.",
+                partial(_draw_map, record, result.up[scene], views),
+                unit=record.unit.slug,
+            )
+
+
+def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> Canvas:
+    return draw_stability(views.above(record, up))
+
+
+def _sweeps(result: Result) -> Iterator[Figure]:
+    for sweep in swept(result):
+        backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
+        if backbones:
+            yield Figure(
+                f"sensitivity_{sweep.name}",
+                f"Sensitivity to {sweep.title}",
+                "The share of recurrent voxels, and every measure over all voxels (solid) and over the recurrent ones"
+                f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes; bars are the standard deviation"
+                " over repeats. The axes of VSS and margin span 0.1 or more, the others begin at 0. Read the others"
+                " with (a): which voxels there are to average changes along the sweep.",
+                f"Panels against {sweep.title}: the recurrent share and each measure, for all voxels and for the"
+                " recurrent ones.",
+                partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in backbones}),
+            )

@@ -1,0 +1,338 @@
+"""ECDFs of what each measure lacks, and each against OP (paper, Semantic Agreement and Belief Drift)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from semstab.core.types import Float64, Int64
+from semstab.model.measures import Measure, measures, op
+from semstab.model.results import RECURRENT
+from semstab.model.statistics import Estimate
+from semstab.model.voxels import VoxelTable
+from semstab.report.averages import ENOUGH, Level, Pooled, Sweep, over_all, over_recurrent
+from semstab.report.figures.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, legend_columns, mark_panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# The voxels of units as histograms by OP, from which ECDFs and the curves against OP are read off; they add up.
+
+BINS = 1000
+"""Bins of a measure between 0 and its largest value; a further one, the first, holds 0 alone."""
+
+
+def _op_bounds() -> Int64:
+    """The lowest OP of each bin: single values up to 8, then steps of about a quarter."""
+    bounds = list(range(1, 10))
+    while bounds[-1] < 2**31:
+        bounds.append(max(bounds[-1] + 1, round(bounds[-1] * 1.25)))
+    return np.array(bounds)
+
+
+OP_BOUNDS = _op_bounds()
+
+
+@dataclass(frozen=True, eq=False)
+class MeasureByOP:
+    """A measure's voxels by OP and value: counts (OP bins, 1 + BINS), sums (OP bins,); `largest` ends the last bin.
+
+    The values count from the best one: of a measure of which more is better they are what it lacks, as in 1 - VSS.
+    """
+
+    counts: Int64
+    sums: Float64
+    largest: float
+
+    @classmethod
+    def of(cls, values: Float64, bins: Int64, largest: float) -> MeasureByOP:
+        """The histogram of values (n,) in OP bins (n,); undefined values do not count."""
+        defined = ~np.isnan(values)
+        values, bins = values[defined], bins[defined]
+        column = np.ceil(values / largest * BINS - 1e-6).clip(0, BINS).astype(np.int64)
+        cells = np.bincount(bins * (BINS + 1) + column, minlength=len(OP_BOUNDS) * (BINS + 1))
+        sums = np.bincount(bins, weights=values, minlength=len(OP_BOUNDS)).astype(np.float64)
+        return cls(cells.reshape(len(OP_BOUNDS), BINS + 1), sums, largest)
+
+    def __add__(self, other: MeasureByOP) -> MeasureByOP:
+        return MeasureByOP(self.counts + other.counts, self.sums + other.sums, self.largest)
+
+    @property
+    def values(self) -> Float64:
+        """(1 + BINS,) the upper end of each bin."""
+        return np.arange(BINS + 1) / BINS * self.largest
+
+    @property
+    def voxels(self) -> Int64:
+        """(OP bins,) voxels where the measure is defined."""
+        total: Int64 = self.counts.sum(axis=1)
+        return total
+
+    def ecdf(self, lowest_op: int = 1) -> Float64:
+        """(1 + BINS,) share of the voxels with at least that OP whose value is at most that of the bin."""
+        counts = self.counts[np.searchsorted(OP_BOUNDS, lowest_op) :].sum(axis=0)
+        share: Float64 = counts.cumsum() / max(1, counts.sum())
+        return share
+
+    def mean(self) -> Float64:
+        """(OP bins,) mean by OP; NaN where there are no voxels."""
+        mean: Float64 = np.where(self.voxels > 0, self.sums / np.maximum(1, self.voxels), np.nan)
+        return mean
+
+    def quantile(self, q: float) -> Float64:
+        """(OP bins,) the value that a share q of the voxels does not exceed, by OP; NaN where there are none."""
+        reached = self.counts.cumsum(axis=1) >= q * self.voxels[:, None]
+        return np.where(self.voxels > 0, self.values[reached.argmax(axis=1)], np.nan)
+
+
+Histograms = Mapping[str, MeasureByOP]
+"""Of a unit's voxels, or of several units' together: each measure by its key."""
+
+
+def lacking(measure: Measure, value: Float64) -> Float64:
+    """How far values are from the best, and back."""
+    return value if measure.better == "lower" else measure.largest - value
+
+
+def histograms(table: VoxelTable) -> Histograms:
+    """The histograms of a unit."""
+    bins = np.searchsorted(OP_BOUNDS, op(table), side="right") - 1
+    return {m.key: MeasureByOP.of(lacking(m, m.of(table)), bins, m.largest) for m in measures()}
+
+
+def together(units: Iterable[Histograms]) -> Histograms:
+    """The voxels of several units pooled."""
+    return reduce(lambda a, b: {key: one + b[key] for key, one in a.items()}, units)
+
+
+def op_position() -> Float64:
+    """(OP bins,) where a bin stands on a logarithmic axis: the geometric mean of its OP."""
+    last = np.append(OP_BOUNDS[1:] - 1, OP_BOUNDS[-1])
+    return np.sqrt(OP_BOUNDS * last.astype(np.float64))
+
+
+Panels = np.ndarray[tuple[int], np.dtype[np.object_]]
+
+INFORMATIVE = 0.99
+"""The axes of the ECDFs end where this share of the voxels of every curve is reached."""
+
+
+def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Figure:
+    """The ECDF of how much each measure lacks in each scene, and in all recurrent voxels; ends are those of x axes."""
+    shown = measures()
+    figure = canvas(PAGE, 2.4 * math.ceil(len(shown) / 2))
+    panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
+    everything = together(scenes.values())
+    for axes, letter, measure in zip(panels, LETTERS, shown, strict=False):
+        _draw_curves(axes, {name: found[measure.key] for name, found in scenes.items()}, everything[measure.key])
+        label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
+        unit = f" ({measure.unit})" if measure.unit else ""
+        axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(0.0, 1.02))
+        mark_panel(axes, letter, f"{label}, voxels with OP ≥ {measure.lowest_op}" if measure.lowest_op > 1 else label)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=legend_columns(labels, figure.get_figwidth()))
+    return figure
+
+
+def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
+    """One curve a scene, and a dashed one of all recurrent voxels, where there are any."""
+    for k, (name, found) in enumerate(scenes.items()):
+        axes.step(found.values, found.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
+    recurrent = everything.ecdf(RECURRENT)
+    if recurrent[-1]:
+        axes.step(
+            everything.values,
+            recurrent,
+            "k--",
+            where="post",
+            linewidth=1.0,
+            label="voxels with OP ≥ 3" + (", all scenes" if len(scenes) > 1 else ""),
+        )
+
+
+def informative(units: Iterable[Histograms]) -> dict[str, float]:
+    """Where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
+
+    def end(found: MeasureByOP) -> float:
+        reached = found.ecdf() >= INFORMATIVE
+        return float(found.values[reached.argmax()]) if reached.any() else found.largest
+
+    ends: dict[str, float] = {}
+    for scene in units:
+        for key, found in scene.items():
+            ends[key] = max(ends.get(key, 0.06 * found.largest), end(found))
+    return ends
+
+
+def draw_persistence(backbones: Mapping[str, Histograms]) -> Figure:
+    """Each measure against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    columns, shown = len(backbones), measures()
+    figure = canvas(COLUMN if columns == 1 else PAGE, 1.2 + 1.5 * len(shown))
+    ratios = (*[3.0] * len(shown), 1.6)
+    grid = figure.subplots(len(ratios), columns, sharex=True, sharey="row", squeeze=False, height_ratios=ratios)
+    for k, (name, histogram) in enumerate(backbones.items()):
+        _draw_column(grid[:, k], histogram, color(k))
+        grid[0, k].set_title(name)
+        grid[-1, k].set_xlabel("OP (frames)")
+    labels = (f"{m.title} ({m.unit})" if m.unit else m.title for m in shown)
+    for axes, label in zip(grid[:, 0], (*labels, "voxels"), strict=True):
+        axes.set_ylabel(label)
+    band = Patch(facecolor=FAINT, alpha=0.4, label="interquartile range")
+    few = Line2D(
+        [], [], color=INK, marker="o", markerfacecolor="white", linewidth=0, label=f"fewer than {ENOUGH:,} voxels"
+    )
+    handles = [Line2D([], [], color=INK, marker="o", label="mean"), band, few]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns > 1 else 2)
+    return figure
+
+
+def _draw_column(rows: Panels, found: Histograms, shade: str) -> None:
+    voxels = next(iter(found.values())).voxels
+    present = voxels > 0
+    x, few = op_position()[present], voxels[present] < ENOUGH
+    for axes, measure in zip(rows[:-1], measures(), strict=True):
+        own = found[measure.key]
+        curves = (own.mean(), own.quantile(0.25), own.quantile(0.75))
+        mean, *ends = (lacking(measure, curve[present]) for curve in curves)
+        axes.fill_between(x, *ends, color=shade, alpha=0.2, linewidth=0.8)
+        axes.plot(x, mean, color=shade, marker="o", markersize=3)
+        axes.plot(x[few], mean[few], color=shade, marker="o", markersize=3, markerfacecolor="white", linewidth=0)
+    rows[-1].vlines(x, 0.5, voxels[present], color=shade, linewidth=3)
+    rows[-1].axhline(ENOUGH, color=INK, linewidth=0.6, linestyle=":")
+    rows[-1].set(xscale="log", yscale="log", ylim=(0.5, None))
+    mark_op(rows[-1], x[-1])
+
+
+def mark_op(axes: Axes, largest: float) -> None:
+    """Ticks at round OP on the logarithmic axis."""
+    from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
+
+    ticks = range(1, 9) if largest <= 8 else (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+    axes.xaxis.set_major_locator(FixedLocator([tick for tick in ticks if tick <= max(largest, 3)]))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+
+
+# The sensitivity sweeps: aggregate and recurrent values together with the recurrent share (paper, Sensitivity).
+
+APART = 0.06
+"""Of a step along the x axis: series that have the same values lie beside each other."""
+
+LEAST_SPAN = 0.1
+"""Of the axis of a share that is good when high (VSS, margin, PSA, alpha): a smaller difference looks small. What is
+good when low (SBD, entropy), and the recurrent share, stand on an axis from 0."""
+
+
+def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
+    """The recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
+    shown = measures()
+    rows = math.ceil((1 + len(shown)) / 3)
+    figure = canvas(PAGE, 2.5 if rows == 1 else 2.1 * rows)
+    share, *panels = figure.subplots(rows, 3, squeeze=False).ravel()
+    values = sorted({level.value for levels in backbones.values() for level in levels})
+    for k, levels in enumerate(backbones.values()):
+        x = positions(values, levels, k, len(backbones))
+        draw_line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), marker="s")
+        enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
+        at = positions(values, enough, k, len(backbones))
+        for axes, measure in zip(panels, shown, strict=False):
+            draw_line(axes, x, levels, over_all(measure), color(k))
+            draw_line(axes, at, enough, over_recurrent(measure), color(k), open_=True)
+    titles = ("recurrent share (%)", *(f"{m.title} ({m.unit})" if m.unit else m.title for m in shown))
+    for axes, letter, title in zip((share, *panels), LETTERS, titles, strict=False):
+        mark_values(axes, sweep, values)
+        mark_panel(axes, letter, title)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    for axes, better in zip((share, *panels), ("lower", *(m.better for m in shown)), strict=False):
+        settle_scale(axes, from_zero=better == "lower")
+    columns = legend_columns([*backbones, "all voxels", "OP ≥ 3"], PAGE)
+    figure.legend(handles=_legend(list(backbones)), loc="outside lower center", ncols=columns)
+    return figure
+
+
+def positions(values: Sequence[float], levels: Sequence[Level], k: int, series: int) -> list[float]:
+    """Where the k-th of so many series has its levels along the x axis."""
+    return [values.index(level.value) + APART * (k - (series - 1) / 2) for level in levels]
+
+
+def settle_scale(axes: Axes, *, from_zero: bool) -> None:
+    """Widen the y axis to hold 0, or `LEAST_SPAN`; what is drawn, intervals too, stays inside with its markers."""
+    if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=np.float64)).any() for line in axes.lines):
+        axes.text(0.5, 0.5, "not known\nwithout --statistics", transform=axes.transAxes, ha="center", va="center")
+        axes.set_yticks([])
+        return
+    low, high = axes.get_ylim()
+    if from_zero:
+        axes.set_ylim(min(low, -0.04 * high), high)
+    elif (missing := LEAST_SPAN - (high - low)) > 0:
+        top = max(high, min(high + missing / 2, 1.01))  # a share has no values above 1
+        axes.set_ylim(top - LEAST_SPAN, top)
+
+
+def mark_values(axes: Axes, sweep: Sweep, values: Sequence[float]) -> None:
+    """The swept values along the x axis, at equal distances."""
+    axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
+    axes.set_xlim(-0.35, len(values) - 0.65)
+    axes.margins(y=0.1)  # a point at an axis' end is seen whole
+    axes.set_xlabel(f"{sweep.title.split(',')[0]} ({sweep.unit})" if sweep.unit else sweep.title)
+
+
+def draw_line(
+    axes: Axes,
+    x: Sequence[float],
+    levels: Sequence[Level],
+    measure: Callable[[Pooled], float],
+    shade: str,
+    *,
+    interval: Callable[[Pooled], Estimate] | None = None,
+    marker: str = "o",
+    open_: bool = False,
+) -> None:
+    """A measure along a sweep, with its interval, else the standard deviation over repeats; `open_` dashes it."""
+    means = [level.mean(measure) for level in levels]
+    errors = [_error(level, measure, interval) for level in levels]
+    axes.errorbar(
+        x,
+        means,
+        yerr=list(zip(*errors, strict=True)) if any(map(any, errors)) else None,
+        color=shade,
+        linestyle="--" if open_ else "-",
+        marker=marker,
+        markerfacecolor="white" if open_ else shade,
+        capsize=2,
+        elinewidth=0.8,
+    )
+
+
+def _error(
+    level: Level, measure: Callable[[Pooled], float], interval: Callable[[Pooled], Estimate] | None
+) -> tuple[float, float]:
+    """How far the bar reaches below and above the mean; 0 where that is not known."""
+    if interval is None:
+        sd = level.spread(measure).sd
+        return (0.0, 0.0) if math.isnan(sd) else (sd, sd)
+    found = level.interval(interval)
+    if math.isnan(found.low):
+        return 0.0, 0.0
+    return max(found.value - found.low, 0.0), max(found.high - found.value, 0.0)
+
+
+def _legend(backbones: list[str]) -> list[object]:
+    from matplotlib.lines import Line2D
+
+    every = Line2D([], [], color=INK, marker="o", label="all voxels")
+    recurrent = Line2D([], [], color=INK, marker="o", linestyle="--", markerfacecolor="white", label="OP ≥ 3")
+    return [*(Line2D([], [], color=color(k), label=name) for k, name in enumerate(backbones)), every, recurrent]

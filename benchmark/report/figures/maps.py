@@ -1,0 +1,429 @@
+"""Maps from above: stability, drift, entropy and where it comes from; and the overview from image to map."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64, Int64, UInt8
+from semstab.datasets.formats.disk import decode_array, read_bytes
+from semstab.errors import DataError, one_line
+from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
+from semstab.metrics.agreement import voxel_keys
+from semstab.model import parquet
+from semstab.model.measures import dominant, measures
+from semstab.model.records import Record, Tables
+from semstab.model.results import RECURRENT, Unit
+from semstab.model.voxels import VoxelTable
+from semstab.report.figures.distributions import Histograms, histograms, together
+from semstab.report.figures.statistics import DriftByOP
+from semstab.report.figures.style import COLORS, COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
+from semstab.report.figures.topdown import EMPTY, MOST, OUTLIERS, FromAbove, best_view, level_axes, top_down, topmost
+from semstab.statistics import decompose, expected_sbd
+from semstab.statistics.steady import LIKELY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.figure import Figure
+
+
+Image = UInt8
+Colors = Sequence[tuple[int, int, int]]
+
+BLANK = (255, 255, 255)
+UNDEFINED = "#cccccc"
+COLORMAP = "YlOrRd"
+RIGHT_COLORS = (
+    ("OP < 3, or no truth", (204, 204, 204)),
+    ("stable, right", (86, 180, 233)),
+    ("unstable, right", (0, 114, 178)),
+    ("unstable, wrong", (240, 228, 66)),
+    ("stable, wrong", (213, 94, 0)),
+)
+"""What is known of a voxel, in Okabe and Ito's colours."""
+
+LEGEND_LINE, LEGEND_KEY, LEGEND_LETTER = 0.15, 0.5, 0.066
+"""Inches of a legend: height of a line; width of a key with its margins, and of a letter."""
+
+WIDE = 1.4
+"""A map this many times as wide as high or more has its panels beneath each other."""
+
+
+def draw_stability(above: FromAbove) -> Figure:
+    """Stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
+    table, rows = above.table, above.rows
+    shown = [measure for measure in measures() if measure.panel]
+    figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
+    _draw_categories(figure, kind, rows, categories(table))
+    for axes, measure in zip(panels, shown, strict=True):
+        values = np.where(table.op > 1, measure.of(table), np.nan)
+        _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
+    where = "" if above.view == "from above" else f", {above.view}"
+    titles = (f"stability{where}", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
+    for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
+        mark_panel(axes, letter, title)
+        framed(axes)
+        scale_bar(axes, rows.shape[1], above.cell)
+    return figure
+
+
+def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | None) -> Figure:
+    """Entropy within and between frames of the topmost voxels and, where truth tells, which are stable and wrong.
+
+    `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel that is seen.
+    """
+    table, rows = above.table, above.rows
+    figure, panels = map_panels(rows, 2 if wrong is None else 3)
+    parts, again = decompose(table), table.op > 1
+    most = math.log(2) / math.log(table.K)
+    for axes, values in zip(panels, (parts.within, parts.between), strict=False):
+        _draw_measure(figure, axes, rows, np.where(again, values, np.nan), (0.0, most))
+    if wrong is not None:
+        panels[2].imshow(_painted(rows, wrong, [shade for _, shade in RIGHT_COLORS]), interpolation_stage="rgba")
+        entries = [(name, tuple(channel / 255 for channel in shade)) for name, shade in RIGHT_COLORS]
+        columns = len(entries) if figure.get_figwidth() > COLUMN else 2
+        figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
+    titles = ("entropy within frames", "entropy between frames", "right and wrong")
+    for axes, letter, title in zip(panels, "abc", titles, strict=False):
+        mark_panel(axes, letter, title)
+        framed(axes)
+        scale_bar(axes, rows.shape[1], above.cell)
+    return figure
+
+
+def right_or_wrong(table: VoxelTable, truth: Int64, likely: Float64) -> Int64:
+    """What is known of each voxel (n,), a row of RIGHT_COLORS.
+
+    By its true class (n,), -1 where that is not known, and how likely it is stable (n,), NaN likewise.
+    """
+    stable = np.nan_to_num(likely) >= LIKELY
+    right = dominant(table) == truth
+    known = (truth >= 0) & (table.op >= RECURRENT)
+    return np.where(known, np.where(right, np.where(stable, 1, 2), np.where(stable, 4, 3)), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """What one frame showed to the camera and to the backbone.
+
+    frame      its index
+    labels     (H, W) predicted rows 0..K-1; K and above: ignored
+    color      (H, W, 3) the image; None where the dataset has none
+    palette    (K, 3) RGB of the classes
+    """
+
+    frame: int
+    labels: npt.NDArray[np.integer[Any]]
+    color: Image | None
+    palette: Image
+
+    @classmethod
+    def load(cls, path: Path) -> Overview:
+        """Read SCENE__BACKBONE.npz with the arrays frame, labels, palette and, where there is one, color.
+
+        Raises DataError where the file is damaged or of another kind.
+        """
+        try:
+            data = read_bytes(path)
+            frame, labels, palette = (decode_array(path, data, key) for key in ("frame", "labels", "palette"))
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                color = decode_array(path, data, "color") if "color.npy" in archive.namelist() else None
+            return cls(int(frame), labels, color, palette)
+        except (ValueError, TypeError) as error:
+            raise DataError(
+                f"{path}: not a saved frame ({one_line(error)}); delete it, and it is made again"
+            ) from error
+
+
+def draw_overview(above: FromAbove, overview: Overview) -> Figure:
+    """Image, prediction and the fused map from above, in one palette."""
+    table, rows = above.table, above.rows
+    palette: Colors = [(int(r), int(g), int(b)) for r, g, b in overview.palette]
+    images = [] if overview.color is None else [("image", overview.color)]
+    images.append(
+        ("prediction", _colored(np.where(overview.labels < table.K, overview.labels.astype(np.int64), EMPTY), palette))
+    )
+    shapes = [*(image.shape for _, image in images), rows.shape]
+    figure = canvas(PAGE, PAGE / len(shapes) * max(shape[0] / shape[1] for shape in shapes) + 0.5)
+    axes = figure.subplots(1, len(shapes))
+    for panel, letter, (title, image) in zip(axes, "ab", images, strict=False):
+        panel.imshow(image)
+        mark_panel(panel, letter, f"{title}, frame {overview.frame}")
+    label = dominant(table)
+    axes[-1].imshow(_painted(rows, label, palette), interpolation_stage="rgba")
+    mark_panel(axes[-1], "abc"[len(images)], f"fused, {above.view}")
+    for panel in axes:
+        framed(panel)
+    scale_bar(axes[-1], rows.shape[1], above.cell)
+    names = table.classes or tuple(str(k) for k in range(table.K))
+    shown = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
+    entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
+    columns = legend_columns([name for name, _ in entries])
+    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * math.ceil(len(entries) / columns))
+    figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
+    return figure
+
+
+def legend_columns(names: Sequence[str]) -> int:
+    """So many columns of a legend with these names fit the page."""
+    longest = max(len(name) for name in names)
+    return max(1, min(len(names), int(PAGE / (LEGEND_KEY + LEGEND_LETTER * longest))))
+
+
+def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
+    """A figure for n maps: up to three side by side, or for wide maps beneath each other in one column of the page."""
+    height, width = rows.shape
+    if width >= WIDE * height:
+        figure = canvas(COLUMN, n * (max(0.3, COLUMN * height / width) + 0.5))
+        return figure, figure.subplots(n, 1)
+    columns = min(n, 3)
+    lines = math.ceil(n / columns)
+    figure = canvas(PAGE, min(8.0, lines * (PAGE / columns * height / width + 0.65)))
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes in panels[n:]:
+        axes.set_axis_off()
+    return figure, list(panels[:n])
+
+
+def _painted(rows: Int64, label: npt.NDArray[Any], colors: Colors) -> Image:
+    """The map in the colours of its voxels' labels (H, W, 3), blank where there are none."""
+    return _colored(np.where(rows == EMPTY, EMPTY, label.astype(np.int64)[rows]), colors)
+
+
+def _colored(labels: Int64, colors: Colors) -> Image:
+    """A label map in colours (H, W, 3), blank where a label is EMPTY."""
+    image: Image = np.array([*colors, BLANK], dtype=np.uint8)[labels]
+    return image
+
+
+def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: UInt8) -> None:
+    """The categories with their names on a colour bar."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    axes.imshow(_painted(rows, category, CATEGORY_COLORS), interpolation_stage="rgba")
+    shades = ListedColormap(np.array(CATEGORY_COLORS) / 255)
+    edges = np.arange(len(CATEGORIES) + 1) - 0.5
+    bar = color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(CATEGORIES)), shades))
+    bar.set_ticks(range(len(CATEGORIES)), labels=[name.replace(" ", "\n") for name in CATEGORIES])
+    bar.ax.tick_params(length=0)
+
+
+def _draw_measure(
+    figure: Figure, axes: Axes, rows: Int64, values: Float64, ends: tuple[float, float], *, best_first: bool = True
+) -> None:
+    """A measure in colour between two ends, with its colour bar; undefined values are grey, empty cells blank."""
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    shades = matplotlib.colormaps[COLORMAP if best_first else f"{COLORMAP}_r"].with_extremes(bad=UNDEFINED)
+    colors = ScalarMappable(Normalize(*ends), shades)
+    image = colors.to_rgba(np.ma.masked_invalid(values[rows]), bytes=True)
+    image[rows == EMPTY, :3] = BLANK
+    axes.imshow(image, interpolation_stage="rgba")
+    color_bar(figure, axes, colors, extend=_beyond(values, ends))
+
+
+def _beyond(values: Float64, ends: tuple[float, float]) -> str:
+    """At which ends of a scale there are values beyond it: a colour bar has an arrow there."""
+    with np.errstate(invalid="ignore"):
+        below, above = bool(np.any(values < ends[0] - 1e-9)), bool(np.any(values > ends[1] + 1e-9))
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
+
+
+def color_bar(figure: Figure, axes: Axes, colors: ScalarMappable, extend: str = "neither") -> Colorbar:
+    """Beneath a panel."""
+    bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03, extend=extend)
+    bar.outline.set_linewidth(0.4)
+    return bar
+
+
+def framed(axes: Axes) -> None:
+    """A thin frame and no ticks: the scale bar says the size."""
+    axes.set(xticks=[], yticks=[], anchor="N")
+    axes.grid(visible=False)
+    for spine in axes.spines.values():
+        spine.set(visible=True, linewidth=0.4, color=FAINT)
+
+
+def scale_length(width: float) -> float:
+    """A round length of at most a quarter of the width: 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(width / 4))
+    return max(step * power for step in (1, 2, 5) if step * power <= width / 4)
+
+
+def scale_bar(axes: Axes, cells: int, cell: float) -> None:
+    """A bar of round length in the lower left corner."""
+    from matplotlib.patheffects import withStroke
+
+    length = scale_length(cells * cell)
+    halo = [withStroke(linewidth=2.5, foreground="white")]
+    end = 0.03 + length / (cells * cell)
+    axes.plot([0.03, end], [0.05, 0.05], transform=axes.transAxes, color=INK, linewidth=1.8, path_effects=halo)
+    text = f"{length:g} m" if length >= 0.1 else f"{length * 100:g} cm"
+    axes.text(0.03, 0.08, text, transform=axes.transAxes, fontsize=6.5, va="bottom", path_effects=halo)
+
+
+def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
+    from matplotlib.patches import Patch
+
+    return [Patch(facecolor=shade, edgecolor=FAINT, linewidth=0.4, label=name) for name, shade in entries]
+
+
+# What figures show of units' voxels, each table read once; the figures of a unit are drawn one after the other.
+
+LARGEST = 2e8
+"""Bytes of views that are kept in memory; those of further units are made from the units' files."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """A unit's voxels by OP: each measure, and SBD beside random order."""
+
+    measures: Histograms
+    drift: DriftByOP
+
+    @classmethod
+    def of(cls, table: VoxelTable, null: Float64) -> Sums:
+        """Of a map, and the SBD (n,) expected of its voxels in random order."""
+        return cls(histograms(table), DriftByOP.of(table, null))
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(together([self.measures, other.measures]), self.drift + other.drift)
+
+
+class Views:
+    """The sums of every unit that was asked for or seen, and views from above: of the last one, and of units seen."""
+
+    def __init__(self) -> None:
+        self._tables = Tables()
+        self._sums: dict[str, Sums] = {}
+        self._above: dict[str, FromAbove] = {}
+        self._last: tuple[str, FromAbove] | None = None
+
+    def see(self, unit: Unit, table: VoxelTable, up: npt.ArrayLike | None) -> None:
+        """Take what figures show of a unit while its map is in memory; from above where up is known."""
+        self._sums[unit.slug] = Sums.of(table, expected_sbd(table))
+        if up is not None and sum(above.nbytes for above in self._above.values()) < LARGEST:
+            self._above[unit.slug] = FromAbove.of(table, up)
+
+    def sums(self, record: Record) -> Sums:
+        """The unit's voxels by OP."""
+        slug = record.unit.slug
+        if slug not in self._sums:
+            self._sums[slug] = reduce(add, self._parts(record))
+        return self._sums[slug]
+
+    def _parts(self, record: Record) -> Iterator[Sums]:
+        """Of the unit, or of each of its tiles."""
+        assert record.voxels_file is not None
+        for file in parquet.files_of(record.voxels_file):
+            table = VoxelTable.load(file) if record.in_tiles else self._tables.of(record)
+            null = _column(file, "sbd_null")
+            yield Sums.of(table, expected_sbd(table) if null is None else null)
+
+    def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
+        """The unit's voxels that are seen from above."""
+        slug = record.unit.slug
+        if slug in self._above:
+            return self._above[slug]
+        if self._last is None or self._last[0] != slug:
+            large = record.in_tiles and record.summary.table.voxels > MOST
+            table = topmost(record.tiles(), up) if large else self._tables.of(record)
+            self._last = slug, FromAbove.of(table, up)
+        return self._last[1]
+
+
+def kept_of(record: Record, table: VoxelTable, names: Sequence[str]) -> list[npt.NDArray[Any]] | None:
+    """Columns (n,) that were written beside the voxels, of these of them, tile by tile; None where they were not."""
+    if record.voxels_file is None or not {*names} <= {*parquet.names_in(record.voxels_file)}:
+        return None
+    found: list[npt.NDArray[Any]] | None = None
+    for file in parquet.files_of(record.voxels_file):
+        own = VoxelTable.columns(file, ("ix", "iy", "iz", *names))
+        wanted, there = voxel_keys(table.index, np.stack([own[axis] for axis in ("ix", "iy", "iz")], axis=1))
+        at = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
+        met = there[at] == wanted
+        if found is None:
+            found = [np.zeros(len(table), own[name].dtype) for name in names]
+        for values, name in zip(found, names, strict=True):
+            values[met] = own[name][at[met]]
+    return found
+
+
+def _column(file: Path, name: str) -> npt.NDArray[Any] | None:
+    return VoxelTable.columns(file, [name])[name] if name in parquet.names_in(file) else None
+
+
+# Where two maps differ, seen from above or from the side.
+
+SAME = "#dedede"
+"""Of voxels that did not change; blank paper is where there are none."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What is drawn of each voxel, from -1, worse, to 1, better; and the numbers of places (m,) at their centres."""
+
+    title: str
+    ends: tuple[str, str]
+    values: Float64
+    numbers: Sequence[int]
+    centres: Sequence[tuple[float, float, float]]
+
+
+def draw_changes(table: VoxelTable, up: npt.ArrayLike, panels: Sequence[Panel]) -> Figure:
+    """The largest change in each column of voxels, worse in orange, better in blue."""
+    axis, view = best_view(table, up)[1:]
+    seen = [top_down(table, axis, np.abs(panel.values)) for panel in panels]
+    figure, axes = map_panels(seen[0][0], len(panels))
+    for own, letter, panel, (rows, cell) in zip(axes, LETTERS, panels, seen, strict=False):
+        _draw(figure, own, panel, rows)
+        mark_panel(own, letter, f"{panel.title}, {view.partition(',')[0]}")
+        framed(own)
+        scale_bar(own, rows.shape[1], cell)
+        _number(own, panel, table, axis, rows.shape[0], cell)
+    return figure
+
+
+def _draw(figure: Figure, axes: Axes, panel: Panel, rows: Int64) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    shades = ScalarMappable(Normalize(-1, 1), LinearSegmentedColormap.from_list("change", [COLORS[1], SAME, COLORS[0]]))
+    image = shades.to_rgba(panel.values[rows], bytes=True)
+    image[rows == EMPTY, :3] = BLANK
+    axes.imshow(image, interpolation_stage="rgba")
+    bar = color_bar(figure, axes, shades)
+    bar.set_ticks([-1, 0, 1], labels=[panel.ends[0], "as before", panel.ends[1]])
+    first, _, last = bar.ax.get_xticklabels()
+    first.set_horizontalalignment("left")
+    last.set_horizontalalignment("right")
+
+
+def _number(axes: Axes, panel: Panel, table: VoxelTable, axis: Float64, height: int, cell: float) -> None:
+    """The numbers of the places, beside their centres."""
+    from matplotlib.patheffects import withStroke
+
+    right, ahead, _ = level_axes(axis)
+    plane = np.stack([table.centers @ ahead, table.centers @ right], axis=1)
+    first = np.floor(np.quantile(plane, OUTLIERS, axis=0) / cell)
+    for number, centre in zip(panel.numbers, panel.centres, strict=True):
+        row, column = np.floor(np.array([ahead @ np.array(centre), right @ np.array(centre)]) / cell) - first
+        axes.annotate(
+            str(number), (column, height - 1 - row), fontsize=6.5, color=INK, ha="center", va="center",
+            path_effects=[withStroke(linewidth=2, foreground="white")], annotation_clip=True,
+        )  # fmt: skip

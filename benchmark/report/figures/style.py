@@ -1,0 +1,137 @@
+"""What all figures share: sizes, type, colours safe for any colour vision, files that come out the same each time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from semstab.core.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+
+COLUMN, PAGE = 3.4, 7.0
+"""Widths of one and of both columns of a page, inches."""
+
+DPI = 300
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
+"""Okabe and Ito's palette, the darker colours first."""
+
+INK, FAINT = "#222222", "#999999"
+
+_STYLE: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 7.5,
+    "axes.titlesize": 8,
+    "axes.labelsize": 7.5,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.edgecolor": INK,
+    "savefig.facecolor": "white",
+    "svg.hashsalt": "semstab",
+    "svg.fonttype": "path",
+}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of the study: the name of its files, what to write beside it, and what draws it.
+
+    alt   for readers who do not see it
+    unit  whose voxels it shows as a map; empty: it shows none
+    """
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    draw: Callable[[], Canvas]
+    unit: str = ""
+
+    @property
+    def dense(self) -> bool:
+        """Whether most of it is an image, so that PNG is the better format on a screen."""
+        return bool(self.unit)
+
+    def paths(self, folder: Path) -> list[Path]:
+        """Its files in a folder: FOLDER/NAME.png and .svg."""
+        return [folder / f"{self.name}.png", folder / f"{self.name}.svg"]
+
+    def save(self, folder: Path) -> list[Path]:
+        """Draw it and write its files, byte for byte the same for the same content."""
+        import matplotlib
+
+        png, svg = self.paths(folder)
+        with matplotlib.rc_context(_STYLE):
+            canvas = self.draw()
+            _without_formulas(canvas)
+            with atomic_path(png) as temporary:
+                canvas.savefig(temporary, dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
+            canvas.set_layout_engine("none")  # it is laid out by now; doing so again takes as long as drawing it
+            with atomic_path(svg) as temporary:
+                canvas.savefig(temporary, dpi=DPI, metadata={"Date": None, "Creator": None})
+        return [png, svg]
+
+
+def _without_formulas(canvas: Canvas) -> None:
+    """Take names as they are: a '$' in one begins no formula. Ticks of logarithmic axes are formulas."""
+    from matplotlib.text import Text
+
+    logarithmic = {
+        label
+        for axes in canvas.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        if axis.get_scale() == "log"
+        for label in axis.get_ticklabels(which="both")
+    }
+    for text in canvas.findobj(Text):
+        if text not in logarithmic:
+            text.set_parse_math(False)
+
+
+def canvas(width: float, height: float) -> Canvas:
+    """An empty figure of this size in inches; it belongs to no window and no global state."""
+    from matplotlib.figure import Figure as Canvas
+
+    return Canvas(figsize=(width, height), layout="constrained")
+
+
+def color(k: int) -> str:
+    """The k-th colour; they repeat after eight."""
+    return COLORS[k % len(COLORS)]
+
+
+def legend_columns(names: Sequence[str], width: float) -> int:
+    """How many entries of a legend stand beside each other in a figure that wide (inches), so that none is cut."""
+    widths = [0.55 + 0.06 * len(name) for name in names]
+    return len(names) if sum(widths) <= width else max(1, int(width / max(widths)))
+
+
+LETTERS = "abcdefghijklmnop"
+"""Of panels, in order."""
+
+
+def mark_panel(axes: Axes, letter: str, title: str) -> None:
+    """Head a panel as the paper does: '(a) title'."""
+    axes.set_title(f"({letter}) {title}", loc="left")

@@ -1,0 +1,166 @@
+"""The map seen from above: which voxel is the topmost one of each column along the up axis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64, Int64, Mask
+from semstab.metrics.agreement import rows_of
+from semstab.model.voxels import VoxelTable
+
+EMPTY = -1
+LARGEST = 2000
+"""Cells of a map's longer side; a larger map gets cells of several voxels."""
+
+MOST = LARGEST**2
+"""Voxels that are kept of a map that is looked at tile by tile."""
+
+LID, LIDDED = 0.4, 0.2
+"""A map is cut open where more than the second share of its columns are covered by voxels of the upper part, the first
+share of its height, that have others below them at half of its height or more: a ceiling, or a shelf's board."""
+
+SLENDER = 2.0
+"""A map that is seen to be so many times as large from a side is shown from there: a wall, a facade."""
+
+OUTLIERS = 0.01
+"""Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
+
+
+def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
+    """Right-handed unit vectors (right, ahead, up): right is the world's x axis, or y where up is x, laid level."""
+    up_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    along = np.eye(3)[0 if abs(up_axis[0]) < 0.9 else 1]
+    right = along - (along @ up_axis) * up_axis
+    right /= np.linalg.norm(right)
+    return right, np.cross(up_axis, right), up_axis
+
+
+def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) -> tuple[Int64, float]:
+    """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
+
+    rank (n,) says which voxel of a cell is shown instead of the topmost one: the highest.
+
+    The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
+    each voxel covers the cells that a level square of its size touches.
+    """
+    right, ahead, up_axis = level_axes(up)
+    centers = table.centers
+    plane = np.stack([centers @ ahead, centers @ right], axis=1)
+    low, high = np.quantile(plane, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    factor = max(1, int(np.ceil((high - low).max() / table.voxel_size / LARGEST)))
+    cell = factor * table.voxel_size
+    cells, rows = covered(plane, up_axis, table.voxel_size, cell)
+    first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
+    inside = ((cells >= first) & (cells <= last)).all(axis=1)
+    cells, rows = cells[inside] - first, rows[inside]
+    height = centers @ up_axis if rank is None else rank
+    order = np.argsort(height[rows], kind="stable")  # the topmost is written last
+    image = np.full(last - first + 1, EMPTY, dtype=np.int64)
+    image[tuple(cells[order].T)] = rows[order]
+    return image[::-1], cell
+
+
+def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tuple[Int64, Int64]:
+    """The cells (m, 2) of an edge, and the voxel (m,) that covers each, by the voxels' centres (n, 2) in the plane.
+
+    Where up is an axis of the world a cell is a column of voxels; else each voxel covers the cells that a level square
+    of its size touches, where a cell is one voxel.
+    """
+    aligned = np.isclose(np.abs(up).max(), 1.0)
+    reach = 0.0 if aligned or cell > voxel_size else 0.499 * voxel_size
+    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
+    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
+    return cells, np.tile(np.arange(len(plane)), len(corners))
+
+
+def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
+    """Of a map that comes tile by tile the voxels that can be seen from above: a table that does not grow with it."""
+    factor, parts = 1, list[VoxelTable]()
+    for tile in tiles:
+        parts.append(_tops(tile, up, factor))
+        while sum(map(len, parts)) > MOST:
+            factor *= 2
+            parts = [_tops(part, up, factor) for part in parts]
+    return VoxelTable.joined(parts)
+
+
+def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
+    """The topmost voxel of each cell of so many voxels' width."""
+    right, ahead, up_axis = level_axes(up)
+    cells = np.floor(table.centers @ np.stack([right, ahead], axis=1) / (factor * table.voxel_size)).astype(np.int64)
+    order = np.lexsort([-(table.centers @ up_axis), cells[:, 1], cells[:, 0]])
+    first = (np.diff(cells[order], axis=0, prepend=cells[order][:1] - 1) != 0).any(axis=1)
+    return table.rows(np.sort(order[first]))
+
+
+def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]:
+    """Which voxels (n,) to look at, against which axis (3,), and what that view is called."""
+    right, ahead, up_axis = level_axes(up)
+    every = np.ones(len(table), dtype=np.bool_)
+    areas = [_area(table, axis) for axis in (up_axis, right, ahead)]
+    if max(areas[1:]) > SLENDER * areas[0]:
+        return every, -right if areas[1] > areas[2] else -ahead, "from the side"
+    heights = table.centers @ up_axis
+    low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
+    cut = high - LID * (high - low)
+    _, column = np.unique(_columns(table, up_axis), return_inverse=True)
+    top, bottom = (np.full(column.max() + 1, end) for end in (-np.inf, np.inf))
+    np.maximum.at(top, column, heights)
+    np.minimum.at(bottom, column, heights)
+    covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
+    if np.mean(covered_columns) <= LIDDED or high - low < 4 * table.voxel_size:
+        return every, up_axis, "from above"
+    return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
+
+
+def _area(table: VoxelTable, axis: Float64) -> int:
+    """Cells that voxels cover, seen along an axis."""
+    return len(np.unique(_columns(table, axis)))
+
+
+def _columns(table: VoxelTable, axis: Float64) -> Int64:
+    """A number (n,) for the column of cells along an axis that each voxel lies in."""
+    right, ahead, _ = level_axes(axis)
+    centers = table.centers
+    x, y = (np.floor(centers @ along / table.voxel_size).astype(np.int64) for along in (right, ahead))
+    columns: Int64 = (x - x.min()) * (np.ptp(y) + 1) + (y - y.min())
+    return columns
+
+
+@dataclass(frozen=True, eq=False)
+class FromAbove:
+    """The voxels that are seen from above, or from where more of them shows.
+
+    table  these voxels alone
+    shown  (n,) whether a voxel of the map is one of them
+    rows   (H, W) the row of each cell's voxel in `table`, EMPTY where there is none
+    cell   the edge of a cell in metres
+    view   what the view is called
+    """
+
+    table: VoxelTable
+    shown: Mask
+    rows: Int64
+    cell: float
+    view: str = "from above"
+
+    @property
+    def nbytes(self) -> int:
+        """Of memory, about."""
+        return self.table.evidence.nbytes + self.rows.nbytes + self.shown.nbytes
+
+    @classmethod
+    def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
+        """See `best_view` and `top_down`."""
+        kept, axis, view = best_view(table, up)
+        rows, cell = top_down(rows_of(table, kept), axis)
+        rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(kept)[rows])
+        shown = np.zeros(len(table), dtype=np.bool_)
+        shown[rows[rows != EMPTY]] = True
+        renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
+        return cls(rows_of(table, shown), shown, renumbered, cell, view)

@@ -1,0 +1,79 @@
+"""A finished run as a notebook wants it: its summaries, tables and series by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from semstab.engine.folder import load_result
+from semstab.errors import ConfigError, DataError, one_line
+from semstab.model import voxels
+from semstab.model.events import Events
+from semstab.model.records import Result
+from semstab.model.voxels import VoxelTable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run or study; a unit is named by scene, backbone and backend as far as that is needed.
+
+    result  all that it found, typed
+    """
+
+    folder: Path
+    result: Result
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """One row a unit: what it is, and the mean of every measure."""
+        return self.result.to_pandas()
+
+    def table(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> VoxelTable:
+        """The voxels of a unit."""
+        return self.result.record(scene=scene, backbone=backbone, backend=backend).table()
+
+    def series(
+        self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None
+    ) -> pd.DataFrame:
+        """The time series of a unit: one row a frame. Raises DataError where its file cannot be read."""
+        file = self.result.record(scene=scene, backbone=backbone, backend=backend).series
+        if file is None:
+            raise DataError(f"{self.folder}: the run kept no series of this unit; run it again")
+        return read_series(file)
+
+    def events(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Events:
+        """The log of a unit's observations. Raises ConfigError where the run kept none."""
+        file = self.result.record(scene=scene, backbone=backbone, backend=backend).events_file
+        if file is None or not file.exists():
+            raise ConfigError(f"{self.folder}: the run kept no log of observations; run it with --events")
+        return Events.load(file)
+
+    def _repr_html_(self) -> str:
+        return self.result._repr_html_()
+
+
+def load(folder: str | Path) -> Run:
+    """A finished run from its folder. Raises DataError where it is not there or damaged."""
+    return Run(Path(folder), load_result(folder))
+
+
+def read_series(file: Path) -> pd.DataFrame:
+    """The time series in a file: one row a frame. Raises DataError where it cannot be read."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    try:
+        read = csv.read_csv(str(file))
+        columns = {name: read.column(name) for name in read.column_names}
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        pa.ArrowException,
+    ) as error:  # LookupError: a name that is there twice
+        raise DataError(f"{file}: cannot be read ({one_line(error)})") from error
+    return voxels.to_pandas(columns)

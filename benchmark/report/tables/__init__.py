@@ -1,0 +1,71 @@
+"""The study's tables: CSV, Markdown and LaTeX rounded as the paper's, JSON in full precision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from semstab.core.files import keep_only, write_json, write_text
+from semstab.model.records import Result
+from semstab.report.remedies import of_interest
+from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram, rules
+from semstab.report.tables.remedies import remedy_tables
+from semstab.report.tables.stability import (
+    agreement,
+    classes,
+    compared,
+    cross_backbone,
+    flicker,
+    fusion,
+    glance,
+    persistence,
+    scenes,
+    sensitivity,
+)
+from semstab.report.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
+from semstab.report.tables.table import TEXT_WRITERS, Cell, Column, Group, Table, to_csv, to_json, to_latex, to_markdown
+
+__all__ = [
+    "Cell",
+    "Column",
+    "Group",
+    "Table",
+    "save_tables",
+    "tables",
+    "to_csv",
+    "to_json",
+    "to_latex",
+    "to_markdown",
+    "write_tables",
+]
+
+BUILDERS = (
+    glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
+    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, compared, agreement,
+)  # fmt: skip
+"""In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
+
+
+def tables(result: Result) -> list[Table]:
+    """Every table that the study has records for, in the paper's order."""
+    shown = of_interest(result)
+    return [*remedy_tables(result), *(table for build in BUILDERS for table in build(shown))]
+
+
+def write_tables(result: Result, folder: str | Path) -> list[Path]:
+    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, in place of all others there; return the paths."""
+    return save_tables(tables(result), folder)
+
+
+def save_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
+    """The same of tables that are made already."""
+    written = []
+    for table in made:
+        stem = Path(folder) / "tables" / table.name
+        for suffix, write in TEXT_WRITERS.items():
+            written.append(stem.with_suffix(f".{suffix}"))
+            write_text(written[-1], write(table))
+        written.append(stem.with_suffix(".json"))
+        write_json(written[-1], to_json(table))
+    keep_only(written, Path(folder) / "tables")
+    return written

@@ -1,0 +1,365 @@
+"""Right beside stable where ground truth tells: geometry's part, correctness, quadrants, rules of fusion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from semstab.metrics import macro_mean
+from semstab.model.contrast import BackboneComparison, CommonLooks, MapCoverage
+from semstab.model.measures import VSS, Quantity, measures
+from semstab.model.records import Result
+from semstab.model.statistics import (
+    Correctness,
+    Correlogram,
+    Estimate,
+    LagBin,
+    Losses,
+    MapStatistics,
+    Quadrants,
+    RuleMeans,
+    RuleOutcome,
+)
+from semstab.report.tables.stability import of_measures, settings
+from semstab.report.tables.statistics import INTERVALS, SEEN_TWICE, Number, by_scene, grouped, judged_records
+from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
+from semstab.statistics.looks.correlogram import STANDARD
+from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.versus.comparison import compared
+
+RIGHT = (ACCURACY, MIOU, ECE, BRIER)
+"""How right fused labels are, in the order of the columns."""
+
+
+def ceiling(result: Result) -> list[Table]:
+    """Disagreement that the ground truth's labels have too, and the rest."""
+    columns = (
+        Column("disagreement", "1 - PSA", 4, "lower"),
+        Column("geometry", "geometry's", 4),
+        Column("model", "the model's", 4, "lower"),
+        Column("geometry_percent", "geometry's (%)", 0),
+    )
+    numbers = (
+        _lost(lambda losses: losses.total),
+        _lost(lambda losses: losses.geometry),
+        _lost(lambda losses: losses.model),
+        _lost(lambda losses: 100 * losses.share.value),
+    )
+    caption = (
+        "Over the voxels that both the predictions and the ground truth saw twice or more. Geometry's: the disagreement"
+        " 1 - PSA that the ground truth's labels have under the same poses, depth and noise; the rest is the model's,"
+        f" negative where it errs alike in all views. {INTERVALS}"
+    )
+    return by_scene(result, "ceiling", "Geometry or model", caption, columns, numbers)
+
+
+def correctness(result: Result) -> list[Table]:
+    """Right beside stable: by stratum of OP, and the four quadrants."""
+    return [*_correct_by_stratum(result), *_quadrants(result)]
+
+
+def _correct_by_stratum(result: Result) -> list[Table]:
+    judged = {
+        name: [found.correctness.strata for _, found in rows if found.correctness is not None]
+        for name, rows in judged_records(result).items()
+    }
+    if not any(judged.values()):
+        return []
+    columns = (
+        Column("persistence", "Persistence"),
+        Column("voxels", "Voxels", 0),
+        *map(Column.of, RIGHT),
+    )
+    groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in judged.items() if strata)
+    caption = (
+        f"{settings(result.select())} Voxels with a true class: more than half of the ground truth's evidence is for"
+        " it. ECE: expected calibration error of the largest belief; Brier: 0 to 2. Macro means: each scene counts"
+        " once; voxels are those of all scenes."
+    )
+    return [Table("correctness", "Right beside stable, by observation persistence", caption, columns, groups)]
+
+
+def _quadrants(result: Result) -> list[Table]:
+    columns = (
+        Column("voxels", "Voxels", 0),
+        Column("stable_right_percent", "right", 1, "higher", over="Stable (%)"),
+        Column("stable_wrong_percent", "wrong", 1, "lower", over="Stable (%)"),
+        Column("unstable_right_percent", "right", 1, over="Unstable (%)"),
+        Column("unstable_wrong_percent", "wrong", 1, "lower", over="Unstable (%)"),
+        Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 1, "lower"),
+    )
+    numbers = (
+        _quadrant(lambda found: found.voxels),
+        _quadrant(lambda found: found.stable_right.percent),
+        _quadrant(lambda found: found.stable_wrong.percent),
+        _quadrant(lambda found: found.unstable_right.percent),
+        _quadrant(lambda found: found.unstable_wrong.percent),
+        _quadrant(lambda found: found.wrong_of_stable.percent),
+    )
+    caption = (
+        "Over the voxels with OP>=3 and a true class. Stable: PSA >= 0.8, of ten frames one may disagree; right: the"
+        " dominant class is the true one. Stable and wrong is the dangerous one: no second look reveals it."
+        f" {INTERVALS}"
+    )
+    return by_scene(result, "quadrants", "Stable and right", caption, columns, numbers)
+
+
+def rules(result: Result) -> list[Table]:
+    """Other rules of fusion applied to the same log of observations, macro means over scenes."""
+    judged = {
+        name: grouped((row for _, found in rows for row in found.fusion_rules or ()), lambda row: row.rule)
+        for name, rows in judged_records(result).items()
+    }
+    judged = {name: rows for name, rows in judged.items() if rows}
+    if not judged:
+        return []
+    columns = (
+        Column("rule", "Rule"),
+        *of_measures(),
+        Column("relabelled_percent", "Relabelled (%)", 2),
+        *map(Column.of, RIGHT),
+    )
+    groups = tuple(Group(name, _rule_rows(rows)) for name, rows in judged.items())
+    caption = (
+        f"{SEEN_TWICE} Averaging is the paper's rule; majority counts votes; product multiplies the frames' evidence as"
+        " Bayes' rule does, geometric is its geometric mean. Relabelled: share of the voxels whose dominant class is"
+        f" not that of averaging. Macro means: each scene counts once.{_order_by_rule(judged)}"
+    )
+    return [Table("rules", "Rules of fusion", caption, columns, groups)]
+
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+def _lost(take: Callable[[Losses], float | Estimate]) -> Number:
+    """A number of geometry's part; NaN where that is not known."""
+    return lambda found: math.nan if found.geometry is None else take(found.geometry)
+
+
+def _quadrant(take: Callable[[Quadrants], float | Estimate]) -> Number:
+    """A number of the quadrants; NaN without ground truth."""
+    return lambda found: math.nan if found.correctness is None else take(found.correctness.quadrants)
+
+
+def _stratum_rows(strata: Sequence[Sequence[Correctness]]) -> tuple[Row, ...]:
+    return tuple(
+        (name, sum(row.voxels for row in rows), *_right(rows))
+        for name, rows in grouped((row for unit in strata for row in unit), lambda row: row.name).items()
+    )
+
+
+def _right(rows: Sequence[Correctness | RuleMeans]) -> list[float]:
+    """The macro mean of each of RIGHT."""
+    values = [(row.accuracy, row.miou, row.ece, row.brier) for row in rows]
+    return [macro_mean(column) for column in zip(*values, strict=True)]
+
+
+def _rule_rows(by_rule: Mapping[str, Sequence[RuleOutcome]]) -> tuple[Row, ...]:
+    return tuple(
+        (
+            rule,
+            *(macro_mean([row.values[measure] for row in rows]) for measure in measures()),
+            100 * macro_mean([row.relabelled_share for row in rows]),
+            *_right([row.values for row in rows]),
+        )
+        for rule, rows in by_rule.items()
+    )
+
+
+def _order_by_rule(judged: Mapping[str, Mapping[str, Sequence[RuleOutcome]]]) -> str:
+    """Whether the order of the backbones by VSS and by accuracy depends on the rule, as a sentence."""
+    if len(judged) < 2:
+        return ""
+    takers: dict[Quantity, Callable[[RuleMeans], float]] = {
+        VSS: lambda row: row[VSS],
+        ACCURACY: lambda row: row.accuracy,
+    }
+    changed = []
+    for quantity, take in takers.items():
+        by_rule: dict[str, dict[str, float]] = {}
+        for backbone, rules_of in judged.items():
+            for rule, rows in rules_of.items():
+                by_rule.setdefault(rule, {})[backbone] = macro_mean([take(row.values) for row in rows])
+        changed += [quantity.word] if len({_order(values) for values in by_rule.values()}) > 1 else []
+    verb = f"changes by {' and by '.join(changed)}" if changed else "is the same"
+    return f" From rule to rule the order of the backbones {verb}."
+
+
+def _order(values: Mapping[str, float]) -> tuple[str, ...]:
+    """The backbones whose value is defined, the highest first."""
+    return tuple(
+        sorted((name for name, value in values.items() if not math.isnan(value)), key=lambda name: -values[name])
+    )
+
+
+# The backbones beside each other, on the same places and at the same number of observations.
+
+_COMMON = "On the voxels that every backbone saw twice or more, and on looks (a place in a frame) that all labelled."
+
+
+def comparison(result: Result) -> list[Table]:
+    """Paired differences, ranking, and what each map covers; one group a scene."""
+    if not result.comparisons:
+        return []
+    covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
+    looks = {found.scene: found.looks for found in result.comparisons if found.looks is not None}
+    return [_differences(result), _ranking(result), covered, *([ignored_table(looks)] if looks else [])]
+
+
+def _differences(result: Result) -> Table:
+    columns = (
+        Column("a", "Backbone"),
+        Column("b", "less backbone"),
+        Column("measure", "Measure"),
+        Column("difference", "Difference", 4, signed=True),
+        Column("p_holm", "p (Holm)", 4),
+        Column("answers", "interval answers"),
+    )
+    caption = (
+        f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
+        f" which something may be claimed; the others describe. {INTERVALS}"
+    )
+    groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
+    return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
+
+
+def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
+    rows = sorted(found.paired.differences, key=lambda row: row.measure != found.paired.primary)
+    return tuple(
+        (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.question) for row in rows
+    )
+
+
+def _ranking(result: Result) -> Table:
+    columns = (
+        Column("measure", "Measure"),
+        Column("rank", "Rank", 0),
+        Column("backbone", "Backbone"),
+        Column("range", "95% of resamples"),
+        Column("best_percent", "first in (%)", 0),
+        Column("value", "Same looks", 4),
+        Column("standardised", "Same OP", 4),
+    )
+    caption = (
+        f"Same looks: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
+        f" strata of OP weighted by those of all maps together. {INTERVALS}"
+    )
+    groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
+    return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
+
+
+def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
+    quantities = {quantity.key: quantity for quantity in compared(truth=True)}
+    return tuple(
+        (
+            quantities[ranking.measure].word,
+            rank.rank,
+            rank.backbone,
+            f"{rank.low} to {rank.high}",
+            100 * rank.best,
+            found.paired.of(quantities[ranking.measure])[rank.backbone],
+            found.standardised.of(quantities[ranking.measure], rank.backbone),
+        )
+        for ranking in found.paired.rankings
+        for rank in ranking.ranks
+    )
+
+
+def ignored_table(looks: Mapping[str, CommonLooks]) -> Table:
+    """What each backbone left out, by scene."""
+    columns = (
+        Column("backbone", "Backbone"),
+        Column("missing_percent", "left out (%)", 1),
+        Column("psa_low", "at least", 3, over="PSA with these"),
+        Column("psa_high", "at most", 3, over="PSA with these"),
+        Column("alpha_ignored", "Alpha, leaving out as a class", 3),
+        Column("order", "Order depends on it"),
+    )
+    caption = (
+        "Of the looks that any backbone labelled, what each left out, in pixels; PSA had these agreed never, or always"
+        " (Manski); alpha between frames where to leave a place out is a class of its own. The order depends on it"
+        " where that alpha, or PSA within its bounds, would order the backbones otherwise."
+    )
+    groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in looks.items())
+    return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
+
+
+def _ignored_rows(found: CommonLooks) -> tuple[Row, ...]:
+    depends = "yes" if found.depends else "no"
+    return tuple(
+        (row.backbone, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored
+    )
+
+
+def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
+    """What each map covers, by scene."""
+    columns = (
+        Column("backbone", "Backbone"),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("repeated", "OP>=2", 0),
+        Column("recurrent", "OP>=3", 0),
+        Column("common_percent", "in all maps (%)", 1),
+        Column("alone", "in no other", 0),
+    )
+    caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
+    groups = tuple(Group(scene, tuple(map(_coverage_row, found))) for scene, found in covered.items())
+    return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
+
+
+def _coverage_row(row: MapCoverage) -> Row:
+    return (
+        row.backbone,
+        row.voxels,
+        row.mean_op,
+        row.repeated,
+        row.recurrent,
+        100 * row.common_share,
+        row.alone,
+    )
+
+
+# Agreement at a stated distance of two looks, and from the nearest to the farthest.
+
+
+def correlogram(result: Result) -> list[Table]:
+    """Alpha between frames where views differ by a stated angle, and for the nearest and the farthest looks."""
+    low, high = STANDARD
+    stated = f"{low:g} to {high:g} degrees apart"
+    columns = (
+        Column("standard", "found", 3, "higher", over=stated),
+        Column("standard_ceiling", "ceiling", 3, over=stated),
+        Column("standard_pairs", "pairs", 0, over=stated),
+        *(Column(f"{axis}_{end}", f"{end}", 3, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
+    )
+    numbers = (
+        _of(lambda found: found.standard.alpha),
+        _of(lambda found: found.standard.ceiling),
+        _of(lambda found: found.standard.pairs or math.nan),
+        *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
+    )
+    caption = (
+        "Alpha between frames of pairs of looks at a place, by how far apart they are: models and flights compare at a"
+        " stated angle between the directions of view, not over whatever pairs a flight has. Nearest, farthest: the"
+        " first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance of the"
+        " cameras. In sampled voxels; intervals at 95%, for the next flight"
+        f" if {LEAST_FRAMES} frames of a bin tell of it, else for this map."
+    )
+    return by_scene(result, "correlogram", "Agreement by distance of the looks", caption, columns, numbers)
+
+
+_AXES = ("time", "angle", "range", "baseline")
+
+
+def _of(take: Callable[[Correlogram], float | Estimate]) -> Callable[[MapStatistics], float | Estimate]:
+    return lambda found: math.nan if found.correlogram is None else take(found.correlogram)
+
+
+def _end(axis: str, last: int) -> Callable[[Correlogram], float]:
+    def value(found: Correlogram) -> float:
+        bins: Sequence[LagBin] = getattr(found, axis)
+        return bins[last].alpha.value if len(bins) > 1 else math.nan
+
+    return value

@@ -1,0 +1,63 @@
+"""Filters over a model beside each other: how steady, how right, how late, what is left, what it costs."""
+
+from __future__ import annotations
+
+from semstab.model.records import Result
+from semstab.report.remedies import Remedies, Remedy, remedies
+from semstab.report.tables.table import Column, Group, Row, Table
+
+COLUMNS = (
+    Column("filter", "Filter"),
+    Column("flicker_percent", "Flicker (%)", 2, "lower", over="Steady?"),
+    Column("alpha", "alpha", 3, over="Steady?"),
+    Column("foresight_percent", "Foresight (%)", 2, "higher", over="Right?"),
+    Column("accuracy_percent", "Accuracy (%)", 2, "higher", over="Right?"),
+    Column("miou_percent", "mIoU (%)", 2, "higher", over="Right?"),
+    Column("stable_wrong_percent", "Stable, wrong (%)", 2, "lower", over="Right?"),
+    Column("lag_frames", "Lag (frames)", 2, "lower", over="Price"),
+    Column("coverage_percent", "Coverage (%)", 1, over="Price"),
+    Column("milliseconds", "ms", 1, "lower", over="Price"),
+)
+CAPTION = (
+    "Flicker: of the places that two frames in a row see, those whose label changes (camera motion taken out). Alpha:"
+    " agreement between frames in the fused map; it rises with any memory of frames before, as frames that share one"
+    " are no longer independent: of a filter that remembers a high alpha says nothing. Foresight: of the places that"
+    " the next frame sees, those whose label the unfiltered model gives them there; no filter has seen that frame, so"
+    " what it merely repeats does not count. Accuracy and mean IoU: of the labelled pixels of single frames. Stable,"
+    " wrong: of the places seen again, those that keep a label that is wrong. Lag: frames by which labels follow a true"
+    " change of what is seen later than the model (at most 8). Coverage: labelled pixels for one of the model's. ms:"
+    " CPU time a frame. Means over scenes."
+)
+
+
+def remedy_tables(result: Result) -> list[Table]:
+    """One table of all models, where filters were judged."""
+    found = remedies(result)
+    if not found:
+        return []
+    groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in found)
+    best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in found]
+    return [
+        Table("remedies", "What steadies the labels", f"{CAPTION} To use: {', '.join(best)}.", COLUMNS, groups, "model")
+    ]
+
+
+def row(remedy: Remedy) -> Row:
+    """Its cells."""
+    return (
+        remedy.filters or "none",
+        100 * remedy.flicker,
+        remedy.alpha,
+        100 * remedy.foresight,
+        100 * remedy.accuracy,
+        100 * remedy.miou,
+        100 * remedy.stable_wrong,
+        remedy.lag,
+        100 * remedy.coverage,
+        remedy.milliseconds,
+    )
+
+
+def marked(found: Remedies, remedy: Remedy) -> str:
+    """'*' for the one to use, '!' for one that is steadier and worse."""
+    return "*" if remedy == found.best else "!" if remedy in found.misleading else ""

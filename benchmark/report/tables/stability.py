@@ -1,0 +1,469 @@
+"""Stability in the world: by scene, by persistence, by class, and of the backbones in one taxonomy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from semstab.config import BACKENDS, SHARED
+from semstab.metrics import macro_mean, split_last
+from semstab.model.measures import SBD, VSS, measures
+from semstab.model.records import ImageSpace, Record, Result
+from semstab.model.results import Agreement, Means, TableSummary
+from semstab.report.averages import (
+    ENOUGH,
+    Level,
+    Pooled,
+    Sweep,
+    by_backbone,
+    complete_scenes,
+    levels,
+    over_all,
+    over_recurrent,
+    pooled,
+    swept,
+)
+from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.statistics.agreement import ALPHA, PSA
+
+VOXELS = Column("voxels", "Voxels", 0)
+SHARE = Column("share_percent", "Voxels (%)", 2)
+SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
+
+
+def of_measures(*, compared: bool = False, prefix: str = "", over: str = "") -> list[Column]:
+    """A column a measure: the paper prints more decimals where it compares."""
+    return [Column.of(measure, compared=compared, prefix=prefix, over=over) for measure in measures()]
+
+
+def scenes(result: Result) -> list[Table]:
+    """The multi-scene table: each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability)."""
+    records = result.select()
+    if not records:
+        return []
+    columns = (
+        Column("scene", "Scene"),
+        VOXELS,
+        Column("points", "Sampled Points", 0),
+        Column("mean_op", "Mean OP", 2),
+        *of_measures(),
+    )
+    groups = tuple(
+        Group(name, tuple(_scene_row(record) for record in rows), _scene_total(rows) if len(rows) > 1 else None)
+        for name, rows in by_backbone(records).items()
+    )
+    caption = (
+        f"{settings(records)} A scene's numbers are means over its voxels. Total / Mean: total voxels and points,"
+        f" macro means of the rest, in which each scene counts once. {SBD_OVER}"
+    )
+    return [Table("scenes", "Stability by scene", caption, columns, groups)]
+
+
+def persistence(result: Result) -> list[Table]:
+    """The persistence strata, the voxels of all scenes pooled (paper, Observation Persistence)."""
+    records = result.select()
+    if not records:
+        return []
+    columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
+    groups = []
+    for name, own in by_backbone(records).items():
+        together = pooled(own)
+        rows = (*together.strata, *together.well_seen)
+        groups.append(Group(name, tuple(_means_row(row) for row in rows), _means_row(together.recurrent)))
+    caption = (
+        f"{settings(records)} Pooled: the means run over the voxels of all scenes together. The last row is the"
+        " recurrent voxels. A voxel seen once has no SBD, and where its pixels agree VSS = 1 and no entropy."
+    )
+    if any(split_last([record.summary.table for record in own]) for own in by_backbone(records).values()):
+        caption += " Where most voxels are in the last stratum, it follows in parts."
+    return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
+
+
+def classes(result: Result) -> list[Table]:
+    """The dominant classes, the voxels of all scenes pooled (paper, Class-wise Stability)."""
+    records = result.select()
+    if not records:
+        return []
+    columns = (Column("class", "Class"), VOXELS, *of_measures(), Column("note", "Note"))
+    groups = tuple(
+        Group(name, tuple(_class_row(row) for row in pooled(rows).classes))
+        for name, rows in by_backbone(records).items()
+    )
+    caption = (
+        f"{settings(records)} Pooled: the means run over the voxels of all scenes that the class dominates."
+        f" {SBD_OVER} Rare: fewer than {ENOUGH:,} voxels, too few to compare."
+    )
+    return [Table("classes", "Stability by dominant class", caption, columns, groups)]
+
+
+def cross_backbone(result: Result) -> list[Table]:
+    """The backbones in one taxonomy: all voxels and the recurrent ones (paper, Cross-Backbone Temporal Stability)."""
+    records = comparable(result)
+    if not records:
+        return []
+    columns = (Column("over", "Means over"), VOXELS, SHARE, *of_measures(compared=True))
+    groups = tuple(Group(name, _comparison_rows(rows)) for name, rows in by_backbone(records).items())
+    caption = (
+        f"{settings(records)} Macro: each scene counts once. Pooled: the voxels of all scenes together; compare the"
+        f" recurrent voxels (OP>=3) with the pooled row, and their share between backbones. {SBD_OVER}"
+    )
+    return [Table("cross_backbone", "Backbones in one taxonomy", caption, columns, groups)]
+
+
+def comparable(result: Result) -> tuple[Record, ...]:
+    """Records of several backbones in one taxonomy: those fused for it, else the base ones where they share theirs."""
+    records = result.select(SHARED) or result.select()
+    several = len(by_backbone(records)) > 1
+    return records if several and len({record.summary.taxonomy for record in records}) == 1 else ()
+
+
+def settings(records: Sequence[Record]) -> str:
+    """What the units have in common, as a sentence."""
+    sizes = sorted({record.summary.table.voxel_size for record in records})
+    spaces = dict.fromkeys(f"{record.summary.taxonomy} (K = {record.summary.table.K})" for record in records)
+    return f"Voxels of {', '.join(f'{size:g}' for size in sizes)} m, taxonomy {', '.join(spaces)}."
+
+
+def _scene_row(record: Record) -> Row:
+    table = record.summary.table
+    return record.unit.scene, table.voxels, table.points, table.mean_op, *table.means.of_all()
+
+
+def _scene_total(records: Sequence[Record]) -> Row:
+    tables = [record.summary.table for record in records]
+    return (
+        "Total / Mean",
+        sum(table.voxels for table in tables),
+        sum(table.points for table in tables),
+        macro_mean([table.mean_op for table in tables]),
+        *_macro(tables),
+    )
+
+
+def _macro(tables: Sequence[TableSummary]) -> list[float]:
+    """The macro mean of each measure."""
+    return [macro_mean([table[measure] for table in tables]) for measure in measures()]
+
+
+def _means_row(row: Means) -> Row:
+    return row.name, row.voxels, 100 * row.share, *row.means.of_all()
+
+
+def _class_row(row: Means) -> Row:
+    note = "" if row.voxels >= ENOUGH else "rare" if row.voxels else "absent"
+    return row.name, row.voxels, *row.means.of_all(), note
+
+
+def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
+    tables, together = [record.summary.table for record in records], pooled(records)
+    return (
+        ("all voxels, macro", together.voxels, 100.0, *_macro(tables)),
+        ("all voxels, pooled", *_means_row(together.every)[1:]),
+        ("OP>=3, pooled", *_means_row(together.recurrent)[1:]),
+    )
+
+
+# The backbones at a glance: what all voxels say, what the recurrent ones say, and how many there are.
+
+_HEADLINES = (VSS, SBD)
+"""The paper's two: a glance is no place for all."""
+
+_COLUMNS = (
+    Column("backbone", "Backbone"),
+    Column("once_percent", "Seen once (%)", 2),
+    Column("recurrent_percent", "OP>=3 (%)", 2),
+    *(Column.of(measure, over="All voxels") for measure in _HEADLINES),
+    *(Column.of(measure, prefix="recurrent_", over="OP>=3") for measure in _HEADLINES),
+    Column("flicker_percent", "plain (%)", 2, "lower", over="Flicker"),
+    Column("compensated_flicker_percent", "compensated (%)", 2, "lower", over="Flicker"),
+)
+
+
+def glance(result: Result) -> list[Table]:
+    """One row a backbone."""
+    records = result.select()
+    if not records:
+        return []
+    rows = tuple(_row(name, found) for name, found in by_backbone(records).items())
+    caption = (
+        f"{settings(records)} Pooled over the voxels of all scenes; flicker is the macro mean of the scenes,"
+        f" compensated for camera motion in the last column. {SBD_OVER}"
+    )
+    return [Table("glance", "Backbones at a glance", caption, _COLUMNS, (Group("", rows),), by="")]
+
+
+def _row(backbone: str, records: Sequence[Record]) -> Row:
+    voxels = pooled(records)
+    return (
+        backbone,
+        100 * voxels.once,
+        100 * voxels.recurrent.share,
+        *(voxels.every[measure] for measure in _HEADLINES),
+        *(voxels.recurrent[measure] for measure in _HEADLINES),
+        macro_mean([record.image_space.flicker_percent for record in records]),
+        macro_mean([record.image_space.compensated_flicker_percent for record in records]),
+    )
+
+
+# The sensitivity sweeps: what all voxels say and what the recurrent ones say, side by side with their share.
+
+
+def sensitivity(result: Result) -> list[Table]:
+    """One table a sweep (paper, Sensitivity to World-Space Association), and one with what thinning does not change."""
+    found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
+    return [table for pair in found for table in pair if table is not None]
+
+
+def _table(result: Result, sweep: Sweep) -> Table:
+    columns = (
+        Column("value", sweep.header),
+        Column("repeats", "Repeats", 0),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("recurrent_percent", "OP>=3 (%)", 2),
+        *of_measures(compared=True, over="All voxels"),
+        *of_measures(compared=True, prefix="recurrent_", over="OP>=3"),
+        Column("note", "Note"),
+    )
+    backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
+    groups = tuple(
+        Group(name, tuple(_sweep_row(sweep, level) for level in levels(result, sweep.name, name))) for name in backbones
+    )
+    scenes = dict.fromkeys(scene for name in backbones for scene in complete_scenes(result, sweep.name, name))
+    caption = (
+        f"Pooled: the means run over the voxels of all scenes together ({', '.join(scenes)}); ± is the standard"
+        f" deviation over the repeats, each with a seed of its own. {SBD_OVER} Few: fewer than {ENOUGH:,} recurrent"
+        " voxels."
+    )
+    return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
+
+
+def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
+    """None where the units have no statistics, as in studies of earlier versions."""
+    columns = (
+        Column("value", sweep.header),
+        Column("mean_op", "Mean OP", 2),
+        Column("vss", "VSS, all voxels", VSS.digits[1], VSS.better),
+        *(Column.of(quantity, compared=True) for quantity in (SBD, PSA, ALPHA)),
+        Column("sbd_excess", "SBD excess", 4, signed=True),
+    )
+    by_backbone = {name: levels(result, sweep.name, name) for name in result.backbones}
+    found = {name: rows for name, rows in by_backbone.items() if any(level.judged for level in rows)}
+    if not found:
+        return None
+    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in found.items())
+    caption = (
+        "VSS is pooled over the voxels of all scenes; the rest is of those seen twice or more, macro means of the"
+        " scenes. PSA: share of pairs of frames that agree about a voxel; alpha: Krippendorff's, the same beyond"
+        " chance; SBD excess: SBD less what the same observations give in random order (bits). These three do not"
+        " depend on how often a voxel was seen; which voxels were seen twice still changes along the sweep. ± is the"
+        " standard deviation over the repeats."
+    )
+    title = f"Agreement against {sweep.title}"
+    return Table(f"sensitivity_agreement_{sweep.name}", title, caption, columns, groups)
+
+
+def _agreement_row(sweep: Sweep, level: Level) -> Row:
+    spread = level.spread if len(level.repeats) > 1 else level.mean
+    return (
+        sweep.text(level.value),
+        level.mean(lambda p: p.mean_op),
+        spread(over_all(VSS)),
+        spread(lambda p: p.drift.value),
+        spread(lambda p: p.psa.value),
+        spread(lambda p: p.alpha.value),
+        spread(lambda p: p.excess_drift),
+    )
+
+
+def _sweep_row(sweep: Sweep, level: Level) -> Row:
+    spread = level.spread if len(level.repeats) > 1 else level.mean
+    return (
+        sweep.text(level.value),
+        len(level.repeats),
+        level.mean(lambda p: p.voxels),
+        level.mean(lambda p: p.mean_op),
+        spread(lambda p: 100 * p.recurrent.share),
+        *(spread(over_all(measure)) for measure in measures()),
+        *(spread(over_recurrent(measure)) for measure in measures()),
+        "" if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH else "few",
+    )
+
+
+# Stability in image coordinates: flicker, flicker without the camera's motion, video consistency.
+
+_NUMBERS = (
+    Column("flicker_percent", "Flicker (%)", 2, "lower"),
+    Column("compensated_flicker_percent", "compensated (%)", 2, "lower"),
+    Column("compensated_share_percent", "co-visible (%)", 2),
+    Column("vc8", "VC8", 4, "higher"),
+    Column("vc16", "VC16", 4, "higher"),
+    Column("self_vc8", "VC8", 4, "higher", over="Without truth"),
+    Column("self_vc16", "VC16", 4, "higher", over="Without truth"),
+)
+_WHAT = (
+    "Flicker: share of the pixels valid in two consecutive sampled frames whose label changes. Compensated: the same"
+    " after the earlier map is warped by depth and pose, occluded pixels left out, so that camera motion does not"
+    " count; co-visible is the share of the valid pixels that the warped map reaches. VC8, VC16: video consistency, the"
+    " share of the pixels whose ground truth stays the same through a clip of 8 or 16 frames and whose prediction does"
+    " too; without truth, of all pixels valid throughout."
+)
+_REGIONS = (
+    " Regions without classes ({names}) are matched from frame to frame; a pixel stays where its regions are a match."
+)
+
+
+def flicker(result: Result) -> list[Table]:
+    """Frame-wise flicker, macro means by backbone, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
+    methods = _by_method(result)
+    if not methods:
+        return []
+    regions = dict.fromkeys(row.backbone for row in result.regions)
+    what = _WHAT + (_REGIONS.format(names=", ".join(regions)) if regions else "")
+    macro = tuple((name, *_numbers(scenes.values())) for name, scenes in methods.items())
+    columns, caption = (Column("method", "Method"), *_NUMBERS), f"{what} Macro means: each scene counts once."
+    tables = [Table("flicker", "Flicker in image space", caption, columns, (Group("", macro),), by="")]
+    if any(len(scenes) > 1 for scenes in methods.values()):
+        groups = tuple(
+            Group(name, tuple((scene, *_numbers([found])) for scene, found in scenes.items()))
+            for name, scenes in methods.items()
+        )
+        columns = (Column("scene", "Scene"), *_NUMBERS)
+        tables.append(Table("flicker_by_scene", "Flicker in image space, by scene", what, columns, groups))
+    return tables
+
+
+def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
+    """By backbone and scene; regions without classes have flicker only."""
+    methods: dict[str, dict[str, ImageSpace]] = {}
+    for record in result.select():
+        methods.setdefault(record.unit.backbone, {})[record.unit.scene] = record.image_space
+    for row in result.regions:
+        found = ImageSpace(row.flicker_percent, row.compensated_flicker_percent, row.compensated_share)
+        methods.setdefault(row.backbone, {})[row.scene] = found
+    return methods
+
+
+def _numbers(scenes: Iterable[ImageSpace]) -> Row:
+    rows = list(scenes)
+    return (
+        macro_mean([row.flicker_percent for row in rows]),
+        macro_mean([row.compensated_flicker_percent for row in rows]),
+        100 * macro_mean([row.compensated_share for row in rows]),
+        macro_mean([row.vc8 for row in rows]),
+        macro_mean([row.vc16 for row in rows]),
+        macro_mean([row.self_vc8 for row in rows]),
+        macro_mean([row.self_vc16 for row in rows]),
+    )
+
+
+# The fusion implementations: the same frames through every backend, and how far each moves the measures.
+
+DIFFERENCE = "Difference to the first"
+LARGEST = "Largest difference"
+
+
+def fusion(result: Result) -> list[Table]:
+    """Each backend beside the base one, over the scenes that every backend fused."""
+    groups = tuple(group for name in result.backbones if (group := _group(result, name)) is not None)
+    if not groups:
+        return []
+    columns = (
+        Column("backend", "Backend"),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        *of_measures(compared=True),
+        Column("recurrent_percent", "OP>=3 (%)", 2),
+        Column("fuse_ms_per_frame", "ms a frame", 1, "lower"),
+        Column("delta_voxels", "Voxels", 0, signed=True, over=DIFFERENCE),
+        Column("delta_mean_op", "OP", 2, signed=True, over=DIFFERENCE),
+        *(Column(f"delta_{m.key}", m.title, m.digits[1], signed=True, over=DIFFERENCE) for m in measures()),
+    )
+    caption = (
+        f"{settings(result.select())} Pooled: the means run over the voxels of all scenes together; ms a frame is the"
+        f" macro mean. The base backend stands first. {SBD_OVER}"
+    )
+    return [Table("fusion", "Fusion implementations", caption, columns, groups)]
+
+
+def compared(result: Result) -> list[Table]:
+    """Where a backend that associates pixels and voxels in another way leaves the base one's map."""
+    if not result.compared:
+        return []
+    titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
+    columns = (
+        Column("scene", "Scene"),
+        Column("backbone", "Backbone"),
+        Column("first_only_percent", "in the first only (%)", 1, over="Voxels"),
+        Column("other_only_percent", "in the other only (%)", 1, over="Voxels"),
+        Column("relabelled_percent", "Other label (%)", 2),
+        *(Column(f"mean_{name}", header, 4, over="Mean difference") for name, header in titles.items()),
+    )
+    pairs = dict.fromkeys(row.backends for row in result.compared)
+    groups = tuple(
+        Group(" and ".join(pair), tuple(_compared_row(row, titles) for row in result.compared if row.backends == pair))
+        for pair in pairs
+    )
+    caption = (
+        "The same frames through code that associates pixels and voxels in another way, and need not agree. Labels and"
+        " differences, which have no sign, are of the voxels that both maps have."
+    )
+    return [Table("fusion_compared", "Where fusion implementations differ", caption, columns, groups, "backends")]
+
+
+def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
+    shares = (100 * only / max(1, n) for only, n in zip(row.only_in, row.voxels, strict=True))
+    means = (row.differences[name].mean for name in names)
+    return row.scene, row.backbone, *shares, 100 * row.differences["label"].mean, *means
+
+
+def agreement(result: Result) -> list[Table]:
+    """How far each backend's map agrees with the base one's, voxel by voxel."""
+    if not result.agreement:
+        return []
+    titles = {"op": "OP", **{measure.key: measure.title for measure in measures()}, "evidence": "Evidence"}
+    columns = (
+        Column("scene", "Scene"),
+        Column("backbone", "Backbone"),
+        Column("only_in_one", "Voxels in one only", 0),
+        *(Column(f"max_{name}", header, 0, scientific=True, over=LARGEST) for name, header in titles.items()),
+        Column("verdict", "Verdict"),
+    )
+    pairs = dict.fromkeys(row.backends for row in result.agreement)
+    rows = [(row.backends, _backend_agreement_row(row, titles)) for row in result.agreement]
+    groups = tuple(Group(" and ".join(pair), tuple(row for of, row in rows if of == pair)) for pair in pairs)
+    caption = "The same frames through two backends: the largest difference of any voxel that both maps have."
+    if one_in := {row.one_in for row in result.agreement} - {1}:
+        caption += f" Against the numpy reference one voxel in {max(one_in)} was compared, drawn at random."
+    return [Table("agreement", "Agreement of the fusion implementations", caption, columns, groups, "backends")]
+
+
+def _backend_agreement_row(row: Agreement, names: Iterable[str]) -> Row:
+    largest = (row.differences[name].max for name in names)
+    return row.scene, row.backbone, sum(row.only_in), *largest, "agree" if row.agrees else "disagree"
+
+
+def _group(result: Result, backbone: str) -> Group | None:
+    others = result.select(BACKENDS, backbone=backbone)
+    by_backend: dict[str, dict[str, Record]] = {}
+    for record in (*result.select(backbone=backbone), *others):
+        by_backend.setdefault(record.unit.backend, {})[record.unit.scene] = record
+    scenes = set.intersection(*(set(rows) for rows in by_backend.values()))
+    if not others or not scenes:
+        return None
+    found = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
+    base = found[result.backend]
+    return Group(backbone, tuple(_backend_row(name, mean, base) for name, mean in found.items()))
+
+
+def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
+    return (
+        backend,
+        mean.voxels,
+        mean.mean_op,
+        *mean.every.means.of_all(),
+        100 * mean.recurrent.share,
+        mean.fuse_ms_per_frame,
+        mean.voxels - base.voxels,
+        mean.mean_op - base.mean_op,
+        *(mean.every[measure] - base.every[measure] for measure in measures()),
+    )

@@ -1,0 +1,307 @@
+"""What the statistics say of each map: agreement, drift, where uncertainty comes from, the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+from semstab.metrics import macro_mean
+from semstab.model.measures import ENTROPY, VSS
+from semstab.model.records import Record, Result
+from semstab.model.statistics import UNDEFINED, DriftStatistics, DriftTests, Estimate, MapStatistics, Reach
+from semstab.report.averages import by_backbone
+from semstab.report.tables.table import Cell, Column, Group, Row, Table
+from semstab.statistics.agreement import ALPHA, KAPPA, PSA
+from semstab.statistics.order.drift import FLIP_RATE
+from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.verdict import ADVICE
+
+SCENE = Column("scene", "Scene")
+REPEATED = Column("repeated_voxels", "Voxels", 0)
+INTERVALS = (
+    "In brackets: intervals at 95% for this map; those of verdicts for the next flight"
+    f" if {LEAST_FRAMES} frames tell of it."
+)
+SEEN_TWICE = "Over the voxels seen twice or more."
+
+T = TypeVar("T")
+Number = Callable[[MapStatistics], float | Estimate]
+
+
+def temporal_agreement(result: Result) -> list[Table]:
+    """Do frames agree about a place? Measures that random thinning of the frames does not change."""
+    columns = (
+        REPEATED,
+        *map(Column.of, (VSS, PSA, KAPPA, ALPHA)),
+        Column("within", "within a frame", 3, "lower", over="Disagreement"),
+        Column("between", "between frames", 3, "lower", over="Disagreement"),
+        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
+        Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
+        Column.of(FLIP_RATE),
+    )
+    numbers: tuple[Number, ...] = (
+        lambda found: found.repeated.voxels,
+        lambda found: found.agreement.vss.value,
+        lambda found: found.agreement.psa,
+        lambda found: found.agreement.kappa.value,
+        lambda found: found.agreement.alpha,
+        lambda found: found.agreement.within.value,
+        lambda found: found.agreement.between.value,
+        lambda found: found.agreement.alpha_between.value,
+        reached(lambda reach: reach.ceiling.value),
+        reached(lambda reach: reach.reached.percent),
+        lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
+    )
+    caption = (
+        f"{SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel; kappa (Fleiss) and alpha (Krippendorff):"
+        " the same beyond chance, 1 perfect, 0 chance; disagreement: the parts of 1 - PSA within a frame and between"
+        " frames; alpha between frames: of the latter alone, beside its ceiling, that of labels which do not depend on"
+        " the view (in sampled voxels); flip rate: share of the steps from one observation to the next"
+        f" at which the predicted class changes. {INTERVALS}"
+    )
+    return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
+
+
+def class_agreement(result: Result) -> list[Table]:
+    """Alpha of each class against all others, beside its ceiling; macro means over scenes."""
+    judged = judged_records(result)
+    groups = tuple(Group(name, _class_rows([found for _, found in rows])) for name, rows in judged.items())
+    if not any(group.rows for group in groups):
+        return []
+    columns = (
+        Column("observations", "Observations", 0),
+        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
+        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
+        Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
+        Column("matters", "Matters"),
+        *map(Column.of, (KAPPA, ALPHA)),
+    )
+    cells = [row[1:] for group in groups for row in group.rows]
+    known = [k for k in range(len(columns)) if any(_says(row[k]) for row in cells)]
+    kept = tuple(
+        Group(group.name, tuple((row[0], *(row[1 + k] for k in known)) for row in group.rows)) for group in groups
+    )
+    caption = (
+        f"{SEEN_TWICE} Each class against all others; observations are the evidence for it, in frames, of all scenes."
+        " Alpha between frames, its ceiling, and the share of it that is reached: in sampled voxels. Matters: the"
+        f" verdict depends on it. Classes that no frame saw there are left out. Macro means: each scene counts once."
+        f" {INTERVALS}"
+    )
+    title = "Agreement of the frames, by class"
+    return [Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), kept)]
+
+
+def drift(result: Result) -> list[Table]:
+    """SBD beside what a random order of the same observations gives, and the drift in one direction."""
+    columns = (
+        Column("voxels", "Voxels", 0),
+        Column("sbd", "as seen", 4, over="SBD (bits)"),
+        Column("sbd_null", "random order", 4, over="SBD (bits)"),
+        Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
+        Column("sbd_p", "p", 3, over="SBD (bits)"),
+        Column("trend", "one way", 3, over="Trend"),
+        Column("trend_null", "random order", 3, over="Trend"),
+        Column("trend_p", "p", 3, over="Trend"),
+        Column("trending_voxels", "trending", 0, over="Voxels"),
+        Column("tested_voxels", "tested", 0, over="Voxels"),
+    )
+    numbers: tuple[Number, ...] = (
+        ordered(lambda drift: drift.voxels),
+        ordered(lambda drift: drift.sbd.value),
+        ordered(lambda drift: drift.null.value),
+        ordered(lambda drift: drift.excess),
+        tested(lambda tests: tests.sbd_p),
+        tested(lambda tests: tests.trend),
+        tested(lambda tests: tests.trend_null),
+        tested(lambda tests: tests.trend_p),
+        tested(lambda tests: tests.trending_voxels),
+        tested(lambda tests: tests.tested_voxels),
+    )
+    logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())
+    one_class = f"{SEEN_TWICE[:-1]}, where each frame says one class; --statistics adds the others, and tests of trend."
+    seen = SEEN_TWICE if logged else one_class
+    tests = (
+        " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
+        " stretches of time; none where errors may last too long for six of them. Trending: voxels whose own trend is"
+        " significant at a false discovery rate of 5%, of those seen six times or more."
+    )
+    caption = (
+        f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
+        f"{tests if logged else ''} {INTERVALS}"
+    )
+    return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
+
+
+def uncertainty(result: Result) -> list[Table]:
+    """The entropy of the belief, within frames and between them."""
+    columns = (
+        Column.of(ENTROPY),
+        Column("within", "within frames", 4, "lower"),
+        Column("between", "between frames", 4, "lower"),
+        Column("within_percent", "within (%)", 0),
+    )
+
+    def share(found: MapStatistics) -> float:
+        entropy = found.uncertainty.entropy.value
+        return 100 * found.uncertainty.within.value / entropy if entropy else math.nan
+
+    numbers: tuple[Number, ...] = (
+        lambda found: found.uncertainty.entropy,
+        lambda found: found.uncertainty.within,
+        lambda found: found.uncertainty.between,
+        share,
+    )
+    caption = (
+        f"{SEEN_TWICE} Entropy of the belief in units of log K, as the sum of what is there within each frame (borders,"
+        f" voxels larger than things, unsure scores) and of the frames' disagreement. {INTERVALS}"
+    )
+    return by_scene(result, "uncertainty", "Where the uncertainty comes from", caption, columns, numbers)
+
+
+def verdicts(result: Result) -> list[Table]:
+    """What the evidence says of each backbone on each scene, and what to do."""
+    judged = judged_records(result)
+    if not judged:
+        return []
+    columns = (
+        SCENE,
+        Column("verdict", "Verdict"),
+        Column("reached_percent", "Reached (%)", 0, "higher"),
+        Column("worst_class", "Worst class"),
+        Column("worst_percent", "reached (%)", 0, "higher"),
+        Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
+        REPEATED,
+        Column("repeated_percent", "of the map (%)", 0),
+        Column("advice", "What to do"),
+    )
+    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
+    caption = (
+        f"{SEEN_TWICE} Reached: alpha between frames, in percent of its ceiling. Decided by the intervals: stable where"
+        " it is at least 80 and no class that matters below 67, usable from 67, unstable below;"
+        " misleading where more than 5% of the stable places are wrong, which only ground truth tells."
+        f" {INTERVALS}"
+    )
+    return [Table("verdicts", "Verdicts", caption, columns, groups)]
+
+
+# --- Parts ------------------------------------------------------------------------------------------------------------
+
+
+def by_scene(
+    result: Result, name: str, title: str, caption: str, columns: Sequence[Column], numbers: Sequence[Number]
+) -> list[Table]:
+    """One row a scene, and the macro mean of several; columns and units that have no number are left out."""
+    cells = {
+        backbone: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
+        for backbone, rows in judged_records(result).items()
+    }
+    cells = {backbone: {scene: row for scene, row in rows.items() if _known(row)} for backbone, rows in cells.items()}
+    known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
+    if not known:
+        return []
+
+    def row(scene: str, of: Sequence[float | Estimate]) -> Row:
+        return scene, *(of[k] for k in known)
+
+    groups = tuple(
+        Group(
+            backbone,
+            tuple(row(scene, own) for scene, own in rows.items()),
+            row("Mean", _means(list(rows.values()))) if len(rows) > 1 else None,
+        )
+        for backbone, rows in cells.items()
+        if rows
+    )
+    return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
+
+
+def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
+    """The base units that have statistics, with these, by backbone."""
+    judged = {
+        backbone: [(record, record.statistics) for record in records if record.statistics is not None]
+        for backbone, records in by_backbone(result.select()).items()
+    }
+    return {backbone: rows for backbone, rows in judged.items() if rows}
+
+
+def tested(take: Callable[[DriftTests], float]) -> Number:
+    """A number of the drift's tests; NaN where there are none."""
+    return lambda found: math.nan if found.drift.tests is None else take(found.drift.tests)
+
+
+def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
+    """A number of drift beside random order; NaN where too few places tell what that gives."""
+    return lambda found: take(found.drift) if found.order_known else math.nan
+
+
+def reached(take: Callable[[Reach], float | Estimate]) -> Number:
+    """A number of the ceiling; NaN where it is not known."""
+    return lambda found: math.nan if found.reach is None else take(found.reach)
+
+
+def _value(found: float | Estimate) -> float:
+    return found.value if isinstance(found, Estimate) else found
+
+
+def _says(cell: Cell) -> bool:
+    value = cell.value if isinstance(cell, Estimate) else cell
+    return value != "" and not (isinstance(value, float) and math.isnan(value))
+
+
+def _known(row: Sequence[float | Estimate]) -> list[int]:
+    """Which of the numbers are defined."""
+    return [k for k, cell in enumerate(row) if not math.isnan(_value(cell))]
+
+
+def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
+    """The macro mean of each column."""
+    return [macro_mean([_value(cell) for cell in column]) for column in zip(*rows, strict=True)]
+
+
+def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
+    """The rows of several units by their name, in order of appearance."""
+    found: dict[str, list[T]] = {}
+    for row in rows:
+        found.setdefault(name(row), []).append(row)
+    return found
+
+
+def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
+    by_name = grouped((row for found in judged for row in found.agreement.classes), lambda row: row.name)
+    reached = grouped((row for found in judged if found.reach for row in found.reach.classes), lambda row: row.name)
+    return tuple(
+        (
+            name,
+            sum(row.observations for row in rows),
+            macro_mean([row.alpha for row in reached.get(name, [])]),
+            macro_mean([row.ceiling for row in reached.get(name, [])]),
+            _one_or_mean([row.reached.percent for row in reached.get(name, [])]),
+            "yes" if any(row.matters for row in reached.get(name, [])) else "",
+            macro_mean([row.kappa for row in rows]),
+            macro_mean([row.alpha for row in rows]),
+        )
+        for name, rows in by_name.items()
+        if any(row.observations for row in rows)
+    )
+
+
+def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
+    """The one, with its interval; of several scenes the macro mean, which has none."""
+    return values[0] if len(values) == 1 else macro_mean([found.value for found in values])
+
+
+def _verdict_row(record: Record, found: MapStatistics) -> Row:
+    right, worst = found.correctness, None if found.reach is None else found.reach.worst
+    return (
+        record.unit.scene,
+        found.verdict.level,
+        UNDEFINED if found.reach is None else found.reach.reached.percent,
+        "" if worst is None else worst.name,
+        UNDEFINED if worst is None else worst.reached.percent,
+        UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
+        found.repeated.voxels,
+        100 * found.repeated.share,
+        ADVICE[found.verdict.level],
+    )

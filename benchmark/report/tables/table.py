@@ -1,0 +1,282 @@
+"""A table apart from its format: columns that know how their numbers are printed, and rows in groups."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import itertools
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from semstab.core.files import csv_text
+from semstab.model.measures import Quantity
+from semstab.report.averages import Spread
+from semstab.statistics import Estimate
+
+UNDEFINED = "--"
+"""What stands in print where a number is undefined; in JSON it is null, in CSV an empty field."""
+
+Cell = str | int | float | Spread | Estimate
+Row = tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its key in CSV and JSON, its header in print, the decimals of its numbers (None: text).
+
+    better      which way is good
+    signed      a positive number has its sign as well
+    scientific  in powers of ten: '2e-16'
+    over        the heading that it shares with its neighbours
+    """
+
+    key: str
+    header: str
+    digits: int | None = None
+    better: Literal["", "higher", "lower"] = ""
+    signed: bool = False
+    scientific: bool = False
+    over: str = ""
+
+    @classmethod
+    def of(cls, quantity: Quantity, *, compared: bool = False, prefix: str = "", over: str = "") -> Column:
+        """Of a measure: with the decimals of a summary, or of a comparison."""
+        digits = quantity.digits[compared]
+        return cls(prefix + quantity.key, quantity.title, digits, quantity.better, over=over)
+
+    def number(self, value: float) -> str:
+        """The rounded number; UNDEFINED where there is none."""
+        if math.isnan(value):
+            return UNDEFINED
+        if self.scientific and value:
+            return f"{value:.{self.digits}e}"
+        rounded = round(value, self.digits) + 0.0  # -0.0 + 0.0 is 0.0
+        return f"{rounded:{'+' if self.signed and rounded else ''},.{self.digits}f}"
+
+    def text(self, cell: Cell) -> str:
+        """The cell in print: 'road', '286,565', '0.957', '0.957 ± 0.002' over repeats, '0.957 (0.951, 0.962)'."""
+        if isinstance(cell, str):
+            return cell
+        if isinstance(cell, Estimate):
+            ends = "" if math.isnan(cell.low) else f" ({self.number(cell.low)}, {self.number(cell.high)})"
+            return self.number(cell.value) + ends
+        if not isinstance(cell, Spread):
+            return self.number(cell)
+        spread = "" if math.isnan(cell.sd) else f" ± {cell.sd:,.{self.digits}f}"
+        return self.number(cell.mean) + spread
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows that belong together under a name, with a last row that sums them up, where there is one."""
+
+    name: str
+    rows: tuple[Row, ...]
+    total: Row | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the study.
+
+    name     of its files
+    caption  what the numbers are, and over what the means run
+    by       what the groups are ('backbone'), the leading column of CSV and JSON; '' for one group without a name
+    """
+
+    name: str
+    title: str
+    caption: str
+    columns: tuple[Column, ...]
+    groups: tuple[Group, ...]
+    by: str = "backbone"
+
+    def rows(self) -> Iterator[tuple[str, Row]]:
+        """Each row, totals too, with the name of its group."""
+        for group in self.groups:
+            for row in (*group.rows, *([group.total] if group.total else [])):
+                yield group.name, row
+
+
+# One writer a format: a table as CSV, Markdown, LaTeX (booktabs) and JSON.
+
+ARROWS = {"higher": "↑", "lower": "↓", "": ""}
+LATEX_WIDTHS = (
+    (53, "table", r"\small"),
+    (60, "table", r"\footnotesize"),
+    (112, "table*", r"\small"),
+    (122, "table*", r"\footnotesize"),
+)
+"""How many characters fit into one column of the page, or into both; a wider table is scaled to both (graphicx)."""
+
+
+def to_csv(table: Table) -> str:
+    """Comma-separated, rounded, without thousands separators; an undefined number is an empty field."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    parts = [_csv_parts([row[k] for _, row in table.rows()]) for k in range(len(table.columns))]
+    keys = [[f"{column.key}{part}" for part in own] for column, own in zip(table.columns, parts, strict=True)]
+    writer.writerow([*_leading(table, table.by), *itertools.chain(*keys)])
+    for group, row in table.rows():
+        cells = (_csv_cells(column, cell, own) for column, cell, own in zip(table.columns, row, parts, strict=True))
+        writer.writerow([*_leading(table, group), *itertools.chain(*cells)])
+    return text.getvalue()
+
+
+def to_markdown(table: Table) -> str:
+    """A GitHub table under its title, the caption beneath."""
+    headers = [_markdown(" ".join(filter(None, (c.over, c.header, ARROWS[c.better])))) for c in table.columns]
+    rule = ["---" if column.digits is None else "---:" for column in table.columns]
+    lines = [f"### {_markdown(table.title)}", "", _pipes(headers), _pipes(rule)]
+    for heading, rows in sections(table):
+        if heading:
+            lines.append(_pipes([f"**{_markdown(heading)}**", *[""] * (len(table.columns) - 1)]))
+        lines += [_pipes([_markdown(cell) for cell in row]) for row in rows]
+    return "\n".join([*lines, "", _markdown(table.caption), ""])
+
+
+def to_latex(table: Table) -> str:
+    """A float with booktabs rules (needs the package booktabs), laid out as the paper's tables."""
+    width = _width(table)
+    fitting = [kind[1:] for kind in LATEX_WIDTHS if width <= kind[0]]
+    environment, size = fitting[0] if fitting else ("table*", r"\footnotesize")
+    left, right = ("", "") if fitting else (r"\resizebox{\textwidth}{!}{", "}")
+    blocks = []
+    for heading, rows in sections(table):
+        title = [rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\emph{{{_latex(heading)}}}}} \\"] if heading else []
+        blocks.append("\n".join([*title, *(" & ".join(_latex(cell) for cell in row) + r" \\" for row in rows)]))
+    return "\n".join(
+        [
+            rf"\begin{{{environment}}}[t]",
+            r"\centering",
+            rf"\caption{{{_latex(_sentence(table.title))} {_latex(table.caption)}}}",
+            rf"\label{{tab:{table.name}}}",
+            size,
+            r"\setlength{\tabcolsep}{4pt}",
+            left
+            + rf"\begin{{tabular}}{{{''.join('l' if column.digits is None else 'r' for column in table.columns)}}}",
+            r"\toprule",
+            *_latex_headers(table),
+            r"\midrule",
+            "\n\\midrule\n".join(blocks),
+            r"\bottomrule",
+            r"\end{tabular}" + right,
+            rf"\end{{{environment}}}",
+            "",
+        ]
+    )
+
+
+def to_json(table: Table) -> dict[str, Any]:
+    """The JSON object, in full precision: {mean, sd, repeats} over repeats, {value, low, high} with an interval."""
+    return {
+        "name": table.name,
+        "title": table.title,
+        "caption": table.caption,
+        "rows": [
+            ({table.by: group} if table.by else {})
+            | {column.key: _json_cell(cell) for column, cell in zip(table.columns, row, strict=True)}
+            for group, row in table.rows()
+        ],
+    }
+
+
+def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
+    """What lies between two rules: the rows of a group under its name, then its total; one group needs no heading."""
+
+    def cells(row: tuple[Cell, ...]) -> list[str]:
+        return [column.text(cell) for column, cell in zip(table.columns, row, strict=True)]
+
+    for group in table.groups:
+        yield group.name if len(table.groups) > 1 else "", [cells(row) for row in group.rows]
+        if group.total is not None:
+            yield "", [cells(group.total)]
+
+
+def _json_cell(cell: Cell) -> Any:
+    return dataclasses.asdict(cell) if isinstance(cell, Spread | Estimate) else cell
+
+
+def _leading(table: Table, cell: str) -> list[str]:
+    """The leading column, where the groups have names."""
+    return [csv_text(cell)] if table.by else []
+
+
+def _csv_parts(cells: Sequence[Cell]) -> list[str]:
+    """The fields of a column: beside its own that of the standard deviation over repeats, or those of the interval."""
+    if any(isinstance(cell, Spread) for cell in cells):
+        return ["", "_sd"]
+    return ["", "_low", "_high"] if any(isinstance(cell, Estimate) for cell in cells) else [""]
+
+
+def _csv_cells(column: Column, cell: Cell, parts: Sequence[str]) -> list[str]:
+    if isinstance(cell, str):
+        return [csv_text(cell), *[""] * (len(parts) - 1)]
+    if isinstance(cell, Estimate):
+        values = [cell.value, cell.low, cell.high]
+    else:
+        values = [cell.mean, cell.sd] if isinstance(cell, Spread) else [cell, math.nan, math.nan]
+    return ["" if math.isnan(value) else column.number(value).replace(",", "") for value in values[: len(parts)]]
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith(".") else f"{text}."
+
+
+def _pipes(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _markdown(text: str) -> str:
+    """Text that Markdown shows as it is."""
+    text = re.sub(r"([\\`*_\[\]|#~])", r"\\\1", relations(" ".join(text.split())))
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def relations(text: str) -> str:
+    """Text with the signs for 'at most' and 'at least', where a format has them."""
+    return text.replace("<=", "≤").replace(">=", "≥")
+
+
+def _width(table: Table) -> int:
+    """Characters of the widest line, two for the space between columns."""
+    cells = [
+        [column.header, *(column.text(row[k]) for _, row in table.rows())] for k, column in enumerate(table.columns)
+    ]
+    return sum(2 + max(map(len, column)) for column in cells)
+
+
+def _latex_headers(table: Table) -> list[str]:
+    """The headers, under a line of those that columns share, where there are any."""
+    headers = " & ".join(_latex(f"{column.header} {ARROWS[column.better]}") for column in table.columns) + r" \\"
+    if not any(column.over for column in table.columns):
+        return [headers]
+    shared, rules, first = [], [], 1
+    for over, columns in itertools.groupby(table.columns, lambda column: column.over):
+        width = len(list(columns))
+        shared.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex(over)}}}")
+        rules += [rf"\cmidrule(lr){{{first}-{first + width - 1}}}"] if over else []
+        first += width
+    return [" & ".join(shared) + r" \\", " ".join(rules), headers]
+
+
+_LATEX = {
+    "\N{MINUS SIGN}": "$-$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_",
+    "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": "$<$", ">": "$>$", "≤": r"$\leq$", "≥": r"$\geq$",
+    "±": r"$\pm$", "√": r"$\surd$", "°": r"$^\circ$", "Δ": r"$\Delta$", "·": r"$\cdot$", '"': "''", "|": r"$|$",
+}  # fmt: skip
+
+
+def _latex(text: str) -> str:
+    """Text that LaTeX shows as it is; the hyphen that leads a number is a minus sign, and ± stands close."""
+    text = re.sub(r"(?<=\d) ± (?=\d)", "±", relations(" ".join(text.split())))
+    text = re.sub(r"(^|(?<=\d )\(|, )-(?=\d)", "\\1\N{MINUS SIGN}", text)
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+TEXT_WRITERS: dict[str, Callable[[Table], str]] = {"csv": to_csv, "md": to_markdown, "tex": to_latex}

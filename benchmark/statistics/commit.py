@@ -1,0 +1,241 @@
+"""When may a map's label be acted on? For each class the least evidence at which labels are right often enough."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from semstab.config import read_yaml, validated
+from semstab.core.files import write_text
+from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.errors import ConfigError, DataError
+from semstab.model.measures import Beliefs, dominant, margin, vss
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.agreement import ratio_of
+from semstab.statistics.correctness import Truth
+from semstab.statistics.sampling.cubes import cubes
+from semstab.statistics.sampling.intervals import of_places
+
+Evidence = Literal["op", "belief", "margin"]
+
+SCHEMA = 1
+EVIDENCE: Mapping[Evidence, Callable[[Beliefs], npt.NDArray[np.generic]]] = {
+    "op": lambda table: table.op,
+    "belief": vss,
+    "margin": margin,
+}
+"""What may be asked for: frames that saw the voxel, the dominant class' share of the belief, its lead over the next."""
+
+STEPS = 8
+"""Thresholds that are tried of each, at equal shares of a class' voxels."""
+
+FEW_CUBES = 3
+"""In no more cubes with an error it is not seen how far errors reach."""
+
+NEVER = -1
+"""Instead of a class: the label is not acted on."""
+
+
+class Threshold(BaseModel):
+    """From where on the labels of a class are acted on, and what the calibration showed of them.
+
+    by, at_least  the evidence that is asked for
+    never         that no threshold is shown to reach the precision: labels are not acted on; the rest is of the best
+    precision, low  share of such labels that are right, and the lower end of its one-sided interval
+    voxels, left    labels of the class with a known truth that were counted; share of all its labels that is left
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    by: Evidence = "op"
+    at_least: float = 0.0
+    never: bool = False
+    precision: float = 0.0
+    low: float = 0.0
+    voxels: int = 0
+    left: float = 0.0
+
+
+class Commit(BaseModel):
+    """Which labels of a map may be acted on, as a YAML file keeps it.
+
+    precision, confidence  labels of a class that are acted on are right with at least this probability; that a class'
+                           threshold promises too much has at most the probability 1 - confidence
+    left                   share of the calibration's voxels whose label is acted on
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_: int = Field(SCHEMA, alias="schema")
+    precision: float = Field(gt=0, lt=1)
+    confidence: float = Field(gt=0, lt=1)
+    voxel_size: float = Field(gt=0)
+    calibrated_on: str = ""
+    left: float = 0.0
+    classes: dict[str, Threshold]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Commit:
+        """Read what `save` wrote. Raises ConfigError, which names the file and the setting."""
+        found = validated(cls, read_yaml(path), f"{path}: ")
+        if found.schema_ != SCHEMA:
+            raise ConfigError(f"{path}: schema {found.schema_}, this version reads {SCHEMA}; calibrate again")
+        return found
+
+    def save(self, path: str | Path) -> None:
+        """Write YAML, atomically."""
+        content = self.model_dump(by_alias=True)
+        write_text(Path(path), yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+    def decide(self, table: VoxelTable) -> Int64:
+        """(n,) the class of each voxel whose label may be acted on, by its row in the table's classes; -1 elsewhere.
+
+        Raises DataError for a map of other classes, or voxels of another size.
+        """
+        self.require(table)
+        label = dominant(table).astype(np.int64)
+        least = np.full((len(EVIDENCE), table.K), np.inf)
+        for k, name in enumerate(table.classes):
+            chosen = self.classes[name]
+            if not chosen.never:
+                least[list(EVIDENCE).index(chosen.by), k] = chosen.at_least
+        enough = np.zeros(len(table), np.bool_)
+        for of, at_least in zip(EVIDENCE.values(), least, strict=True):
+            enough |= np.asarray(of(table)) >= at_least[label]
+        return np.where(enough, label, NEVER)
+
+    def require(self, table: VoxelTable) -> None:
+        """Raise DataError where a map is not of the kind that was calibrated."""
+        if not table.classes or set(table.classes) != set(self.classes):
+            raise DataError(
+                f"thresholds of the classes {_few(self.classes)}, a map of {_few(table.classes)}; calibrate on a run"
+                " with its taxonomy"
+            )
+        if not math.isclose(table.voxel_size, self.voxel_size, rel_tol=1e-6):
+            raise DataError(
+                f"thresholds of voxels of {self.voxel_size:g} m, a map of {table.voxel_size:g} m; calibrate on a run"
+                f" with --voxel-size {table.voxel_size:g}"
+            )
+
+
+def calibrate(
+    maps: Sequence[tuple[VoxelTable, Truth]], *, precision: float = 0.95, confidence: float = 0.95, on: str = ""
+) -> Commit:
+    """For each class the evidence, of OP, belief and margin, that leaves most labels, each right with that precision.
+
+    maps  of scenes with the same classes and voxel size, with the true class of their voxels; they err by themselves
+
+    STEPS thresholds of each evidence are tried. One is taken where the lower end of the share of right labels is at
+    least the precision, at the error 1 - confidence divided by all that are tried (Bonferroni; as in Angelopoulos et
+    al. 2021, Learn then Test). The end is Clopper and Pearson's, for as many labels as these are worth (Korn and
+    Graubard 1998): the variance is that of cubes of space, with errors that reach as far as the data show. Where errors
+    are too few for that, cubes are counted instead of labels.
+    """
+    tables = [table for table, _ in maps]
+    if not 0 < precision < 1 or not 0.5 <= confidence < 1:
+        raise ConfigError(f"precision {precision:g}, confidence {confidence:g}: both lie between 0 and 1, from 0.5 on")
+    index = np.concatenate([table.index + np.array([i << 20, 0, 0]) for i, table in enumerate(tables)]).astype(np.int32)
+    label = np.concatenate([dominant(table) for table in tables])
+    true = np.concatenate([truth.label for _, truth in maps])
+    size, names = tables[0].voxel_size, tables[0].classes
+    values = {by: np.concatenate([np.asarray(of(table), float) for table in tables]) for by, of in EVIDENCE.items()}
+    found = {}
+    for k, name in enumerate(names):
+        rows = np.flatnonzero((label == k) & (true >= 0))
+        own = {by: value[rows] for by, value in values.items()}
+        sample = _Labels(index[rows], true[rows] == k, own, size)
+        found[name] = sample.least(precision, 1 - confidence)
+    every = Commit(
+        schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=found
+    )
+    decided = [every.decide(table) for table in tables]
+    left = float((np.concatenate(decided) >= 0).mean())
+    of_class = {
+        name: float((np.concatenate(decided) == k).sum() / max((label == k).sum(), 1)) for k, name in enumerate(names)
+    }
+    classes = {name: each.model_copy(update={"left": of_class[name]}) for name, each in found.items()}
+    return every.model_copy(update={"left": left, "classes": classes})
+
+
+class _Labels:
+    """The labels of one class: where they are (n, 3), whether right (n,), and their evidence (n,) of each kind."""
+
+    def __init__(
+        self,
+        index: Int32,
+        right: Mask,
+        evidence: Mapping[Evidence, Float64],
+        size: float,
+    ) -> None:
+        self._right, self._evidence = right, evidence
+        if len(index):
+            self._cell, self._of, self._edge = cubes((index[:, 0], index[:, 1], index[:, 2]), size)
+
+    def least(self, precision: float, error: float) -> Threshold:
+        """The threshold that leaves most of them."""
+        tried, kept = self._tried()
+        best = Threshold(never=True)
+        for by, at in sorted(tried, key=lambda pair: -kept[pair]):
+            share, low = self._share(by, at, error / len(tried))
+            found = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=kept[by, at])
+            if low >= precision:
+                return found
+            best = max(best, found, key=lambda each: each.low)
+        return best
+
+    def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
+        """Thresholds that leave different labels, and how many each leaves."""
+        tried: dict[bytes, tuple[Evidence, float]] = {}
+        kept = {}
+        for by in self._evidence:
+            for at in self._steps(by):
+                some = self._evidence[by] >= at
+                kept[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
+        return list(tried.values()), kept
+
+    def _steps(self, by: Evidence) -> list[float]:
+        """Thresholds that are tried, chosen without a look at what is right."""
+        if not len(self._right):
+            return []
+        quantiles = np.quantile(self._evidence[by], np.arange(STEPS) / STEPS, method="lower")
+        return [float(at) for at in np.unique(quantiles)]
+
+    def _share(self, by: Evidence, at: float, error: float) -> tuple[float, float]:
+        """The share of those with so much evidence that is right, and its lower end."""
+        some = self._evidence[by] >= at
+        of, cells = self._of[some], len(self._cell)
+        right, every = self._right[some].astype(np.float64), np.ones(len(of))
+        sums: Float64 = np.stack(
+            [np.bincount(of, weights=each, minlength=cells) for each in (right, every)], axis=1
+        ).astype(float)
+        sums = sums[sums[:, 1] > 0]
+        if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
+            return _of_few(sums, error)
+        found = of_places(self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error)
+        return found.value, found.low if found.decided else 0.0
+
+
+def _of_few(sums: Float64, error: float) -> tuple[float, float]:
+    """The share that is right and its lower end, where too few cubes (m, 2) hold an error to tell how far these reach.
+
+    Cubes, of one size, count as right or wrong as a whole (Clopper and Pearson 1934).
+    """
+    from scipy import special
+
+    right, size = sums.sum(axis=0)
+    cubes = size**2 / float((sums[:, 1] ** 2).sum())
+    wrong = max(np.count_nonzero(sums[:, 0] < sums[:, 1]), cubes * (1 - right / size))
+    low = float(special.betaincinv(cubes - wrong, wrong + 1, error)) if cubes > wrong else 0.0
+    return float(right / size), low
+
+
+def _few(names: Sequence[str] | Mapping[str, Threshold]) -> str:
+    listed = list(names)
+    return ", ".join(listed[:4]) + (", ..." if len(listed) > 4 else "") if listed else "no names"

@@ -1,0 +1,333 @@
+"""Label maps and scores of a scene wherever they stand: which sources there are, and the file of each frame."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from semstab.core.types import UInt8, UInt16
+from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.options import FileOptions, Folders, Template, inside_text, matching_folders
+from semstab.datasets.formats.images import (
+    LABEL_SUFFIXES,
+    MASK_SUFFIXES,
+    SCORE_SUFFIXES,
+    Read,
+    Size,
+    read_labels,
+    read_mask,
+    read_scores,
+)
+from semstab.datasets.geometry.lenses import Labels, Scores
+from semstab.datasets.scene import GROUND_TRUTH, listed, nearest
+from semstab.errors import ConfigError, DataError
+from semstab.model.labels import IGNORE_16BIT, LabelSpace, ignore_id
+
+logger = logging.getLogger("semstab")
+
+Kind = Literal["labels", "scores", "masks"]
+KINDS: tuple[Kind, ...] = ("labels", "scores")
+SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES, "masks": MASK_SUFFIXES}
+DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
+REGIONS = "regions/{backbone}/{name}"
+LABEL_SPACE_FILE = "label_space.yaml"
+"""In a folder of label maps or scores: their classes, where they are not the scene's; a taxonomy file."""
+
+SEPARATE = "{scene}/{backbone}/{name}"
+"""The template of label maps in a folder of their own."""
+
+
+@dataclass(frozen=True)
+class LabelSource:
+    """One label source of a scene: where a frame's file would be.
+
+    folders  what lies there
+    first    the first frame that has a file, and the file; None where none has
+    """
+
+    kind: Kind
+    base: Path
+    template: str
+    folders: Folders
+    first: tuple[str, str] | None = None
+
+    def file(self, frame: FrameSource) -> str | None:
+        """The file of a frame; as text, for a path takes longer to make than to look up."""
+        where = str(self.base)
+        paths = (inside_text(self.base, self.template.replace("{name}", name), where) for name in frame.called)
+        return next(
+            (file for path in paths if (file := self.folders.file(path, SUFFIXES[self.kind])) is not None), None
+        )
+
+    def missing(self, frame: FrameSource) -> list[str]:
+        """Nothing, or the path that the file of that frame would have."""
+        if self.file(frame) is not None:
+            return []
+        path = self.base / self.template.replace("{name}", frame.name)
+        return [str(path if path.suffix.lower() in SUFFIXES[self.kind] else f"{path}{SUFFIXES[self.kind][0]}")]
+
+
+@dataclass(frozen=True)
+class ScenePlace:
+    """A scene's name, its folder, and its path below root, which {scene} in templates stands for."""
+
+    name: str
+    folder: Path
+    below_root: str
+
+
+def find_sources(
+    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders
+) -> dict[str, LabelSource]:
+    """The label sources of a scene with these frames; `gt` is the ground truth.
+
+    labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
+    else is there. A folder without a file of any frame is left out with a warning.
+    Raises ConfigError for a template that cannot be used, or a labels_root that is not there, DataError for a folder
+    that cannot be listed.
+    """
+    found: dict[str, LabelSource] = {}
+    base = place.folder if options.labels_root is None else options.labels_root
+    if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
+        raise ConfigError(f"{base}: there is no such folder; mend labels_root")
+    for kind in KINDS:
+        for backbone, template in _templates(kind, options, place, base).items():
+            source = _source(kind, base, template, frames, folders)
+            name = f"{backbone}-scores" if kind == "scores" and not isinstance(options.scores, dict) else backbone
+            if name in found:
+                raise ConfigError(f"{place.folder}: two label sources are called '{name}'; rename one")
+            if source.first is not None:
+                found[name] = source
+            elif frames:
+                logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
+    if not found and (options.labels or options.scores or options.labels_root):
+        logger.warning(
+            "%s: no label maps in %s fit the options labels and scores; looked for %s",
+            place.name, base, ", ".join(label_paths(options, place, frames)),
+        )  # fmt: skip
+    if options.ground_truth and GROUND_TRUTH not in found:
+        truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
+        source = _source("labels", place.folder, truth.filled(scene=place.below_root), frames, folders)
+        found |= {GROUND_TRUTH: source} if source.first is not None else {}
+    return found
+
+
+def label_paths(options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource]) -> list[str]:
+    """Where label maps and scores are looked for: the paths of the first frame, with BACKBONE for any name."""
+    base, found = options.labels_root or place.folder, []
+    for kind in KINDS:
+        said = _said(kind, options)
+        for template in said.values() if isinstance(said, dict) else [said] if said else []:
+            name = template.replace("{scene}", place.below_root).replace("{backbone}", "BACKBONE")
+            path = base / name.replace("{name}", frames[0].name if frames else "NAME")
+            found.append(str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}"))
+    return found
+
+
+def find_regions(
+    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders, sources: Collection[str]
+) -> dict[str, LabelSource]:
+    """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none.
+
+    Raises DataError where the name is one of `sources`, too.
+    """
+    base = place.folder if options.labels_root is None else options.labels_root
+    template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
+    found = {
+        backbone: _source("labels", base, filled, frames, folders)
+        for backbone, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
+    }
+    if both := next((name for name in found if name in sources), None):
+        raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
+    return {backbone: source for backbone, source in found.items() if source.first is not None}
+
+
+def find_masks(options: FileOptions, place: ScenePlace, folders: Folders) -> LabelSource | None:
+    """Where the masks of frames are; None without the option."""
+    if options.masks is None:
+        return None
+    template = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=place.below_root)
+    return LabelSource("masks", place.folder, template, folders)
+
+
+def _said(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
+    """The template of every backbone, or one of each by its name; None where there are none of that kind."""
+    said = options.labels if kind == "labels" else options.scores
+    if said is not None:
+        return said
+    if options.labels_root is not None:
+        return SEPARATE if kind == "labels" else None
+    return DEFAULTS[kind]
+
+
+def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) -> dict[str, str]:
+    """By backbone, a template in which only {name} is left."""
+    said = _said(kind, options)
+    if isinstance(said, dict):
+        templates = {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in said.items()}
+        return {key: template.filled(scene=place.below_root) for key, template in templates.items()}
+    if said is None:
+        return {}
+    template = Template(kind, said, ("scene", "backbone", "name"), ("backbone", "name"))
+    return matching_folders(base, template, "backbone", scene=place.below_root)
+
+
+def _source(kind: Kind, base: Path, template: str, frames: Sequence[FrameSource], folders: Folders) -> LabelSource:
+    """One source, with the first frame that has a file."""
+    source = LabelSource(kind, base, template, folders)
+    there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
+    return replace(source, first=next(there, None))
+
+
+def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:
+    """That of option taxonomies, else of a label_space.yaml beside its maps, else that of the scene in `folder`.
+
+    None where nothing says it. Raises ConfigError for one that cannot be used.
+    """
+    if name in options.taxonomies:
+        return LabelSpace.load(options.taxonomies[name])
+    assert source.first is not None
+    frame, file = source.first
+    for parent in Path(file).parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
+        if (beside := parent / LABEL_SPACE_FILE).is_file():
+            return LabelSpace.load(beside)
+    try:
+        if options.classes is not None:
+            return LabelSpace(name="classes of the scene", classes=options.classes)
+        return None if options.taxonomy is None else LabelSpace.load(options.taxonomy)
+    except ConfigError as error:
+        raise ConfigError(f"{folder}: {error}") from error
+
+
+# What the ids of a label map mean where that is not the taxonomy's own: other tables, ids for 'no label'.
+
+NO_ID = IGNORE_16BIT - 1
+"""In a table of class ids: an id that is not in it."""
+
+
+def translated(labels: Labels, table: UInt16, path: Path) -> Labels:
+    """table[labels]. Raises DataError for an id that the table does not have."""
+    ids: Labels = table[labels]
+    if (unknown := ids == NO_ID).any():
+        raise DataError(f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?")
+    return ids
+
+
+def without_labels(labels: Labels, void: Collection[int]) -> Labels:
+    """The ids, where one of `void` is the ignore id."""
+    return np.where(np.isin(labels, [*void]), labels.dtype.type(ignore_id(labels)), labels)
+
+
+def without_scores(scores: Scores, ids: Sequence[int], void: Collection[int]) -> Scores:
+    """The scores (H, W, K) of classes with these ids, 0 where one of `void` has the largest."""
+    ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
+    return np.where(ignored[..., None], scores.dtype.type(0), scores)
+
+
+# The label maps, scores and masks of a scene's frames, read into the ids of its taxonomies, in their own pixels.
+
+
+class LabelMaps:
+    """What was predicted of the frames of a scene: which sources there are, their classes, and the maps themselves.
+
+    class_ids  by label source a table from the ids of its files to those of its taxonomy, where they differ
+    folders    what lies where maps may be
+
+    Raises ConfigError for options that cannot be used.
+    """
+
+    def __init__(
+        self,
+        options: FileOptions,
+        place: ScenePlace,
+        frames: Sequence[FrameSource],
+        class_ids: Mapping[str, UInt16],
+        folders: Folders,
+    ) -> None:
+        labels = find_sources(options, place, frames, folders)
+        regions = find_regions(options, place, frames, folders, labels)
+        self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
+        self.ground_truth = GROUND_TRUTH in labels
+        self.regions = tuple(regions)
+        self._options = options
+        self._folder = place.folder
+        self._frames = frames
+        self._sources = {**labels, **regions}
+        self._masks = find_masks(options, place, folders)
+        self._class_ids = class_ids
+        self._spaces: dict[str, LabelSpace | None] = {}
+
+    def source(self, backbone: str) -> LabelSource:
+        """The files of a label source. Raises ConfigError where there is none of that name."""
+        known = self._sources
+        if backbone not in known:
+            hint = nearest(backbone, known) if known else "put its label maps into labels/NAME/, or set option labels"
+            raise ConfigError(f"{self._folder}: backbone '{backbone}' is not there; {hint}")
+        return known[backbone]
+
+    def file(self, frame: FrameSource, backbone: str) -> Path:
+        """The file of a frame. Raises DataError where it is not there."""
+        source = self.source(backbone)
+        if (file := source.file(frame)) is None:
+            lost = [path for each in self._frames for path in source.missing(each)]
+            raise DataError(
+                f"{self._folder}: {listed(lost, str(self._folder))}; choose frames that have them, or add them"
+            )
+        return Path(file)
+
+    def space(self, backbone: str) -> LabelSpace | None:
+        """The classes of a label source, None where nothing says them; what says them is read once."""
+        if backbone not in self._spaces:
+            source, none = self.source(backbone), backbone in self.regions
+            self._spaces[backbone] = None if none else label_space(self._options, self._folder, backbone, source)
+        return self._spaces[backbone]
+
+    def label_space(self, backbone: str, where: Path) -> LabelSpace:
+        """The same; raises DataError with `where` where nothing says them, ConfigError where it has none."""
+        source = self.source(backbone)
+        if backbone in self.regions:
+            raise ConfigError(f"{self._folder}: '{backbone}' holds regions without classes, which cannot be fused")
+        space = self.space(backbone)
+        if space is None:
+            assert source.first is not None
+            beside = Path(source.first[1]).parent
+            raise DataError(
+                f"{where}: the classes of '{backbone}' are not known; set classes: [name, ...] in id order, taxonomy:"
+                f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {beside}"
+            )
+        return space
+
+    def labels(self, backbone: str, path: Path, read: Read) -> Labels:
+        """Ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
+        labels = read_labels(path, self.space(backbone), read)
+        if backbone in self._class_ids:
+            labels = translated(labels, self._class_ids[backbone], path)
+        void = self._options.void_ids.get(backbone)
+        return without_labels(labels, void) if void else labels
+
+    def scores(self, backbone: str, path: Path, size: Size, read: Read) -> Scores:
+        """Scores (H, W, K) of one file; `size` is (H, W) of the depth. Raises DataError that names it."""
+        scores = read_scores(path, self._options.scores_layout or "KHW", size, read)
+        if void := self._options.void_ids.get(backbone):
+            space = self.space(backbone)
+            scores = without_scores(scores, range(scores.shape[2]) if space is None else space.ids, void)
+        return scores
+
+    def mask_file(self, frame: FrameSource) -> Path | None:
+        """The mask of a frame, where it has one."""
+        file = None if self._masks is None else self._masks.file(frame)
+        return None if file is None else Path(file)
+
+    def mask(self, path: Path, read: Read) -> UInt8:
+        """(H, W): 1 where a mask leaves out. Raises DataError that names it."""
+        return read_mask(path, read).astype(np.uint8)
+
+    def table_bytes(self, backbone: str) -> bytes:
+        """The table of its ids, as bytes that are equal where it is."""
+        return self._class_ids[backbone].tobytes() if backbone in self._class_ids else b""

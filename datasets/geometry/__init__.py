@@ -1,0 +1,1 @@
+"""Geometry of single views: cameras, poses and lenses."""

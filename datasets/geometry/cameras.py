@@ -1,0 +1,176 @@
+"""Cameras as datasets state them: intrinsics for images of a size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float32, Float64
+from semstab.errors import DataError
+from semstab.model.frames import Intrinsics
+
+LARGEST = 1e9
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics as a dataset states them, and the (width, height) that they are for; None: of any image's own.
+
+    Raises DataError for numbers that no camera has, so that nothing overflows.
+    """
+
+    intrinsics: Intrinsics
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        K = self.intrinsics
+        for name, value, least in (("fx", K.fx, 1e-3), ("fy", K.fy, 1e-3), ("cx", K.cx, 0), ("cy", K.cy, 0)):
+            if not least <= abs(value) <= LARGEST:
+                raise DataError(f"intrinsics: {name} = {value:g} pixels is none of a camera; is the file damaged?")
+
+    def at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
+        """Intrinsics, pixel centres at integers, of an image of the whole field of view and of that shape (H, W, ...).
+
+        `centre` is where the dataset has the centre of the first pixel: 0, or 0.5 where it counts from the corner.
+        """
+        stated, size = self.intrinsics, (shape[1], shape[0])
+        K = Intrinsics(stated.fx, stated.fy, stated.cx - centre, stated.cy - centre)
+        return K if self.size in (None, size) else K.resized(self.size or size, size)
+
+
+FxFyCxCy = tuple[float, float, float, float]
+
+
+def camera_of(stated: FxFyCxCy | None, usual: FxFyCxCy, size: tuple[int, int]) -> Camera:
+    """The stated intrinsics, of the depth images as they are, or else a dataset's usual ones, of images of a size."""
+    return Camera(Intrinsics(*stated)) if stated is not None else Camera(Intrinsics(*usual), size)
+
+
+# Poses of other conventions as camera-to-world matrices with OpenCV axes; trajectories between their time stamps.
+
+Poses = Float64
+
+CAMERA_AXES: Mapping[str, Poses] = {
+    "opencv": np.eye(3),
+    "opengl": np.diag([1.0, -1.0, -1.0]),
+    "ned": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+}
+"""From OpenCV camera axes (x right, y down, z forward) to the named ones: opengl has x right, y up, z backward;
+ned has x forward, y right, z down, as TartanAir."""
+
+UP_AXES: Mapping[str, tuple[float, float, float]] = {
+    "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
+}  # fmt: skip
+
+UNIT_TOLERANCE = 0.01
+LARGEST_COORDINATE = 1e9
+"""Metres from the origin: beyond, coordinates would lose the size of a voxel."""
+
+
+def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Poses:
+    """T (4, 4) of a convention and camera axes as camera-to-world with OpenCV axes; one that is not finite stays.
+
+    Raises DataError with `where` (the file) where it cannot be inverted.
+    """
+    if not np.isfinite(T).all():
+        return T
+    if (largest := np.abs(T).max()) > LARGEST_COORDINATE:
+        raise DataError(f"{where}: the pose holds {largest:g}, which no camera's has; is the file damaged?")
+    if convention == "world_to_camera":
+        T = _inverse(T, where)
+    T = T.copy()
+    T[:3, :3] = T[:3, :3] @ CAMERA_AXES[axes]
+    return T
+
+
+def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Poses:
+    """(n, 4, 4) from translations (n, 3) and quaternions (n, 4) in the order x y z w; NaN where one is not finite.
+
+    Raises DataError that names the file and the pose, counted from 1, for a quaternion that is not of length 1.
+    """
+    from scipy.spatial.transform import Rotation
+
+    T = np.full((len(translations), 4, 4), np.nan)
+    finite = np.isfinite(translations).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(quaternions[finite], axis=1)
+    if (wrong := np.abs(lengths - 1) > UNIT_TOLERANCE).any():
+        number = np.flatnonzero(finite)[wrong][0] + 1
+        raise DataError(
+            f"{path}: the quaternion of pose {number} has length {lengths[wrong][0]:.4g}, not 1; is the order of the"
+            " columns right?"
+        )
+    T[finite] = np.eye(4)
+    if finite.any():
+        T[finite, :3, :3] = Rotation.from_quat(quaternions[finite]).as_matrix()
+    T[finite, :3, 3] = translations[finite]
+    return T
+
+
+def at_times(
+    times: Float64,
+    poses: Poses,
+    wanted: Float64,
+    max_gap: float,
+    method: Literal["interpolate", "nearest"],
+) -> Poses:
+    """(m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: the nearest, or between the two.
+
+    NaN where no pose is within `max_gap` seconds, and beside a pose that is NaN. Between two poses the position is
+    linear and the rotation spherically linear (slerp); before the first and after the last one they hold.
+    """
+    kept = np.isfinite(poses).all(axis=(1, 2))
+    times, poses = times[kept], poses[kept]
+    if not len(times):
+        return np.full((len(wanted), 4, 4), np.nan)
+    at = nearest(wanted, times)
+    found = poses[at] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
+    found[np.abs(times[at] - wanted) > max_gap] = np.nan
+    return found
+
+
+def nearest(times: Float64, others: Float64) -> npt.NDArray[np.intp]:
+    """For each time the index of the nearest of the ascending others; of two as near the earlier one."""
+    after = np.searchsorted(others, times).clip(max=len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+
+
+def _between(times: Float64, poses: Poses, wanted: Float64) -> Poses:
+    from scipy.spatial.transform import Rotation, Slerp
+
+    at = wanted.clip(times[0], times[-1])
+    T = np.tile(np.eye(4), (len(at), 1, 1))
+    T[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
+    for axis in range(3):
+        T[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
+    return T
+
+
+def _inverse(T: Poses, where: str) -> Poses:
+    try:
+        return np.linalg.inv(T).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError as error:
+        raise DataError(f"{where}: the pose cannot be inverted, so it is not rigid; leave this frame out") from error
+
+
+# Depth that was stored as the distance along a pixel's ray, brought to the distance along the optical axis.
+
+
+def ray_lengths(camera: Intrinsics, u: npt.ArrayLike, v: npt.ArrayLike) -> Float64:
+    """Length of the rays through pixels (u, v) from the camera to the plane one metre ahead, metres."""
+    x = (np.asarray(u, dtype=np.float64) - camera.cx) / camera.fx
+    y = (np.asarray(v, dtype=np.float64) - camera.cy) / camera.fy
+    return np.sqrt(x**2 + y**2 + 1)
+
+
+def planar(depth: Float32, camera: Intrinsics) -> Float32:
+    """Planar depth (H, W), metres, from distances along the rays; what marks a pixel invalid stays invalid."""
+    H, W = depth.shape
+    along_axis: Float32 = (depth / ray_lengths(camera, np.arange(W), np.arange(H)[:, None])).astype(np.float32)
+    return along_axis

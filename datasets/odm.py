@@ -1,0 +1,334 @@
+"""Projects of OpenDroneMap, and of OpenSfM, with depth from whatever surface or depth maps they have.
+
+Sources: opendronemap.org (docs, Outputs); opensfm.org; the folders of real projects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from semstab.core.files import open_file
+from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.labels import ScenePlace
+from semstab.datasets.files.options import DepthKind, FileOptions, Folders, PoseConvention, Template, UpAxis, inside
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.files.scene import FileScene
+from semstab.datasets.formats.dense_depth import HEADER_BYTES, dmap_header
+from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from semstab.datasets.opensfm import GEOREFERENCING, Shot, georeference_of, read_reconstruction
+from semstab.errors import DataError
+from semstab.model.georeference import Georeference
+
+# The files of a project of OpenDroneMap or OpenSfM: its poses, images, surfaces and depth maps, and their names.
+
+UNDISTORTED = "undistorted/reconstruction.json"
+DISTORTED = "reconstruction.json"
+
+MESHES = (
+    "odm_meshing/odm_mesh.ply", "odm_meshing/odm_25dmesh.ply", "odm_texturing*/odm_textured_model_geo.obj",
+    "odm_texturing*/*_geo.obj",
+)  # fmt: skip
+DSM = "odm_dem/dsm.tif"
+MVE = "mve/views/view_{:04d}.mve/depth-L0.mvei"
+DMAPS = "openmvs/depthmaps"
+
+Kind = Literal["mesh", "dsm", "mve", "openmvs", "files"]
+
+
+@dataclass(frozen=True)
+class Project:
+    """The parts of a project: its folder, that of OpenSfM in it, and the file of its poses."""
+
+    folder: Path
+    opensfm: Path
+    poses: Path
+
+    @property
+    def undistorted(self) -> bool:
+        """Whether the poses are of undistorted images."""
+        return self.poses == self.opensfm / UNDISTORTED
+
+
+def find_project(folder: Path) -> Project | None:
+    """The project in a folder, of OpenDroneMap or of OpenSfM; None where nothing is reconstructed."""
+    for opensfm in (folder / "opensfm", folder):
+        for poses in (opensfm / UNDISTORTED, opensfm / DISTORTED):
+            if poses.is_file():
+                return Project(folder, opensfm, poses)
+    return None
+
+
+# --- names and images -----------------------------------------------------------------------------------------------
+
+
+PHOTO_SUFFIXES = (".JPG", ".jpg", ".JPEG", ".jpeg", ".png", ".PNG", ".tif", ".TIF", ".tiff", ".TIFF")
+ADDED_SUFFIXES = ("", ".tif", ".jpg", ".png")
+"""What ODM appends to the name of an undistorted image."""
+
+
+def bare_name(shot: str) -> str:
+    """A shot's name without the suffixes of images: DJI_0018 of DJI_0018.JPG.tif."""
+    while Path(shot).suffix and Path(shot).suffix in PHOTO_SUFFIXES:
+        shot = shot[: -len(Path(shot).suffix)]
+    return shot
+
+
+def written_names(shot: str) -> tuple[str, ...]:
+    """The names that files of a shot may have: its own, and without and with any suffixes."""
+    bare = bare_name(shot)
+    names = (f"{bare}{suffix}{added}" for suffix in PHOTO_SUFFIXES for added in ADDED_SUFFIXES)
+    return tuple(dict.fromkeys((shot, *(f"{shot}{added}" for added in ADDED_SUFFIXES), bare, *names)))
+
+
+def frame_names(shots: Iterable[str]) -> list[str]:
+    """The frames' names: the shots' without suffixes, or as they are where these would not differ."""
+    names = list(shots)
+    bare = [bare_name(name) for name in names]
+    return bare if len(set(bare)) == len(names) else names
+
+
+class Images:
+    """The files of a project's images, by the names that ODM and OpenSfM give them; `stated` is where they are else."""
+
+    def __init__(self, project: Project, stated: Path | None) -> None:
+        self._folders = Folders()
+        self._project = project
+        self._photographs = [project.folder / "images", project.opensfm / "images"]
+        own = [project.opensfm / "undistorted/images"] if project.undistorted else self._photographs
+        self._own = own if stated is None else [stated]
+
+    def color(self, shot: str) -> Path | None:
+        """The image that the shot's pose is of."""
+        return self._first(self._own, shot)
+
+    def photograph(self, shot: str) -> Path | None:
+        """The photograph that it was made of."""
+        return self._first(self._photographs, shot)
+
+    def _first(self, places: Iterable[Path], shot: str) -> Path | None:
+        for place in places:
+            for written in written_names(shot):
+                path = inside(place, place, written, str(self._project.poses))
+                if path.suffix.lower() in COLOR_SUFFIXES and self._folders.has(path):
+                    return path
+        return None
+
+
+# --- depth ----------------------------------------------------------------------------------------------------------
+
+
+def _mesh(project: Project, _: str) -> Path | None:
+    return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
+
+
+def _dsm(project: Project, _: str) -> Path | None:
+    path = project.folder / DSM
+    return path if path.is_file() else None
+
+
+def _mve(project: Project, _: str) -> Path | None:
+    return next(iter(sorted(project.folder.glob("mve/views/*/depth-L0.mvei"))), None)
+
+
+def _openmvs(project: Project, _: str) -> Path | None:
+    return next(iter(_dmap_files(project)), None)
+
+
+def _files(project: Project, template: str) -> Path | None:
+    folder = (project.folder / template).parent
+    return folder if "{" not in str(folder) and folder.is_dir() else None
+
+
+LOOK_FOR: dict[Kind, Callable[[Project, str], Path | None]] = {
+    "mesh": _mesh, "dsm": _dsm, "mve": _mve, "openmvs": _openmvs, "files": _files,
+}  # fmt: skip
+"""By source of depth what finds it in a project, with the template of depth files; the one taken first in front."""
+
+PLACES: dict[Kind, str] = {
+    "mesh": "odm_meshing/odm_mesh.ply, odm_25dmesh.ply, odm_texturing*/*_geo.obj",
+    "dsm": DSM,
+    "mve": "mve/views/view_NNNN.mve/depth-L0.mvei",
+    "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
+    "files": "depth/NAME.png",
+}
+
+
+def _dmap_files(project: Project) -> list[Path]:
+    return sorted((project.opensfm / "undistorted" / DMAPS).glob("*.dmap"))
+
+
+def _depth_maps(project: Project) -> dict[str, Path]:
+    """Depth maps of OpenMVS by the name of the frame that each says it is of."""
+    found = {}
+    for path in _dmap_files(project):
+        with open_file(path) as file:
+            image = dmap_header(path, file.read(HEADER_BYTES)).image
+        found[bare_name(Path(image.replace("\\", "/")).name)] = path
+    return found
+
+
+def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
+    """The depth map that each shot has, or would have, by its name; `names` are the frames' by those of their shots."""
+    if kind == "mve":
+        return {shot: project.folder / MVE.format(k) for k, shot in enumerate(names)}
+    if kind == "openmvs":
+        maps, folder = _depth_maps(project), project.opensfm / "undistorted" / DMAPS
+        return {shot: maps.get(name, folder / f"{name}.dmap") for shot, name in names.items()}
+    folders = Folders()
+    wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
+    return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in wanted.items()}
+
+
+class OdmOptions(FileOptions):
+    """What the project says, and may be said otherwise."""
+
+    depth_from: Kind | None = Field(
+        None,
+        description="mesh, dsm, mve, openmvs, or files (option depth); the first of them that the project has where not"
+        " given",
+    )
+    depth: str = Field("depth/{name}", description="template of depth files in the project")
+    images: Path | None = Field(
+        None, description="folder of the images that the poses are of, where it is not in the project"
+    )
+    labels_on: Literal["undistorted", "original"] | None = Field(
+        None,
+        description="the images that labels were predicted on: undistorted ones or original photographs; those that the"
+        " poses are of where not given",
+    )
+    reconstruction: int | None = Field(None, ge=0, description="which of several reconstructions, counted from 0")
+    depth_kind: DepthKind = None
+    pose_convention: PoseConvention = "world_to_camera"
+    up_axis: UpAxis = "z"
+
+
+class Odm(FileDataset[OdmOptions]):
+    """{name} is the photograph's name without the suffixes: DJI_0018 of DJI_0018.JPG and of DJI_0018.JPG.tif.
+
+    Label maps may have the suffixes, too: DJI_0018.JPG.png. The parts of a split project, submodels/submodel_NNNN, are
+    scenes of their own.
+    """
+
+    Options: type[BaseModel] = OdmOptions
+    looks_like = f"opensfm/{UNDISTORTED} or opensfm/{DISTORTED}, which is there once a project is reconstructed"
+
+    def __init__(self, options: OdmOptions) -> None:
+        self._depth = Template("depth", options.depth, ("name",), ("name",))
+        self._read: dict[Path, list[Shot]] = {}
+        super().__init__(options)
+
+    def find_scenes(self, root: Path) -> Iterator[ScenePlace]:
+        """The projects, and the submodels of each beside it."""
+        for place in super().find_scenes(root):
+            yield place
+            parts = place.folder / "submodels"
+            for name in subfolders(parts):
+                if self.is_scene(parts / name):
+                    below = f"{place.below_root}/submodels/{name}"
+                    yield ScenePlace(f"{place.name}-submodels-{name}", parts / name, below)
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether there is a reconstruction."""
+        return find_project(folder) is not None
+
+    def settled(self, folder: Path) -> OdmOptions:
+        """The options with the source of depth that the project has.
+
+        Raises DataError where it has none, or not the one that is asked for.
+        """
+        options = self.options
+        if options.surface is not None:
+            return options.model_copy(update={"depth_kind": options.depth_kind or "planar"})
+        project = self._project(folder)
+        kinds = [options.depth_from] if options.depth_from else list(LOOK_FOR)
+        for kind in kinds:
+            if (found := LOOK_FOR[kind](project, options.depth)) is not None:
+                surface = found if kind in ("mesh", "dsm") else None
+                along = options.depth_kind or ("ray" if kind == "mve" else "planar")
+                return options.model_copy(update={"surface": surface, "depth_from": kind, "depth_kind": along})
+        raise DataError(
+            f"{folder}: has no depth: no {', '.join(kinds)} ({'; '.join(PLACES[kind] for kind in kinds)}); set surface"
+            " to a mesh, cloud or raster"
+        )
+
+    def scene(self, name: str) -> FileScene:
+        """Open one; it says where its depth comes from."""
+        scene = super().scene(name)
+        kind = self.settled(scene.folder).depth_from
+        scene.depth_from = f"{kind}, {scene.depth_from or PLACES[kind]}" if kind is not None else scene.depth_from
+        return scene
+
+    def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
+        """What the options say, else the project's coords.txt and proj.txt, else OpenSfM's reference."""
+        if options.crs is not None:
+            return super().georeference(folder, options)
+        project = self._project(folder)
+        T_cw = [shot.T_cw for shot in self._shots(project.poses)]
+        return georeference_of(folder / GEOREFERENCING, project.opensfm, T_cw)
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """One a shot, in the natural order of their names. Raises what `read_reconstruction` raises."""
+        project = self._project(folder)
+        shots = self._shots(project.poses)
+        names = frame_names(shot.name for shot in shots)
+        kind = self.settled(folder).depth_from
+        depth = depth_files(
+            project, kind, {shot.name: name for shot, name in zip(shots, names, strict=True)}, self._depth
+        )
+        originals = self._originals(project)
+        look = Images(project, self.options.images)
+        frames = [
+            self._frame(project, look, shot, name, depth[shot.name], originals.get(name))
+            for shot, name in zip(shots, names, strict=True)
+        ]
+        return sorted(frames, key=lambda frame: natural(frame.name))
+
+    def _frame(
+        self, project: Project, look: Images, shot: Shot, name: str, depth: Path, original: Shot | None
+    ) -> FrameSource:
+        color, photograph = look.color(shot.name), look.photograph(shot.name)
+        wanted = self.options.labels_on or ("undistorted" if project.undistorted else "original")
+        lens = shot.lens
+        if wanted == "original" and project.undistorted:
+            if original is None:
+                raise DataError(
+                    f"{project.opensfm / DISTORTED}: does not say how the photograph {name} is distorted, which"
+                    " labels_on: original needs"
+                )
+            lens = original.lens
+        return FrameSource(
+            name=name,
+            depth=depth,
+            pose=shot.T_cw,
+            pose_file=project.poses,
+            camera=shot.camera,
+            color=color,
+            color_lens=shot.lens,
+            label_lens=lens if wanted == "original" else None,
+            photograph=photograph if project.undistorted else color,
+            aliases=written_names(shot.name),
+        )
+
+    def _originals(self, project: Project) -> dict[str, Shot]:
+        """The shots with the cameras of the photographs, by the frames' names, where they are asked for."""
+        path = project.opensfm / DISTORTED
+        if self.options.labels_on != "original" or not project.undistorted or not path.is_file():
+            return {}
+        shots = self._shots(path)
+        return dict(zip(frame_names(shot.name for shot in shots), shots, strict=True))
+
+    def _shots(self, path: Path) -> list[Shot]:
+        if path not in self._read:
+            self._read[path] = read_reconstruction(path, self.options.reconstruction)
+        return self._read[path]
+
+    def _project(self, folder: Path) -> Project:
+        project = find_project(folder)
+        assert project is not None
+        return project

@@ -1,0 +1,236 @@
+"""OpenSfM's reconstructions: the cameras and the shots of a reconstruction.json; points are skipped.
+
+Source: opensfm.org, Reconstruction Format and Geometric Models; OpenDroneMap has them in its folder opensfm/.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semstab.core.files import parse_json
+from semstab.core.types import Float64
+from semstab.datasets.formats.disk import number, read_bytes, read_object
+from semstab.datasets.geometry.cameras import Camera, Poses
+from semstab.datasets.geometry.lenses import Lens
+from semstab.errors import DataError, one_line
+from semstab.model.frames import Intrinsics
+from semstab.model.georeference import Georeference
+
+MAX_BYTES = 2**32
+"""With the points of thousands of photographs."""
+
+MAX_SIDE = 2**24
+COEFFICIENTS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "perspective": ("brown", ("k1", "k2", "", "", "")),
+    "simple_radial": ("brown", ("k1", "", "", "", "")),
+    "radial": ("brown", ("k1", "k2", "", "", "")),
+    "brown": ("brown", ("k1", "k2", "p1", "p2", "k3")),
+    "fisheye": ("fisheye", ("k1", "k2", "", "")),
+    "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
+"""By projection type the model of its lens, and which key each of the lens's coefficients has, if any."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One photograph: its name, its pose (4, 4) world-to-camera, its camera without distortion, and its lens.
+
+    lens  None where nothing distorts
+    """
+
+    name: str
+    T_cw: Poses
+    camera: Camera
+    lens: Lens | None
+
+
+def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
+    """The shots of the only reconstruction of a file, or of the one with that number, in its order.
+
+    Raises DataError for a damaged file, several reconstructions where none is wanted, or an unknown camera model.
+    """
+    found = _reconstructions(path)
+    if len(found) > 1 and wanted is None:
+        names = "; ".join(f"{k}: {_told(one)}" for k, one in enumerate(found[:5]))
+        more = f"; {len(found) - 5} more" if len(found) > 5 else ""
+        raise DataError(
+            f"{path}: {len(found)} reconstructions, which share no coordinates ({names}{more}); choose one"
+            " with reconstruction: NUMBER"
+        )
+    if not 0 <= (wanted or 0) < len(found):
+        raise DataError(f"{path}: there is no reconstruction {wanted}; it has {len(found)}, counted from 0")
+    cameras, shots = (_part(found[wanted or 0], key, path) for key in ("cameras", "shots"))
+    lenses = {name: _lens(values, f"{path}: camera {name[:60]!r}") for name, values in cameras.items()}
+    read = [_shot(name, values, lenses, f"{path}: shot {name[:80]!r}") for name, values in shots.items()]
+    if not read:
+        raise DataError(f"{path}: the reconstruction has no shot; reconstruct again")
+    return read
+
+
+def _reconstructions(path: Path) -> Sequence[Mapping[str, Any]]:
+    data = read_bytes(path, MAX_BYTES)
+    try:
+        content = parse_json(data)
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
+    if not isinstance(content, list) or not content or not all(isinstance(one, dict) for one in content):
+        raise DataError(f"{path}: expected a list of reconstructions; run the reconstruction again")
+    return content
+
+
+def _part(content: Mapping[str, Any], key: str, path: Path) -> Mapping[str, Mapping[str, Any]]:
+    part = content.get(key)
+    if not isinstance(part, dict) or not all(isinstance(values, dict) for values in part.values()):
+        raise DataError(f"{path}: '{key}' must be an object with an entry for each")
+    return part
+
+
+def _told(content: Mapping[str, Any]) -> str:
+    shots = content.get("shots")
+    names = list(shots) if isinstance(shots, dict) else []
+    return f"{len(names)} shots" + (f" from {names[0][:40]}" if names else "")
+
+
+def _shot(name: str, values: Mapping[str, Any], lenses: Mapping[str, tuple[Camera, Lens | None]], where: str) -> Shot:
+    from scipy.spatial.transform import Rotation
+
+    camera = str(values.get("camera"))
+    if camera not in lenses:
+        raise DataError(f"{where}: its camera {camera[:60]!r} is not in the file")
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(_vector(values, "rotation", where)).as_matrix()
+    T[:3, 3] = _vector(values, "translation", where)
+    return Shot(name, T, *lenses[camera])
+
+
+def _vector(values: Mapping[str, Any], key: str, where: str) -> list[float]:
+    parts = values.get(key)
+    if not isinstance(parts, list) or len(parts) != 3:
+        raise DataError(f"{where}: '{key}' must be three numbers")
+    return [number({key: part}, key, where) for part in parts]
+
+
+def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
+    """The pinhole that stands for a camera, and its lens where it distorts.
+
+    The pinhole is that of OpenSfM's own undistorted images: the mean focal length, the centre of the image.
+    """
+    kind = values.get("projection_type", "perspective")
+    if not isinstance(kind, str) or kind not in COEFFICIENTS:
+        raise DataError(
+            f"{where}: the camera model {str(kind)[:40]!r} is not known; there is {', '.join(COEFFICIENTS)}; undistort"
+            " the images (opensfm undistort)"
+        )
+    width, height = (_side(values, key, where) for key in ("width", "height"))
+    side = max(width, height)
+    fx, fy = (number(values, key if key in values else "focal", where) * side for key in ("focal_x", "focal_y"))
+    cx, cy = (_or_zero(values, key, where) * side for key in ("c_x", "c_y"))
+    model, keys = COEFFICIENTS[kind]
+    coefficients = tuple(_or_zero(values, key, where) for key in keys)
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    try:
+        pinhole = Camera(Intrinsics((fx + fy) / 2, (fx + fy) / 2, *centre), (width, height))
+        stated = Camera(Intrinsics(fx, fy, centre[0] + cx, centre[1] + cy), (width, height))
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+    if model == "brown" and not any(coefficients):
+        return stated, None
+    return pinhole, Lens(stated, "brown" if model == "brown" else "fisheye", coefficients)
+
+
+def _or_zero(values: Mapping[str, Any], key: str, where: str) -> float:
+    return number(values, key, where) if key in values else 0.0
+
+
+def _side(values: Mapping[str, Any], key: str, where: str) -> int:
+    value = number(values, key, where)
+    if not 1 <= value <= MAX_SIDE:
+        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
+    return int(value)
+
+
+# Where a project of OpenDroneMap or OpenSfM lies on Earth: coords.txt and proj.txt, or reference_lla.json.
+
+logger = logging.getLogger("semstab")
+
+GEOREFERENCING = "odm_georeferencing"
+MAX_TEXT_BYTES = 2**26
+
+FAR = 200.0
+"""Metres: GPS in drones errs by tens of metres at most; camera centres further off lie in other coordinates."""
+
+
+def georeference_of(folder: Path, opensfm: Path, T_cw: Sequence[Poses]) -> Georeference | None:
+    """That of a project whose cameras have these poses, None where it has none.
+
+    Projects of OpenDroneMap lie in the projection of proj.txt less the offset of coords.txt. Where their cameras do
+    not lie at the positions of coords.txt, they are topocentric about OpenSfM's reference, as those of OpenSfM are.
+    Raises DataError for damaged files, ConfigError for a projection that is not known.
+    """
+    centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in T_cw])
+    coords, proj = folder / "coords.txt", folder / "proj.txt"
+    if not coords.is_file():
+        return _topocentric(opensfm)
+    east, north, positions = _read_coords(coords)
+    off = _off(centres, positions)
+    if off > FAR and (local := _topocentric(opensfm)) is not None:
+        return local
+    if off > FAR:
+        logger.warning("%s: the cameras lie %.0f m from its positions; is it of another project?", coords, off)
+    return Georeference.of(_crs(coords, proj), (east, north, 0.0), str(proj if proj.is_file() else coords))
+
+
+def _crs(coords: Path, proj: Path) -> str:
+    """proj.txt, else the first line of coords.txt: 'WGS84 UTM 15N' or a PROJ string."""
+    if proj.is_file():
+        return _text(proj).strip()
+    words = _text(coords).split("\n")[0].split()
+    if len(words) == 3 and words[:2] == ["WGS84", "UTM"] and words[2][:-1].isdecimal():
+        return f"EPSG:{(326 if words[2][-1] == 'N' else 327) * 100 + int(words[2][:-1])}"
+    return " ".join(words)
+
+
+def _read_coords(path: Path) -> tuple[float, float, Float64]:
+    """Offset to the east and north, and the positions (n, 3) of the photographs relative to it."""
+    lines = [line.split() for line in _text(path).splitlines()[1:] if line.strip()]
+    try:
+        numbers = [[float(word) for word in line] for line in lines]
+        east, north = numbers[0]
+        positions = np.array(numbers[1:], dtype=np.float64).reshape(-1, 3)
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path}: expected a projection, 'EAST NORTH', then 'x y z' a line; run ODM again") from error
+    if not np.isfinite([east, north]).all():
+        raise DataError(f"{path}: the offset {east:g} {north:g} is not finite; run ODM again")
+    return east, north, positions
+
+
+def _off(centres: Float64, positions: Float64) -> float:
+    """Metres between the middles of cameras and positions, over the ground; 0 where there are no positions."""
+    if not len(positions):
+        return 0.0
+    middle = np.median(centres[:, :2], axis=0) - np.median(positions[:, :2], axis=0)
+    return float(np.hypot(*middle))
+
+
+def _topocentric(opensfm: Path) -> Georeference | None:
+    """East, north and up about OpenSfM's reference, as a transverse Mercator projection about the same point.
+
+    Within a kilometre the two differ by centimetres: by the height above the ellipsoid over the Earth's radius.
+    """
+    path = opensfm / "reference_lla.json"
+    if not path.is_file():
+        return None
+    content = read_object(path)
+    latitude, longitude, altitude = (number(content, key, str(path)) for key in ("latitude", "longitude", "altitude"))
+    crs = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +datum=WGS84 +units=m +no_defs +type=crs"
+    return Georeference.of(crs, (0.0, 0.0, altitude), str(path))
+
+
+def _text(path: Path) -> str:
+    return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig", errors="replace")
