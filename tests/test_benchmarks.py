@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PERF = Path(__file__).parent / "perf"
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {
     "bench_fusion.py": ["--sizes", "96x54", "--rounds", "1", "--conditions", "noise 0.3 %"],
     "bench_scaling.py": ["--size", "96x54", "--voxels", "1000", "5000"],
@@ -23,7 +23,7 @@ SMALL = {
 
 @pytest.mark.parametrize("script", SMALL)
 def test_a_benchmark_prints_its_table_and_writes_it(script, tmp_path) -> None:
-    command = [sys.executable, str(PERF / script), *SMALL[script], "--json", str(tmp_path / "figures.json")]
+    command = [sys.executable, str(BENCHMARKS / script), *SMALL[script], "--json", str(tmp_path / "figures.json")]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "96x54" in result.stdout

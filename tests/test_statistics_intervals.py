@@ -215,7 +215,7 @@ def test_parts_of_a_map_have_its_interval():
     assert estimate(merged(*parts), "alpha") == estimate(sums, "alpha")
 
 
-# --- Coverage, a small part of tests/simulation -----------------------------------------------------------------------
+# --- Coverage, a small part of simulations -----------------------------------------------------------------------
 
 
 def covered(row: Row) -> bool:

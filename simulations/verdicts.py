@@ -1,6 +1,6 @@
 """How often is a verdict wrong, ceiling, classes and all?
 
-    python tests/simulation/verdicts.py [--trials 200] [--seed 0]
+    python simulations/verdicts.py [--trials 200] [--seed 0]
 
 Scenes with voxels at borders that hold two classes, as a sampler sees them. Models reach a little less of their ceiling
 than a level of the verdict asks for: how many flights are said to be of that level, or of a better one?

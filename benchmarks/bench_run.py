@@ -1,7 +1,7 @@
 """Wall-clock of the stages of a run beside that of its fusion: what all that is said of a map costs.
 
-    python tests/perf/bench_run.py [--frames 200] [--runs 5] [--voxel-size 0.05]
-    python tests/perf/bench_run.py --data SCENE --voxel-size 0.01     # of a sequence of your own
+    python benchmarks/bench_run.py [--frames 200] [--runs 5] [--voxel-size 0.05]
+    python benchmarks/bench_run.py --data SCENE --voxel-size 0.01     # of a sequence of your own
 
 A camera walks round a furnished room (room.py). The same run by the numba backend several times in one process, without
 --statistics and with it, with one thread: the first one, which loads compiled code and libraries, apart; of the others

@@ -1,9 +1,9 @@
 """How often do intervals hold what they are about?
 
-    python tests/simulation/intervals.py this-map [--trials 300] [--seed 0]
-    python tests/simulation/intervals.py next-flight [--trials 300] [--seed 0]
-    python tests/simulation/intervals.py differences [--trials 300] [--seed 0]
-    python tests/simulation/intervals.py correlogram [--trials 300] [--seed 0]
+    python simulations/intervals.py this-map [--trials 300] [--seed 0]
+    python simulations/intervals.py next-flight [--trials 300] [--seed 0]
+    python simulations/intervals.py differences [--trials 300] [--seed 0]
+    python simulations/intervals.py correlogram [--trials 300] [--seed 0]
 
 Prints a table in Markdown. What an interval is about is the number that very many such scenes and flights have
 together: that of the sums of all trials.

@@ -1,6 +1,6 @@
 """Time of one frame through backend `torch`, its input on the device already, beside the floor and the CPU backends.
 
-    python tests/perf/bench_gpu.py [--json FILE] [--device CUDA:0] [--sizes 3840x2160] [--classes 7 20]
+    python benchmarks/bench_gpu.py [--json FILE] [--device CUDA:0] [--sizes 3840x2160] [--classes 7 20]
                                    [--voxels 1000000 20000000] [--rounds 50] [--logits float16]
 
 The map grows by one view fused at ever new places; then places chosen at random are fused again, as ids, as logits, and

@@ -1,6 +1,6 @@
 """How often does a gate err, and how much does it take to be decided?
 
-    python tests/simulation/gate.py [--trials 200] [--seed 0] [--only TEXT] [--frames random|fixed]
+    python simulations/gate.py [--trials 200] [--seed 0] [--only TEXT] [--frames random|fixed]
 
 Two models on the same frames of the same scene; scenes, frames and errors are drawn anew for each trial. Prints a table
 in Markdown of the rule 'alpha drop < margin' at the 5 % level: without a difference, which must not fail, and with a

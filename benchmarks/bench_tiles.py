@@ -1,7 +1,7 @@
 """A map in tiles against the same one at once: peak memory and CPU time of the whole command, and are they the same?
 
-    python tests/perf/bench_tiles.py [--frames 50 150 ...] [--memory-gb 1] [--jobs 1] [--record] [--json FILE]
-    python tests/perf/bench_tiles.py --city 0.4 0.2 0.1 --tile-size 128
+    python benchmarks/bench_tiles.py [--frames 50 150 ...] [--memory-gb 1] [--jobs 1] [--record] [--json FILE]
+    python benchmarks/bench_tiles.py --city 0.4 0.2 0.1 --tile-size 128
 
 A flight goes to and fro over a field, in legs 40 m apart, with a frame every 30 m: a frame adds about 30,000 voxels of
 0.2 m. It is written as a posed folder and run on one thread, without report, and without recording unless `--record`
@@ -28,7 +28,7 @@ from semstab.core.files import write_json
 from semstab.model.voxels import VoxelTable
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(HERE.parent / "tests"))
 
 from compare_summaries import differences  # noqa: E402
 from posed_writer import write_posed  # noqa: E402

@@ -1,6 +1,6 @@
 """Share of voxels without drift whose p-values fall below a level: none may be above it but by chance.
 
-    python tests/simulation/orders.py [--voxels 10000] [--seed 0]
+    python simulations/orders.py [--voxels 10000] [--seed 0]
 
 Observations of each voxel are exchangeable: labels, scores, or labels of which three in ten are mixed.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from simulated_events import log_of_evidence, soft
 

@@ -1,6 +1,6 @@
 """What a frame costs beside its pixels: opening and planning a long sequence, and the memory that a run takes a frame.
 
-    python tests/perf/bench_long.py [--frames 100000] [--fused 2000 10000] [--still] [--json FILE]
+    python benchmarks/bench_long.py [--frames 100000] [--fused 2000 10000] [--still] [--json FILE]
 
 A posed folder of tiny frames, of which all but 50 are links. CPU seconds and resident memory in MB after each step:
 open the scene, select frames (each pose is read: tracking may have been lost), hash the input, pickle what a task is
@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(HERE.parent / "tests"))
 
 from posed_writer import write_posed  # noqa: E402
 

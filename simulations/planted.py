@@ -1,6 +1,6 @@
 """Copies of a posed folder whose label source has a known fault, to see whether a gate finds it.
 
-    python tests/simulation/planted.py SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
+    python simulations/planted.py SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
 
 Writes OUT/third (the class is labelled as another one in every third frame), OUT/first (in the first third of the
 frames) and OUT/flip (2 % of the pixels, drawn at random, have a random class), each with the scene's own depth, poses

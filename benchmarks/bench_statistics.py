@@ -1,7 +1,7 @@
 """CPU time of the statistics beside that of the loop whose log they read, and the memory that both take.
 
-    python tests/perf/bench_statistics.py [--frames 200] [--size 640x480] [--voxel-size 0.05] [--classes 7] [--rooms 1]
-    python tests/perf/bench_statistics.py --flight --frames 50 --voxel-size 0.2 [--flipped 0.05] [--scores 3]
+    python benchmarks/bench_statistics.py [--frames 200] [--size 640x480] [--voxel-size 0.05] [--classes 7] [--rooms 1]
+    python benchmarks/bench_statistics.py --flight --frames 50 --voxel-size 0.2 [--flipped 0.05] [--scores 3]
 
 A camera walks round a furnished room and sees each place again and again (room.py); with --rooms it goes on to the next
 one; with --flight it flies over a field and sees most places twice (flight.py); --flipped is a share of pixels whose
@@ -38,7 +38,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.fusion_rules import fuse_all
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from posed_writer import write_posed
 

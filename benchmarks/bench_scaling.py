@@ -1,6 +1,6 @@
 """Time of a frame and memory of a voxel as the map grows: does a frame's cost depend on the size of the map?
 
-    python tests/perf/bench_scaling.py [--json FILE] [--backend numba] [--classes 7] [--voxels 100000 ...]
+    python benchmarks/bench_scaling.py [--json FILE] [--backend numba] [--classes 7] [--voxels 100000 ...]
 
 The map grows by one 3840x2160 frame fused at ever new places, 200 m apart. At each size frames at places chosen at
 random are fused again: all their voxels are known, and lie anywhere in the map. Memory is what the process grew by, of

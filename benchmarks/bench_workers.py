@@ -1,6 +1,6 @@
 """One map in tiles on one Dask worker and on two: how much faster are two, and what keeps them from twice as fast?
 
-    python tests/perf/bench_workers.py [--frames 150] [--memory-gb 1] [--workers 1 2] [--repeat 2] [--cold]
+    python benchmarks/bench_workers.py [--frames 150] [--memory-gb 1] [--workers 1 2] [--repeat 2] [--cold]
 
 The flight of bench_tiles.py, in a folder that all see; a real scheduler and worker processes of one thread each on
 127.0.0.1, started before the clock, with so much memory each. They have done a run of a few frames before, as workers

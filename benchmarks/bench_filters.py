@@ -1,6 +1,6 @@
 """CPU time a frame of each filter, on one core.
 
-    python tests/perf/bench_filters.py [--size 640x480] [--classes 8] [--frames 12]
+    python benchmarks/bench_filters.py [--size 640x480] [--classes 8] [--frames 12]
 
 A camera moves along a wall; beliefs are random. Milliseconds are CPU time of all threads, medians over the frames after
 the first four, which fill what a filter remembers and compile.

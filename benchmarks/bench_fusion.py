@@ -1,6 +1,6 @@
 """CPU time of one frame through each fusion backend, beside Open3D's own VoxelBlockGrid.integrate on the same frames.
 
-    python tests/perf/bench_fusion.py [--json FILE] [--sizes 1280x720 3840x2160] [--classes 7] [--rounds 3]
+    python benchmarks/bench_fusion.py [--json FILE] [--sizes 1280x720 3840x2160] [--classes 7] [--rounds 3]
                                       [--conditions "noise 0.3 %" ...] [--backends numba open3d]
 
 The frames fly along a street of facades, trees and sky. 'first' is the first frame of a new map, code already compiled;

@@ -1,6 +1,6 @@
 """CPU time of one frame of soft scores, beside one read of its scores and the finding of its pixels' voxels.
 
-    python tests/perf/bench_scores.py [--sizes 1280x720 3840x2160] [--classes 7 20 150] [--types float32 float16]
+    python benchmarks/bench_scores.py [--sizes 1280x720 3840x2160] [--classes 7 20 150] [--types float32 float16]
                                       [--noise 0] [--rounds 5] [--json FILE]
 
 The frames fly along the street of bench_fusion.py: a third of the image is sky, whose scores nobody needs. 'read' is

@@ -1,6 +1,6 @@
 """How often does the scene's test of drift reject where there is none?
 
-    python tests/simulation/drift.py [--runs 200]
+    python simulations/drift.py [--runs 200]
 
 Groups of 12 voxels that are first seen together, in frames whose errors are anew in each or last (autocorrelation 0.8),
 common to a group or to a frame. Share of scenes of which a p-value is told, and with p <= 0.05, of the test by SBD and
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from simulated_events import log_of
 

@@ -1,6 +1,6 @@
 """How often a frame of a lawn-mower flight is decoded for the parts of its map; nothing is fused.
 
-    python tests/perf/bench_decodes.py [--side 2000] [--pitch 90 50] [--tiles 1 2 4 8] [--json FILE]
+    python benchmarks/bench_decodes.py [--side 2000] [--pitch 90 50] [--tiles 1 2 4 8] [--json FILE]
 
 A UAV flies to and fro at 60 m over a plane, in legs 25 m apart, with a frame every 12 m (70 degrees across: 79 and 70 %
 of a frame overlap with the next one, and with the next leg), and looks so many degrees below the horizon, up to 250 m

@@ -1,6 +1,6 @@
 """The command line on a folder of PNGs, against the bare OpenCV decode of the same files on the same cores.
 
-    python tests/perf/bench_end_to_end.py --backend open3d --json end_to_end.json
+    python benchmarks/bench_end_to_end.py --backend open3d --json end_to_end.json
 
 A folder is made for each kind of depth and noise level: views of the built-in city, rendered at half the size and
 scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as

@@ -1,6 +1,6 @@
 """What the recording costs: the command line on a folder of PNGs and colour JPEGs, with it and without.
 
-    python tests/perf/bench_recording.py --size 1920x1080 --frames 40
+    python benchmarks/bench_recording.py --size 1920x1080 --frames 40
 
 The folder is made as bench_end_to_end.py makes it (16-bit depth with noise, 8-bit labels), with colour as JPEG of the
 quality that cameras use. Runs with and without take turns, bound to the same cores, on files in the page cache; the

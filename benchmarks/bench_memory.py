@@ -1,6 +1,6 @@
 """Does a run take what the memory estimate says? Measured peak of the whole command against it, at once and in tiles.
 
-    python tests/perf/bench_memory.py [--backends numba open3d] [--classes 7 41] [--kinds labels scores] [--json FILE]
+    python benchmarks/bench_memory.py [--backends numba open3d] [--classes 7 41] [--kinds labels scores] [--json FILE]
 
 What a run takes is the peak of the whole command less what it has when it is planned (0.22 GB, with Open3D 0.36). The
 estimate is of all of that: what is loaded later, frames, and the map with what comes of it, of as many voxels and
@@ -30,7 +30,7 @@ from semstab.engine.tiling.sights import Sights
 from semstab.engine.work.memory import GB, Kind, Load, filled_of, voxels_of
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(HERE.parent / "tests"))
 
 from posed_writer import write_posed  # noqa: E402
 

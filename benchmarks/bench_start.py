@@ -1,6 +1,6 @@
 """CPU time until the command has answered: its help, a warm run of one frame, and a run with nothing compiled.
 
-    python tests/perf/bench_start.py [--backend numba] [--rounds 3] [--cold]
+    python benchmarks/bench_start.py [--backend numba] [--rounds 3] [--cold]
 
 User and system time of the whole process; other work on the machine changes little. A small frame of a posed folder is
 fused by one backend; the process ends when its report is there. The cold run compiles into an empty folder, and its

@@ -1,7 +1,7 @@
 """Do thresholds from which labels are acted on keep what they promise?
 
-    python tests/simulation/commit.py simulated [--trials 100] [--seed 0] [--precision 0.9]
-    python tests/simulation/commit.py halves RUN [--precision 0.9]
+    python simulations/commit.py simulated [--trials 100] [--seed 0] [--precision 0.9]
+    python simulations/commit.py halves RUN [--precision 0.9]
 
 Simulated: thresholds are calibrated on one scene, and how often labels with so much evidence are right is counted over
 all other scenes of the same kind. Broken is the share of the thresholds that promise more than that; at most 1 -

@@ -1,6 +1,6 @@
 """CPU time of depth that is cast at a surface: of embree, of Open3D, and of a frame as a scene yields it.
 
-    python tests/perf/bench_casting.py [--json FILE] [--size 4000x2250] [--triangles 400000] [--rounds 3]
+    python benchmarks/bench_casting.py [--json FILE] [--size 4000x2250] [--triangles 400000] [--rounds 3]
 
 A camera looks down at hills. 'frame' is what reading it costs beside the tree, which is built once: rays, cast, and
 writing it to the folder of casts; 'again' is reading that file. Seconds are CPU time of all threads, medians.
