@@ -42,17 +42,7 @@ def run_study(
     observers: Sequence[Observer] = (),
     command: Sequence[str] = (),
     report: bool = True,
-    processes: int = 1,
 ) -> Result:
-    """The same of a study: a unit that fails is among the result's failures, and the others finish.
-
-    Figures are drawn by one process or by two; a script that asks for two must be importable.
-    """
-    reporting = [Reporting(out, processes=processes)] if report else []
-    try:
-        return execute_study(
-            as_config(config), out, executor=executor, observers=[*observers, *reporting], command=command
-        )
-    finally:
-        for observer in reporting:
-            observer.close()
+    """The same of a study: a unit that fails is among the result's failures, and the others finish."""
+    reporting = [Reporting(out)] if report else []
+    return execute_study(as_config(config), out, executor=executor, observers=[*observers, *reporting], command=command)

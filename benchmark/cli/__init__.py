@@ -19,7 +19,7 @@ from semstab.cli.comparing import commit, compare, conform, gate
 from semstab.cli.data import check, convert, predict
 from semstab.cli.options import say
 from semstab.cli.outputs import export, list_, relabel
-from semstab.cli.running import remedies, run, study, view
+from semstab.cli.running import remedies, run, show, study, view
 from semstab.core.process import settle
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 
@@ -149,7 +149,7 @@ def root(
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
     (remedies, "remedies"), (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"),
-    (conform, "conform"), (view, "view"), (list_, "list"),
+    (conform, "conform"), (show, "show"), (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)
 

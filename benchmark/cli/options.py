@@ -170,6 +170,7 @@ TileSize = Annotated[
         show_default="where a map would not fit",
     ),
 ]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print every table.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 
 

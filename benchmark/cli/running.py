@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Iterator
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,6 +29,7 @@ from semstab.cli.options import (
     Scheduler,
     TileSize,
     TrustGeometry,
+    Verbose,
     VoxelSize,
     chosen,
     overrides,
@@ -40,7 +41,6 @@ from semstab.errors import ConfigError
 if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine import Executor, Observer
-    from semstab.model.records import Result
     from semstab.recording.observer import Recording
 
 
@@ -123,6 +123,7 @@ def run(
     classes: Classes = None,
     filters: Filters = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
     named = {
@@ -145,7 +146,7 @@ def run(
     resolved = _load(config, content, predict or [], classes, filters or [])
     if device is not None:
         resolved = _on_device(resolved, device)
-    execute(resolved, out or _default_out(), executor_of(jobs, scheduler), rerun, report, quiet)
+    execute(resolved, out or _default_out(), executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
 
 
 def study(
@@ -170,6 +171,7 @@ def study(
     report: Report = "on",
     trust_geometry: TrustGeometry = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
     from semstab.model.results import slug
@@ -180,7 +182,43 @@ def study(
     )
     if only is not None:
         config = config.only(only)
-    execute(config, out or Path("studies") / slug(config.name), executor_of(jobs, scheduler), rerun, report, quiet)
+    execute(
+        config,
+        out or Path("studies") / slug(config.name),
+        executor_of(jobs, scheduler),
+        rerun,
+        report,
+        quiet=quiet,
+        verbose=verbose,
+    )
+
+
+def show(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")],
+    what: Annotated[
+        list[str] | None, typer.Argument(metavar="[TABLE]...", help="Tables to print, by the beginning of their names.")
+    ] = None,
+) -> None:
+    """Print the answer of a finished run again, or its tables, without computing."""
+    from rich.console import Console
+
+    from semstab.engine.folder import load_result
+    from semstab.report.tables import tables
+    from semstab.report.tables.table import to_terminal
+    from semstab.report.terminal import print_summary
+
+    result, console = load_result(run), Console()
+    there = {table.name: table for table in tables(result)}
+    if not what:
+        print_summary(result, console, out=run)
+        console.print(f"  tables  {', '.join(there)}", highlight=False, markup=False)
+        return
+    for name in what:
+        chosen_tables = [table for key, table in there.items() if key.startswith(name)]
+        if not chosen_tables:
+            raise ConfigError(f"{run}: no table '{name}'; there are {', '.join(there)}")
+        for table in chosen_tables:
+            console.print(f"{to_terminal(table)}\n", highlight=False, markup=False, soft_wrap=True)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
@@ -205,8 +243,18 @@ def _why_no_recording(run: Path) -> str:
     return f"{run}: was not recorded (a study is only where it is asked for); {shown}start it again with --rerun FILE"
 
 
-def execute(config: Config, out: Path, executor: Executor, rerun: str | None, report: str, quiet: bool) -> None:
-    """Run it, say what was found, and end with the exit code that this calls for."""
+def execute(
+    config: Config,
+    out: Path,
+    executor: Executor,
+    rerun: str | None,
+    report: str,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+) -> None:
+    """Run it, print the answer, and end with the exit code that it calls for."""
+    began = time.monotonic()
     from rich.console import Console
 
     from semstab.api import run_study
@@ -220,7 +268,7 @@ def execute(config: Config, out: Path, executor: Executor, rerun: str | None, re
     gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
     try:
         told: dict[str, Any] = {"executor": executor, "observers": observers, "command": sys.argv}
-        result = run_study(config, out, **told, report=report == "on", processes=2)
+        result = run_study(config, out, **told, report=report == "on")
         for line in failure_lines(result):
             say(f"error: {line}")
         if not quiet:
@@ -228,9 +276,7 @@ def execute(config: Config, out: Path, executor: Executor, rerun: str | None, re
             if remedies(result):
                 print_remedies(result, console)
             elif result.select():
-                print_summary(result, console)
-            for line in _where(result, out, recording, report):
-                console.print(line, soft_wrap=True, markup=False, highlight=False)
+                print_summary(result, console, out=out, seconds=time.monotonic() - began, verbose=verbose)
         for each in recording:
             each.serve()
     finally:
@@ -250,16 +296,6 @@ def _recording(rerun: str | None, out: Path) -> list[Recording]:
     from semstab.recording.target import Target
 
     return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
-
-
-def _where(result: Result, out: Path, recording: list[Recording], report: str) -> Iterator[str]:
-    """Where to find what."""
-    yield f"folder: {out}"
-    if report == "on" and result.select():
-        yield f"report: {out / 'report.html'}"
-    for each in recording:
-        file = each.target.file
-        yield f"recording: semstab-bench view {out if file == out / 'recording.rrd' else file}"
 
 
 def executor_of(jobs: int, scheduler: str | None) -> Executor:
@@ -352,4 +388,4 @@ def remedies(
     )
     for line in left_out if not quiet else ():
         say(line)
-    execute(config, out, executor_of(jobs, None), "off", report, quiet)
+    execute(config, out, executor_of(jobs, None), "off", report, quiet=quiet)

@@ -181,6 +181,7 @@ class Config(Settings):
         description="edge of a tile, voxels, a power of 2: maps are fused tile by tile; where not given, only those"
         " that would not fit, in tiles of a chosen size; off: such a map is refused; not kept",
     )
+    svg: bool = Field(False, exclude=True, description="also write figures as SVG, for print; not kept")
     check_geometry: bool = Field(
         True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
     )

@@ -7,7 +7,6 @@ import io
 import itertools
 import json
 import re
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,14 +26,7 @@ from semstab.report.tables import tables, write_tables
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from semstab.config import Config
     from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
-    from semstab.model.results import Unit, UnitSummary
-    from semstab.model.voxels import VoxelTable
-    from semstab.report.figures import DrawingProcess
-    from semstab.task import Task
 
 
 # The parts of a page that needs no other file: its style, tables and figures.
@@ -114,19 +106,18 @@ def figure_block(figure: Figure, folder: Path) -> dict[str, Any]:
     """A figure as the page holds it; drawn where FOLDER/figures lacks it."""
     from PIL import Image
 
-    png, svg = (folder / "figures" / f"{figure.name}.{suffix}" for suffix in ("png", "svg"))
-    if not (png.exists() and svg.exists()):
-        figure.save(folder / "figures")
+    png = folder / "figures" / f"{figure.name}.png"
+    if not png.exists():
+        figure.save(png.parent)
     with Image.open(png) as image:
         width, height = (edge / DPI for edge in image.size)
-        data = _screen_png(image) if figure.dense else svg.read_bytes()
-    kind = "png" if figure.dense else "svg+xml"
+        data = _screen_png(image)
     return {
         "name": figure.name,
         "title": figure.title,
         "caption": relations(figure.caption),
         "alt": figure.alt,
-        "source": f"data:image/{kind};base64,{base64.b64encode(data).decode()}",
+        "source": f"data:image/png;base64,{base64.b64encode(data).decode()}",
         "width": round(width * CSS_INCH),
         "height": round(height * CSS_INCH),
         "narrow": width <= COLUMN * 1.01,
@@ -150,53 +141,24 @@ __all__ = ["Reporting", "write_report"]
 MOST_NAMED = 3
 """Scenes that are named in the title."""
 
-WORTH_A_PROCESS = 5.0
-"""Seconds of work from which on figures are drawn by two processes."""
-
 
 class Reporting(Observer):
-    """Writes tables, figures and report.html into the folder when all has been computed, by one process or two."""
+    """Writes tables, figures and report.html into the folder when all has been computed."""
 
-    def __init__(self, folder: str | Path, *, processes: int = 1) -> None:
+    def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
-        self._processes = processes
-        self._began = time.monotonic()
-        self._beside: DrawingProcess | None = None
-        self._views = figures.Views()
-        self._watched = ""
-        self._up: npt.ArrayLike | None = None
+        self._svg = False
 
     def run_started(self, plan: Plan, kept: Sequence[PlannedUnit | PlannedRegions]) -> None:
-        """Figures show the units of the first backend; of the statistics they show more than the map says."""
-        self._watched = "" if plan.config.statistics else plan.config.backends[0].name
-
-    def group_started(self, task: Task, config: Config) -> None:
-        """Where up is in the scene that is fused now."""
-        self._up = task.scene.up
-
-    def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
-        """Take from the map what figures show of it."""
-        if unit.backend == self._watched:
-            self._views.see(unit, table, self._up)
-
-    def advanced(self, frames: int, what: str) -> None:
-        """What takes a while is worth a second process for its figures."""
-        if self._beside is None and self._processes > 1 and time.monotonic() - self._began > WORTH_A_PROCESS:
-            from semstab.report.figures import DrawingProcess
-
-            self._beside = DrawingProcess()
+        """Which formats figures are written in."""
+        self._svg = plan.config.svg
 
     def run_finished(self, result: Result) -> None:
         """Write them; nothing where every unit failed."""
         if result.select():
             write_tables(result, self._folder)
-            figures.write_figures(result, self._folder, self._views, self._beside)
+            figures.write_figures(result, self._folder, svg=self._svg)
             write_report(result, self._folder)
-
-    def close(self) -> None:
-        """End the second process."""
-        if self._beside is not None:
-            self._beside.close()
 
 
 def write_report(result: Result, folder: str | Path) -> list[Path]:

@@ -1,214 +1,250 @@
-"""The summary of a run or a study in the terminal."""
+"""The answer on one screen of 80 columns; progress while a run works; and what failed."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from semstab.check import Verdict
-from semstab.config import BACKENDS, BASE
+from semstab.config import BASE
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan, Planned
-from semstab.metrics import macro_mean, pool, split_last
-from semstab.model.measures import VSS, measures
+from semstab.metrics import macro_mean
+from semstab.model.measures import measures
 from semstab.model.records import Failure, Record, Result
-from semstab.model.results import STAGES, Agreement, Means, UnitSummary
-from semstab.report.averages import Sweep, describe, levels, over_all, over_recurrent, pooled
-from semstab.report.narrative import HARDLY_ANY, remarks
-from semstab.report.remedies import Remedies, Remedy, advice, remedies
-from semstab.report.tables.remedies import COLUMNS, marked
-from semstab.report.tables.remedies import row as remedy_row
-from semstab.report.terminal_statistics import comparison_lines, lines
+from semstab.model.results import Agreement, UnitSummary
+from semstab.model.statistics import Estimate
+from semstab.report.narrative import warnings
+from semstab.report.remedies import advice, remedies
+from semstab.report.tables import tables
+from semstab.report.tables.table import to_terminal
+from semstab.statistics.agreement import ALPHA
+from semstab.statistics.verdict import RELIABLE, TENTATIVE
 from semstab.task import Task
 
-NOTHING = "-"
-
-FUSION_STAGES = ("association", "update")
-"""Parts of fusion; frames are decoded beside it, and waited for where that takes longer."""
-
+WIDTH = 80
 RARE = 100
-"""Voxels below which a class is too rare to be called the worst."""
+"""Voxels below which a class is too rare to be called unstable."""
 
-MOST_CLASSES = 10
-"""So many classes a backbone are shown, the least steady first; the others are in the tables."""
+MOST_CLASSES = {1: 5, 2: 3}
+"""How many of the least stable classes are listed by the number of models; 1 of more models."""
+
+MOST_WARNINGS = 2
+STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other voxel sizes", "write": "writing"}
 
 
-def print_summary(result: Result, console: Console) -> None:
-    """The scene table, the strata, the agreement of the backends, and how to read them."""
-    shown = [record.summary for record in result.select()]
-    console.print(_scene_table(shown))
-    console.print(_strata_table(shown))
-    console.print(_class_table(result))
+def print_summary(
+    result: Result, console: Console, *, out: Path | None = None, seconds: float | None = None, verbose: bool = False
+) -> None:
+    """The answer first, then where to look; `verbose` adds every table of the run."""
+    for line in screen(result, out=out, seconds=seconds):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    for table in tables(result) if verbose else ():
+        console.print(f"\n{to_terminal(table)}", highlight=False, markup=False, soft_wrap=True)
+
+
+def screen(result: Result, *, out: Path | None = None, seconds: float | None = None) -> Iterator[str]:
+    """The lines of a run or a study: verdicts, least stable classes, warnings, the check, the time, where to look."""
+    records = result.select()
+    if len(records) == 1:
+        yield from _one(result, records[0])
+    else:
+        yield from _several(result, records)
     for sweep in result.sweeps():
-        console.print(_sweep_table(result, describe(sweep)))
-    if len(named := _named(result)) > len(shown):
-        console.print(_backends_table(named))
-    if result.compared:
-        console.print(_compared_table(result.compared))
-    drawn = [row for row in result.agreement if row.one_in > 1]
-    if told := [row for row in result.agreement if row not in drawn or not row.agrees]:
-        console.print(_agreement_table(told))
-    if drawn:
-        console.print(f"{_drawn(drawn)}\n", highlight=False, markup=False)
-    console.print(_stages_line(shown), highlight=False)
-    for text in _statistics(result):
-        console.print(text, highlight=False, markup=False, soft_wrap="\n" in text.rstrip())  # tables keep their lines
-    for text in remarks(result):
-        console.print(f"- {text}", highlight=False, markup=False)
-    console.print()
-    for run in shown:
-        if run.frames_left_out:
-            text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_left_out} of"
-            text += f" {run.frames + run.frames_left_out} selected frames were left out: they lack a file or a pose"
-            console.print(text, soft_wrap=True, markup=False)
-        if (cut := run.scores_left_out) is not None:
-            text = f"{run.unit.scene}, {run.unit.backbone}: top_k leaves out {cut.mean:.2%} of a pixel's scores on"
-            text += f" average, {cut.most:.2%} at most: no voxel's belief or VSS changes by more than that"
-            console.print(text, soft_wrap=True, markup=False, highlight=False)
-        if run.frames_empty:
-            text = f"{run.unit.scene}, {run.unit.backbone}: {run.frames_empty} of {run.frames} frames hold no pixel"
-            console.print(f"{text} with both depth and a label", soft_wrap=True, markup=False)
-    once = sum(_once(run) for run in shown) / sum(run.table.voxels for run in shown)
-    if once < HARDLY_ANY:
+        yield f"  sweep over {sweep.replace('_', ' ')}: semstab-bench show {out or 'RUN'} sensitivity_{sweep}"
+    for text in list(warnings(result))[:MOST_WARNINGS]:
+        yield from textwrap.wrap(f"warning: {text}", WIDTH, initial_indent="  ", subsequent_indent="    ")
+    yield from _checks(result)
+    yield from _where(result, out, seconds)
+
+
+# --- One model on one scene -------------------------------------------------------------------------------------------
+
+
+def _one(result: Result, record: Record) -> Iterator[str]:
+    run, found = record.summary, record.summary.statistics
+    yield _head(f"{run.unit.scene} / {run.unit.backbone}", result, [run])
+    yield ""
+    if found is not None:
+        yield from _verdict(run)
+    recurrent = run.table.recurrent
+    yield f"  of the map   {_percent(recurrent.share)} seen 3 times or more, {_percent(1 - recurrent.share)} fewer"
+    yield from _flicker(record)
+    yield from _classes([record])
+    if run.worst_frames:
+        yield f"  most drift in frames    {' '.join(str(frame.frame) for frame in run.worst_frames)}"
+    means = "  ".join(f"{m.word} {recurrent[m]:.{m.digits[0]}f}{f' {m.unit}' if m.unit else ''}" for m in measures())
+    yield f"  paper's measures        OP>=3: {means}"
+    yield ""
+
+
+def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
+    """What was fused: '40 frames, 7 classes, 0.2 m voxels', and whether depth and poses agree."""
+    first = runs[0]
+    frames = sorted({run.frames for run in runs})
+    counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
+    what = f"{counts} frames, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels"
+    return f"{name}    {what}    {_geometry(result)}".rstrip()
+
+
+def _geometry(result: Result) -> str:
+    states: Mapping[str, Mapping[str, object]] = result.manifest.get("geometry", {})
+    if not states:
+        return ""
+    errors = [float(error) for found in states.values() if isinstance(error := found.get("error"), float)]
+    if all(found.get("state") == "sound" for found in states.values()):
+        return f"geometry ok ({100 * max(errors):.2g} %)" if errors else "geometry ok"
+    return "geometry unclear: semstab-bench check"
+
+
+def _verdict(run: UnitSummary) -> Iterator[str]:
+    """The level, the number that it rests on, and what that number means."""
+    found = run.statistics
+    assert found is not None
+    level, alpha = found.verdict.level.upper(), found.judged.alpha_between
+    if found.verdict.level == "no verdict":
+        yield from textwrap.wrap(found.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    console.print(
-        f"{once:.0%} of the voxels were seen once: they say nothing about stability. "
-        f"Read {_listed([measure.word for measure in measures()])} by OP, or for OP>=3."
+    share = ""
+    if found.reach is not None and not math.isnan(found.reach.reached.value):
+        share = f", {_percent(found.reach.reached.value)} of its ceiling {found.reach.ceiling.value:.2f}"
+    yield f"  {level}    alpha {alpha.value:.2f}{_interval(alpha)}{share}"
+    yield f"  act on labels from {_percent(RELIABLE)} of the ceiling on, with care from {_percent(TENTATIVE)}"
+    psa = found.judged.psa.value
+    yield f"  two frames see the same class at {_percent(psa)} of the locations"
+    wrong = found.judged.wrong_of_stable
+    if not math.isnan(wrong.value):
+        yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the stable locations are wrong"
+    yield ""
+
+
+def _flicker(record: Record) -> Iterator[str]:
+    compensated = record.image_space.compensated_flicker_percent
+    if not math.isnan(compensated):
+        yield f"  flicker      {compensated:.1f} % of the pixels change class between frames (camera motion removed)"
+
+
+def _interval(found: Estimate, scale: float = 1.0) -> str:
+    if math.isnan(found.low) or math.isnan(found.high):
+        return ""
+    if scale == 1.0:
+        return f" (95 % CI {_short(found.low)} to {_short(found.high)})"
+    return f" ({scale * found.low:.0f} to {scale * found.high:.0f} %)"
+
+
+def _short(value: float) -> str:
+    """'.55' for 0.55."""
+    text = f"{value:.2f}"
+    return text.replace("0.", ".", 1) if abs(value) < 1 else text
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def _metres(size: float) -> str:
+    return f"{1000 * size:g} mm" if size < 0.01 else f"{size:g} m"
+
+
+# --- Several ----------------------------------------------------------------------------------------------------------
+
+
+def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
+    """A row a scene and model; the differences to the first model where they are known."""
+    yield _head(
+        ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else ""), result, [r.summary for r in records]
     )
+    yield ""
+    accuracy = any(record.summary.statistics is not None and _miou(record) == _miou(record) for record in records)
+    width = min(20, max(len(record.unit.backbone) for record in records) + 2)
+    head = f"  {'model':<{width}} {'verdict':<14}{'alpha (95 % CI)':<19}{'agree':>6}{'flicker':>8}{'VSS':>7}{'SBD':>8}"
+    yield head + (f"{'mIoU':>6}" if accuracy else "")
+    yield f"  {'':<{width}} {'':<14}{'':<19}{'%':>6}{'%':>8}{'OP>=3':>7}{'bits':>8}" + (f"{'%':>6}" if accuracy else "")
+    for scene in result.scenes:
+        own = [record for record in records if record.unit.scene == scene]
+        if len(result.scenes) > 1 and own:
+            yield f"  {scene}"
+        for record in own:
+            yield _row(record, width, accuracy=accuracy)
+    yield from _differences(result)
+    yield from _classes(records)
+    yield ""
 
 
-def _statistics(result: Result) -> Iterator[str]:
-    """The verdict on each backbone, scene by scene; with `--statistics` all that was found, and the comparisons."""
-    units = [record.summary for record in (*result.select(), *result.select(BACKENDS))]
-    for base in result.select():
-        group = (base.unit.scene, base.unit.backbone)
-        same = [run for run in units if (run.unit.scene, run.unit.backbone) == group]
-        judged = [run.statistics for run in same if run.statistics is not None]
-        if judged:
-            fullest = max(judged, key=lambda found: found.sections)
-            if fullest.sections:
-                yield "\n".join([*_headline(f"{base.unit.scene}, {base.unit.backbone}"), *lines(fullest), ""])
-            else:
-                scene = f"{base.unit.scene}, " if len(result.scenes) > 1 else ""
-                yield f"{scene}{fullest.verdict.line}\n"
-    for compared in result.comparisons:
-        title = f"{compared.scene}: {_listed(compared.backbones)}"
-        yield "\n".join([*_headline(title), *comparison_lines(compared), ""])
+def _row(record: Record, width: int, *, accuracy: bool) -> str:
+    run, found = record.summary, record.summary.statistics
+    level, alpha, agree = "-", "", math.nan
+    if found is not None:
+        judged = found.judged
+        level, agree = found.verdict.level, 100 * judged.psa.value
+        ends = (
+            ""
+            if math.isnan(judged.alpha_between.low)
+            else f" ({_short(judged.alpha_between.low)} to {_short(judged.alpha_between.high)})"
+        )
+        alpha = f"{judged.alpha_between.value:.2f}{ends}"
+    vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
+    name = run.unit.backbone if len(run.unit.backbone) <= width else run.unit.backbone[: width - 1] + "…"
+    flicker = record.image_space.compensated_flicker_percent
+    cells = f"  {name:<{width}} {level:<14}{alpha:<19}{_number(agree, 0):>6}{_number(flicker, 1):>8}"
+    cells += f"{_number(vss, 3):>7}{_number(sbd, 4):>8}"
+    return cells + (f"{_number(100 * _miou(record), 1):>6}" if accuracy else "")
 
 
-def _headline(title: str) -> tuple[str, str]:
-    return title, "-" * len(title)
+def _miou(record: Record) -> float:
+    """Of the fused labels seen twice or more; NaN without ground truth."""
+    found = record.summary.statistics
+    rows = [] if found is None or found.correctness is None else found.correctness.strata
+    return rows[0].miou if rows else math.nan
 
 
-def _once(run: UnitSummary) -> int:
-    return sum(row.voxels for row in run.table.strata if row.name == "OP=1")
+def _differences(result: Result) -> Iterator[str]:
+    """How far alpha differs from the first model's on the locations that all saw, where that was compared."""
+    for comparison in result.comparisons:
+        first = comparison.backbones[0]
+        for row in comparison.paired.differences:
+            if row.measure == ALPHA.key and first in (row.a, row.b):
+                sign = 1.0 if row.b == first else -1.0
+                other = row.a if row.b == first else row.b
+                value = sign * row.difference.value
+                low, high = sorted((sign * row.difference.low, sign * row.difference.high))
+                clear = "" if low > 0 or high < 0 else ": not told apart"
+                place = f"{comparison.scene}: " if len(result.scenes) > 1 else ""
+                yield f"  {place}{other} less {first}: alpha {value:+.2f} ({low:+.2f} to {high:+.2f}){clear}"
 
 
-def narrow_table(title: str, names: Sequence[str], numbers: Sequence[str]) -> Table:
-    """A table that fits 80 columns: no lines between columns, headers of two lines."""
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True
-    )
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+# --- Both -------------------------------------------------------------------------------------------------------------
+
+
+def _classes(records: Sequence[Record]) -> Iterator[str]:
+    """The classes on which frames agree least, of those that cover enough of the map."""
+    names = list(dict.fromkeys(record.unit.backbone for record in records))
+    most, alone = MOST_CLASSES.get(len(names), 1), len(names) == 1
+    lines = []
     for name in names:
-        table.add_column(name, vertical="bottom", overflow="fold")  # names give way, numbers do not
-    for name in numbers:
-        table.add_column(name, justify="right", vertical="bottom", no_wrap=True)
-    return table
+        alphas = class_alphas([record for record in records if record.unit.backbone == name])
+        shares = _class_shares([record for record in records if record.unit.backbone == name])
+        common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in alphas]
+        for key in sorted(common, key=alphas.__getitem__)[:most]:
+            label = key if alone else f"{name}: {key}"
+            lines.append(f"    {label[:30]:<30}{alphas[key]:>6.2f}{100 * shares[key][1]:>9.0f} %")
+    if lines:
+        yield ""
+        yield f"  {'least stable classes':<32}{'alpha':>6}{'of the map':>12}"
+        yield from lines
 
 
-def _scene_table(runs: Sequence[UnitSummary]) -> Table:
-    numbers = ("voxels", "mean\nOP", *_headers(), "flicker\n%", "OP>=3\n%")
-    table = narrow_table(escape(_title(runs)), ("scene",), numbers)
-    for backbone, rows in _by_backbone(runs):
-        table.add_row(escape(backbone), style="bold")
-        for run in rows:
-            table.add_row(escape(f"  {run.unit.scene}"), *_scene_cells([run]))
-        if len(rows) > 1:
-            table.add_row("  total/mean", *_scene_cells(rows))
-    return table
-
-
-def _scene_cells(runs: Sequence[UnitSummary]) -> list[str]:
-    """One scene's numbers, or the totals and macro means of several (each scene counts once)."""
-    tables = [run.table for run in runs]
-    return [
-        f"{sum(table.voxels for table in tables):,}",
-        _number(macro_mean([table.mean_op for table in tables]), 2),
-        *(_number(macro_mean([table[m] for table in tables]), m.digits[0]) for m in measures()),
-        _number(macro_mean([run.flicker_percent for run in runs]), 2),
-        _number(100 * macro_mean([table.recurrent.share for table in tables]), 2),
-    ]
-
-
-def _strata_table(runs: Sequence[UnitSummary]) -> Table:
-    title = "by observation persistence" + (", all scenes pooled" if len(_scenes(runs)) > 1 else "")
-    table = narrow_table(title, ("persistence",), ("voxels", "%", *_headers()))
-    for backbone, rows in _by_backbone(runs):
-        table.add_row(escape(backbone), style="bold")
-        voxels = sum(run.table.voxels for run in rows)
-        for strata in zip(*(run.table.strata for run in rows), strict=True):
-            table.add_row(*_stratum_cells(pool(strata, voxels)))
-        for part in split_last([run.table for run in rows]):
-            table.add_row(*_stratum_cells(part), style="dim")
-        table.add_row(*_stratum_cells(pool([run.table.recurrent for run in rows], voxels)), style="italic")
-    return table
-
-
-def _stratum_cells(row: Means) -> list[str]:
-    return [
-        f"  {row.name}",
-        f"{row.voxels:,}",
-        _number(100 * row.share, 2),
-        *(_number(row[m], m.digits[0]) for m in measures()),
-    ]
-
-
-def _headers() -> list[str]:
-    """Each measure over an arrow that says which way is good, and its unit."""
-    arrows = [(measure, "↑" if measure.better == "higher" else "↓") for measure in measures()]
-    return [f"{m.word} {arrow}\n{m.unit}" if m.unit else f"{m.word}\n{arrow}" for m, arrow in arrows]
-
-
-def _stages_line(runs: Sequence[UnitSummary]) -> str:
-    """Mean milliseconds a frame: of fusion, with its parts where they are known, and of what is done beside it."""
-    means = {stage: macro_mean([run.stages_ms.get(stage, math.nan) for run in runs]) for stage in STAGES}
-    known = {stage: f"{stage} {value:.1f}" for stage, value in means.items() if not math.isnan(value)}
-    parts = ", ".join(known.pop(stage) for stage in FUSION_STAGES if stage in known)
-    fusion = _number(macro_mean([run.fuse_ms_per_frame for run in runs]), 1)
-    beside = "".join(f", {text}" for text in known.values())
-    return f"ms a frame: fusion {fusion}{f' ({parts})' if parts else ''}{beside}\n"
-
-
-def _class_table(result: Result) -> Table:
-    """Classes that there are, by how well frames agree on them, the worst first; rare ones at the end."""
-    maps = {backbone: result.select(backbone=backbone) for backbone in result.backbones}
-    seen = {name: [row for row in pooled(records).classes if row.voxels] for name, records in maps.items()}
-    title = "by class, the least steady first"
-    if any(row.voxels < RARE for there in seen.values() for row in there):
-        title += f", those of fewer than {RARE} voxels last"
-    title += ", all scenes pooled" if len(result.scenes) > 1 else ""
-    known = any(_class_alphas(result.select()).values())
-    table = narrow_table(title, ("class",), ("voxels", "%", *_headers(), *(["alpha\n↑"] if known else [])))
-    for backbone, there in seen.items():
-        alphas = _class_alphas(maps[backbone])
-        there.sort(key=lambda row: (row.voxels < RARE, alphas.get(row.name, 1.0), row[VSS]))
-        table.add_row(escape(backbone), style="bold")
-        for row in there[:MOST_CLASSES]:
-            name, *cells = _stratum_cells(row)
-            table.add_row(escape(name), *cells, *([_number(alphas.get(row.name, math.nan), 2)] if known else []))
-        if len(there) > MOST_CLASSES:
-            table.add_row(f"  ... {len(there) - MOST_CLASSES} more")
-    return table
-
-
-def _class_alphas(records: Sequence[Record]) -> dict[str, float]:
+def class_alphas(records: Sequence[Record]) -> dict[str, float]:
     """Krippendorff's alpha of each class, the macro mean over scenes, where it is known."""
     found: dict[str, list[float]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
@@ -218,112 +254,57 @@ def _class_alphas(records: Sequence[Record]) -> dict[str, float]:
     return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
 
 
-def _sweep_table(result: Result, sweep: Sweep) -> Table:
-    """What a sweep came to: of all voxels, of the recurrent ones, how many these are, and how far frames agree."""
-    numbers = (f"{VSS.word}\nall", f"{VSS.word}\nOP>=3", "OP>=3\n%", "alpha\n↑")
-    table = narrow_table(sweep.title, (sweep.header,), numbers)
-    for backbone in result.backbones:
-        found = levels(result, sweep.name, backbone)
-        if found:
-            table.add_row(escape(backbone), style="bold")
-        for level in found:
-            means = (level.mean(over_all(VSS)), level.mean(over_recurrent(VSS)))
-            share, alpha = 100 * level.mean(lambda p: p.recurrent.share), level.mean(lambda p: p.alpha.value)
-            cells = (*(_number(mean, VSS.digits[0]) for mean in means), _number(share, 2), _number(alpha, 2))
-            table.add_row(f"  {sweep.text(level.value)}", *cells)
-    return table
+def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:
+    """Voxels of each class, and their share of the map."""
+    voxels: dict[str, int] = {}
+    for row in (row for record in records for row in record.summary.table.classes):
+        voxels[row.name] = voxels.get(row.name, 0) + row.voxels
+    total = sum(record.summary.table.voxels for record in records)
+    return {name: (n, n / max(1, total)) for name, n in voxels.items()}
 
 
-def _named(result: Result) -> list[UnitSummary]:
-    """The units of all backends that were asked for, not of one that others are only checked against."""
-    others = [record.summary for record in result.select(BACKENDS) if record.statistics is not None]
-    return [*(record.summary for record in result.select()), *others]
+def _checks(result: Result) -> Iterator[str]:
+    """How the backends agree with each other: one line a pair."""
+    for pair in dict.fromkeys(row.backends for row in result.agreement):
+        rows = [row for row in result.agreement if row.backends == pair]
+        yield f"  {_check(pair, rows)}"
+    for row in result.compared:
+        relabelled = 100 * row.differences["label"].mean
+        yield f"  {row.backends[1]} differs from {row.backends[0]} by design: {relabelled:.1f} % of the labels"
 
 
-def _backends_table(runs: Sequence[UnitSummary]) -> Table:
-    numbers = ("voxels", "mean\nOP", *_headers()[:2], "OP>=3\n%", "ms a\nframe")
-    title = "fusion backends, the same frames" + (", all scenes" if len(_scenes(runs)) > 1 else "")
-    table = narrow_table(title, ("backend",), numbers)
-    for backbone, rows in _by_backbone(runs):
-        table.add_row(escape(backbone), style="bold")
-        for name in dict.fromkeys(run.unit.backend for run in rows):
-            own = [run for run in rows if run.unit.backend == name]
-            voxels, mean_op, *means, _, recurrent = _scene_cells(own)  # two measures leave room for the name
-            fusion = _number(macro_mean([run.fuse_ms_per_frame for run in own]), 1)
-            table.add_row(escape(f"  {name}"), voxels, mean_op, *means[:2], recurrent, fusion)
-    return table
-
-
-def _compared_table(compared: Sequence[Agreement]) -> Table:
-    """How backends differ that associate pixels and voxels in another way: mean differences of a voxel of both."""
-    symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures() if not measure.lowest_op > 1}}
-    numbers = ("first\nonly", "other\nonly", "label\ndiffers", *(f"mean\nΔ{s}" for s in symbols.values()))
-    table = narrow_table("backends that differ by design, voxel by voxel", ("scene, backbone",), numbers)
-    for pair in dict.fromkeys(row.backends for row in compared):
-        table.add_row(escape("\n".join(pair)), style="bold")
-        for row in (row for row in compared if row.backends == pair):
-            share = [f"{100 * only / max(1, n):.1f}%" for only, n in zip(row.only_in, row.voxels, strict=True)]
-            means = [_number(row.differences[name].mean, 3) for name in symbols]
-            label = f"{100 * row.differences['label'].mean:.1f}%"
-            table.add_row(escape(f"  {row.scene}, {row.backbone}"), *share, label, *means)
-    return table
-
-
-def _agreement_table(agreement: Sequence[Agreement]) -> Table:
-    symbols = {"op": "OP", **{measure.key: measure.symbol for measure in measures()}, "evidence": "e"}
-    numbers = ("voxels\nin one", *(f"Δ{symbol}" for symbol in symbols.values()), "")
-    short = [f"{measure.symbol} {measure.word}" for measure in measures() if measure.short]
-    title = f"agreement: largest differences of a voxel ({', '.join([*short, 'e evidence'])})"
-    table = narrow_table(title, ("scene, backbone",), numbers)
-    for pair in dict.fromkeys(row.backends for row in agreement):
-        table.add_row(escape(" · ".join(pair)), style="bold")
-        for row in (row for row in agreement if row.backends == pair):
-            largest = [row.differences[name].max for name in symbols]
-            differences = [f"{difference:.0e}" if difference else "0" for difference in largest]
-            verdict = "[green]agree[/]" if row.agrees else "[bold red]DISAGREE[/]"
-            table.add_row(escape(f"  {row.scene}, {row.backbone}"), f"{sum(row.only_in):,}", *differences, verdict)
-    return table
-
-
-def _drawn(sampled: Sequence[Agreement]) -> str:
-    """How the backends fared that were checked on a sample of the voxels."""
-    backends = _listed([*dict.fromkeys(row.backends[0] for row in sampled)])
-    voxels, bad = sum(row.voxels[1] for row in sampled), sum(not row.agrees for row in sampled)
-    found = f"{bad} of {len(sampled)} maps differ" if bad else "none differs"
+def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
+    checked, reference = pair
+    voxels, bad = sum(row.voxels[-1] for row in rows), [row for row in rows if not row.agrees]
+    drawn = f" drawn at random, 1 in {rows[0].one_in}" if rows[0].one_in > 1 else ""
+    if not bad:
+        return f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal"
+    row = bad[0]
+    measure = max(row.differences, key=lambda name: row.differences[name].max)
+    only = f", {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
     return (
-        f"check: {backends} against the numpy reference on {voxels:,} voxels drawn at random, one in"
-        f" {sampled[0].one_in}: {found} (--check numpy: on all of them)"
+        f"{checked} and {reference} DISAGREE in {len(bad)} of {len(rows)} maps: {row.scene}, {row.backbone}: {measure}"
+        f" differs by {row.differences[measure].max:.1e}{only}"
     )
 
 
-def _listed(words: Sequence[str]) -> str:
-    """'a, b and c'."""
-    *most, last = words
-    return f"{', '.join(most)} and {last}" if most else last
+def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[str]:
+    """How long it took, and what to open or type next."""
+    if seconds is not None:
+        stages = {STAGE_NAMES.get(k, k): v for k, v in result.manifest.get("seconds", {}).items() if k != "all"}
+        longest = sorted(stages, key=lambda name: -stages[name])[:3]
+        parts = ", ".join(f"{name} {stages[name]:.0f}" for name in longest if stages[name] >= 1)
+        yield f"  {seconds:.0f} s{f' (CPU work of {parts})' if parts else ''}"
+    if out is None:
+        return
+    if (out / "report.html").exists():
+        yield f"  report  {out / 'report.html'}"
+    if (out / "recording.rrd").exists():
+        yield f"  viewer  semstab-bench view {out}"
+    yield f"  more    semstab-bench show {out}"
 
 
-def _title(runs: Sequence[UnitSummary]) -> str:
-    first = runs[0]
-    return (
-        f"{first.unit.backend}, voxels of {first.table.voxel_size:g} m, {first.taxonomy} (K = {first.table.K}), "
-        f"{first.frames} frames a scene"
-    )
-
-
-def _by_backbone(runs: Sequence[UnitSummary]) -> list[tuple[str, list[UnitSummary]]]:
-    names = list(dict.fromkeys(run.unit.backbone for run in runs))
-    return [(name, [run for run in runs if run.unit.backbone == name]) for name in names]
-
-
-def _scenes(runs: Sequence[UnitSummary]) -> set[str]:
-    return {run.unit.scene for run in runs}
-
-
-def _number(value: float, digits: int) -> str:
-    return NOTHING if math.isnan(value) else f"{value:.{digits}f}"
-
-
-# What a run or a study looks like in the terminal while it works, and what failed.
+# --- While it works, and what failed ---------------------------------------------------------------------------------
 
 SECONDS_A_LINE = 10.0
 """Where there is no terminal for a bar, progress is a line that often."""
@@ -413,50 +394,11 @@ def _named_task(failure: Failure) -> str:
     return f"{failure.variation.sweep} {failure.unit.backend if value is None else f'{value:g}'}"
 
 
-# The remedies in the terminal: a table within 80 columns, and what to use.
-
-HEADERS = (
-    "flick\n%",
-    "alpha",
-    "fore-\nsight\n%",
-    "accu-\nracy\n%",
-    "mIoU\n%",
-    "stable\nwrong\n%",
-    "lag",
-    "cov.\n%",
-    "ms",
-)
-DIGITS = (1, 3, 1, 1, 1, 1, 1, 0, 0)
-
-
 def print_remedies(result: Result, console: Console) -> None:
-    """A table a model; '*' is the filter to use, '!' one that steadies the labels and makes them worse."""
+    """The filter to use for each model, then the table of all; '*' is the one to use, '!' makes labels worse."""
     for found in remedies(result):
-        console.print(_table(found))
         for sentence in advice(found):
             console.print(sentence, highlight=False, markup=False)
-        console.print(
-            "\n* to use; ! steadier and worse. Alpha rises with any memory: it chooses nothing here.\n", highlight=False
-        )
-
-
-def _table(found: Remedies) -> Table:
-    table = Table(
-        title=f"remedies for {escape(found.model)}", title_justify="left", title_style="bold", box=SIMPLE_HEAD,
-        pad_edge=False, collapse_padding=True,
-    )  # fmt: skip
-    table.add_column("", no_wrap=True)
-    table.add_column("filter", vertical="bottom", overflow="fold")
-    for header in HEADERS:
-        table.add_column(header, justify="right", vertical="bottom", no_wrap=True)
-    for remedy in (found.unfiltered, *found.filtered):
-        best = remedy == found.best
-        table.add_row(marked(found, remedy), *_cells(remedy), style="bold" if best else "")
-    return table
-
-
-def _cells(remedy: Remedy) -> list[str]:
-    name, *numbers = remedy_row(remedy)
-    columns = zip(COLUMNS[1:], DIGITS, numbers, strict=True)
-    shown = [f"{value:.{digits}f}" if value == value else "-" for _, digits, value in columns]  # noqa: PLR0124
-    return [escape(str(name)).replace("+", "\n +"), *shown]
+    for table in tables(result):
+        if table.name.startswith("remedies"):
+            console.print(f"\n{to_terminal(table)}", highlight=False, markup=False, soft_wrap=True)

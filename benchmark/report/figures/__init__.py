@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semstab.core.files import keep_only
-from semstab.core.process import follow_parent
 from semstab.model.measures import measures
 from semstab.model.records import OVERVIEW, Record, Result
 from semstab.model.results import slug
@@ -37,93 +31,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
-# A second process that draws figures. It loads what drawing needs while frames are still fused.
-
-
-class DrawingProcess:
-    """Started at once; it ends with `close`, or with its parent."""
-
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        listening, self._alive = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(1, context, initializer=_begin, initargs=(listening,))
-        self._given: list[Future[None]] = []
-        with contextlib.suppress(BrokenProcessPool):
-            self._given.append(self._pool.submit(_load))
-
-    def draw(self, result: Result, folder: Path, views: Views, names: Sequence[str]) -> Callable[[], bool]:
-        """Begin to draw the figures of those names of a result in the folder.
-
-        What is returned waits for them, and says whether they are there: not where the process died, or never came to
-        life, as in a script that cannot be imported.
-        """
-        drawing = None
-        with contextlib.suppress(BrokenProcessPool, RuntimeError):
-            drawing = self._pool.submit(_draw, result, folder, views, names)
-            self._given.append(drawing)
-
-        def drawn() -> bool:
-            with contextlib.suppress(BrokenProcessPool):
-                return drawing is not None and drawing.result() is None
-            return False
-
-        return drawn
-
-    def close(self) -> None:
-        """End the process, also where it is at work; one that is idle ends by itself, without a word."""
-        if all(future.done() for future in self._given):
-            self._pool.shutdown()
-        self._alive.close()
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _begin(listening: Connection) -> None:
-    follow_parent(listening)
-
-
-def _load() -> None:
-    import pyarrow.parquet  # noqa: F401
-
-
-def _draw(result: Result, folder: Path, views: Views, names: Sequence[str]) -> None:
-    found = {figure.name: figure for figure in figures(result, folder, views)}
-    for name in names:
-        found[name].save(folder / "figures")
-
-
 __all__ = ["Figure", "Views", "figures", "write_figures"]
 
 
-def write_figures(
-    result: Result, folder: str | Path, views: Views | None = None, beside: DrawingProcess | None = None
-) -> list[Path]:
-    """Write FOLDER/figures/NAME.{png,svg} for every figure that the study has records for; return the paths.
+def write_figures(result: Result, folder: str | Path, *, svg: bool = False) -> list[Path]:
+    """Write FOLDER/figures/NAME.png, and .svg on request, for every figure that the study has records for.
 
-    What `views` lacks of a unit is read from its voxels. A process `beside` this one draws about half of them. Other
-    figures there are removed.
+    Other figures there are removed. Returns the paths.
     """
     target = Path(folder) / "figures"
-    views = views or Views()
-    wanted = figures(result, folder, views)
-    units = list(dict.fromkeys(figure.unit for figure in wanted if figure.unit))
-    elsewhere = [] if beside is None else [*units[:3], *units[4::2]]  # three take as long as all that show no map
-    others = sorted((figure for figure in wanted if figure.unit in elsewhere), key=lambda figure: figure.unit)
-    own = sorted((figure for figure in wanted if figure.unit not in elsewhere), key=lambda figure: figure.unit)
-    drawn = None if beside is None else beside.draw(result, Path(folder), views, [figure.name for figure in others])
-    for figure in own:
-        figure.save(target)
-    if drawn is not None and not drawn():
-        for figure in others:
-            figure.save(target)
-    written = [path for figure in wanted for path in figure.paths(target)]
+    drawn = sorted(figures(result, folder), key=lambda figure: figure.unit)  # those of a unit read its voxels once
+    written = [path for figure in drawn for path in figure.save(target, svg=svg)]
     keep_only(written, target)
     return written
 
 
-def figures(result: Result, folder: str | Path, views: Views | None = None) -> list[Figure]:
+def figures(result: Result, folder: str | Path) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
-    views = views or Views()
-    found = remedies(result)
+    views, found = Views(), remedies(result)
     result = of_interest(result)
     kept = [record for record in result.select() if record.voxels_file is not None]
     return [

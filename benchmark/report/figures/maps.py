@@ -23,7 +23,7 @@ from semstab.metrics.agreement import voxel_keys
 from semstab.model import parquet
 from semstab.model.measures import dominant, measures
 from semstab.model.records import Record, Tables
-from semstab.model.results import RECURRENT, Unit
+from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.report.figures.distributions import Histograms, histograms, together
 from semstab.report.figures.statistics import DriftByOP
@@ -285,9 +285,6 @@ def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
 
 # What figures show of units' voxels, each table read once; the figures of a unit are drawn one after the other.
 
-LARGEST = 2e8
-"""Bytes of views that are kept in memory; those of further units are made from the units' files."""
-
 
 @dataclass(frozen=True, eq=False)
 class Sums:
@@ -306,19 +303,12 @@ class Sums:
 
 
 class Views:
-    """The sums of every unit that was asked for or seen, and views from above: of the last one, and of units seen."""
+    """The sums of every unit that was asked for, and the view from above of the last one."""
 
     def __init__(self) -> None:
         self._tables = Tables()
         self._sums: dict[str, Sums] = {}
-        self._above: dict[str, FromAbove] = {}
         self._last: tuple[str, FromAbove] | None = None
-
-    def see(self, unit: Unit, table: VoxelTable, up: npt.ArrayLike | None) -> None:
-        """Take what figures show of a unit while its map is in memory; from above where up is known."""
-        self._sums[unit.slug] = Sums.of(table, expected_sbd(table))
-        if up is not None and sum(above.nbytes for above in self._above.values()) < LARGEST:
-            self._above[unit.slug] = FromAbove.of(table, up)
 
     def sums(self, record: Record) -> Sums:
         """The unit's voxels by OP."""
@@ -338,8 +328,6 @@ class Views:
     def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
         """The unit's voxels that are seen from above."""
         slug = record.unit.slug
-        if slug in self._above:
-            return self._above[slug]
         if self._last is None or self._last[0] != slug:
             large = record.in_tiles and record.summary.table.voxels > MOST
             table = topmost(record.tiles(), up) if large else self._tables.of(record)

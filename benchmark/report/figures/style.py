@@ -69,29 +69,23 @@ class Figure:
     draw: Callable[[], Canvas]
     unit: str = ""
 
-    @property
-    def dense(self) -> bool:
-        """Whether most of it is an image, so that PNG is the better format on a screen."""
-        return bool(self.unit)
-
-    def paths(self, folder: Path) -> list[Path]:
-        """Its files in a folder: FOLDER/NAME.png and .svg."""
-        return [folder / f"{self.name}.png", folder / f"{self.name}.svg"]
-
-    def save(self, folder: Path) -> list[Path]:
-        """Draw it and write its files, byte for byte the same for the same content."""
+    def save(self, folder: Path, *, svg: bool = False) -> list[Path]:
+        """Draw it and write FOLDER/NAME.png, and .svg on request; the same bytes for the same content."""
         import matplotlib
 
-        png, svg = self.paths(folder)
+        formats: dict[str, Any] = {
+            "png": {"dpi": DPI, "metadata": {"Software": None}, "pil_kwargs": {"compress_level": 2}}
+        }
+        if svg:
+            formats["svg"] = {"metadata": {"Date": None, "Creator": None}}
         with matplotlib.rc_context(_STYLE):
             canvas = self.draw()
             _without_formulas(canvas)
-            with atomic_path(png) as temporary:
-                canvas.savefig(temporary, dpi=DPI, metadata={"Software": None}, pil_kwargs={"compress_level": 2})
-            canvas.set_layout_engine("none")  # it is laid out by now; doing so again takes as long as drawing it
-            with atomic_path(svg) as temporary:
-                canvas.savefig(temporary, dpi=DPI, metadata={"Date": None, "Creator": None})
-        return [png, svg]
+            for suffix, options in formats.items():
+                with atomic_path(folder / f"{self.name}.{suffix}") as temporary:
+                    canvas.savefig(temporary, format=suffix, **options)
+                canvas.set_layout_engine("none")  # it is laid out by now; doing so again takes as long as drawing it
+        return [folder / f"{self.name}.{suffix}" for suffix in formats]
 
 
 def _without_formulas(canvas: Canvas) -> None:

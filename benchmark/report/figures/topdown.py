@@ -149,11 +149,6 @@ class FromAbove:
     cell: float
     view: str = "from above"
 
-    @property
-    def nbytes(self) -> int:
-        """Of memory, about."""
-        return self.table.evidence.nbytes + self.rows.nbytes + self.shown.nbytes
-
     @classmethod
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """See `best_view` and `top_down`."""

@@ -19,8 +19,10 @@ from semstab.report.tables.stability import (
     fusion,
     glance,
     persistence,
+    reduced,
     scenes,
     sensitivity,
+    voxel_sizes,
 )
 from semstab.report.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
 from semstab.report.tables.table import TEXT_WRITERS, Cell, Column, Group, Table, to_csv, to_json, to_latex, to_markdown
@@ -41,7 +43,8 @@ __all__ = [
 
 BUILDERS = (
     glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
-    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, fusion, compared, agreement,
+    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, voxel_sizes, reduced, fusion,
+    compared, agreement,
 )  # fmt: skip
 """In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
 

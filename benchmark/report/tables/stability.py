@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 from semstab.config import BACKENDS, SHARED
@@ -467,3 +468,47 @@ def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
         mean.mean_op - base.mean_op,
         *(mean.every[measure] - base.every[measure] for measure in measures()),
     )
+
+
+# The same map by other means: soft scores reduced to labels, other voxel sizes.
+
+
+def reduced(result: Result) -> list[Table]:
+    """Soft scores reduced to each pixel's likeliest class, beside hard labels: what the two compare by."""
+    records = result.select()
+    if len({record.summary.reduced is None for record in records}) < 2:
+        return []
+    columns = (
+        Column("scene", "Scene"),
+        Column("vss", VSS.title, VSS.digits[0], VSS.better),
+        Column("recurrent_vss", f"{VSS.title}, OP>=3", VSS.digits[0], VSS.better),
+        Column.of(ALPHA),
+    )
+    groups = tuple(
+        Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_backbone(records).items()
+    )
+    caption = (
+        "Hard labels and soft scores do not compare by VSS, entropy or alpha, because scores spread their evidence."
+        " Here scores are reduced to each pixel's likeliest class, and labels are as they are."
+    )
+    return [Table("reduced", "Labels and reduced scores", caption, columns, groups)]
+
+
+def _reduced_row(record: Record) -> Row:
+    found, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
+    if found is not None:
+        return record.unit.scene, found.vss, found.recurrent_vss, found.alpha
+    alpha = math.nan if statistics is None else statistics.agreement.alpha.value
+    return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
+
+
+def voxel_sizes(result: Result) -> list[Table]:
+    """Alpha at half, once and twice the voxel size, from some frames."""
+    groups = tuple(
+        Group(name, rows)
+        for name, records in by_backbone(result.select()).items()
+        if (rows := tuple((r.unit.scene, s.voxel_size, s.frames, s.alpha) for r in records for s in r.summary.sizes))
+    )
+    columns = (Column("scene", "Scene"), Column("voxel_size", "Voxel (m)", 4), Column("frames", "Frames", 0))
+    caption = "Krippendorff's alpha of the same frames in voxels of other sizes: how far it depends on that choice."
+    return [Table("voxel_sizes", "Other voxel sizes", caption, (*columns, Column.of(ALPHA)), groups)] if groups else []

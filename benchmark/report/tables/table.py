@@ -8,6 +8,7 @@ import io
 import itertools
 import math
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -95,6 +96,16 @@ class Table:
     groups: tuple[Group, ...]
     by: str = "backbone"
 
+    def only(self, *keys: str) -> Table:
+        """The same with these columns alone."""
+        at = [k for k, column in enumerate(self.columns) if column.key in keys]
+
+        def cut(row: Row) -> Row:
+            return tuple(row[k] for k in at)
+
+        groups = tuple(Group(g.name, tuple(map(cut, g.rows)), g.total and cut(g.total)) for g in self.groups)
+        return dataclasses.replace(self, columns=tuple(self.columns[k] for k in at), groups=groups)
+
     def rows(self) -> Iterator[tuple[str, Row]]:
         """Each row, totals too, with the name of its group."""
         for group in self.groups:
@@ -169,6 +180,32 @@ def to_latex(table: Table) -> str:
             "",
         ]
     )
+
+
+def to_terminal(table: Table, width: int = 0) -> str:
+    """For a terminal: the title, the rows, the caption; as wide as the rows need, or folded to `width` columns."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table as Grid
+
+    grid = Grid(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    for column in table.columns:
+        header = "\n".join(filter(None, (column.over, f"{column.header} {ARROWS[column.better]}".strip())))
+        number = column.digits is not None
+        grid.add_column(
+            escape(header), justify="right" if number else "left", vertical="bottom", no_wrap=number, overflow="fold"
+        )
+    for heading, rows in sections(table):
+        if heading:
+            grid.add_row(f"[bold]{escape(heading)}[/]")
+        for row in rows:
+            grid.add_row(*map(escape, row))
+    text = io.StringIO()
+    console = Console(file=text, width=width or 400, color_system=None)
+    console.print(grid)
+    lines = [line.rstrip() for line in text.getvalue().splitlines()]
+    return "\n".join([*lines, *textwrap.wrap(table.caption, width or 80)])
 
 
 def to_json(table: Table) -> dict[str, Any]:
