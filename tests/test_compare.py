@@ -113,7 +113,7 @@ def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):
     again = load_comparison(folder)
     assert [row.measure for row in again.overall[0].contrasts] == [row.measure for row in fault.overall[0].contrasts]
     assert again.scenes[0].against[0].places == fault.scenes[0].against[0].places
-    for name in ("comparison.md", "report.html", "recording.rrd", "tables/comparison.csv", "figures/comparison.svg",
+    for name in ("comparison.md", "report.html", "recording.rrd", "tables/comparison.csv", "figures/comparison.png",
                  "figures/comparison_classes.png", "figures/comparison_map__wall__new.png"):  # fmt: skip
         assert (folder / name).stat().st_size > 0
     page = (folder / "report.html").read_text()
@@ -186,7 +186,7 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     text = StringIO()
     print_comparison(fault, Console(file=text, width=80))
     assert max(map(len, text.getvalue().splitlines())) <= 80
-    for word in ("wall: new less old", "alpha b.f.", "door", "window", "frames"):
+    for word in ("wall: new less old", "Alpha between", "door", "window", "frames"):
         assert word in text.getvalue()
     page = markdown(fault)
     assert page.startswith("## new against old\n")

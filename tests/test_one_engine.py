@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,11 +22,8 @@ from semstab.engine import LocalProcesses, load_result
 from semstab.engine.units import make_plan
 from semstab.engine.work import image_space
 from semstab.metrics import compare, compensated_flicker
-from semstab.model.records import Result
 from semstab.recording.observer import Recording
 from semstab.recording.target import Target
-from semstab.report.figures import DrawingProcess, write_figures
-from semstab.report.figures.maps import Views
 from semstab.settings import load_config, load_study
 from semstab.task import read as read_frame
 
@@ -77,9 +73,9 @@ def test_every_folder_has_tables_figures_and_a_report_unless_told_otherwise(root
     data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--rerun", "off")
     out = bench(*data, "--out", "run", cwd=tmp_path, report=True).stdout
     run = tmp_path / "run"
-    assert "report: run/report.html" in out
+    assert "report  run/report.html" in out
     assert {"scenes.csv", "persistence.md", "verdicts.tex"} <= {file.name for file in (run / "tables").iterdir()}
-    assert {"persistence.png", "persistence.svg"} <= {file.name for file in (run / "figures").iterdir()}
+    assert {"persistence.png"} <= {file.name for file in (run / "figures").iterdir()}
     assert 'id="table-scenes"' in (run / "report.html").read_text()
     out = bench(*data, "--out", "bare", "--report", "off", cwd=tmp_path).stdout
     assert "report" not in out
@@ -181,26 +177,6 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
     monkeypatch.undo()
     semstab.engine.run(load_config(overrides=settings(root, backbones=["a"])), out=out)
     assert not (out / "failures.log").exists()
-
-
-def test_two_processes_draw_the_figures_that_one_draws(root, tmp_path) -> None:
-    out = tmp_path / "run"
-    result = semstab.engine.run(load_config(overrides=settings(root, backends=["numpy"])), out=out)
-    from_files = figure_files(result, out, Views(), None)
-    assert len(from_files) >= 8
-    seen = Views()
-    for record in result.select():
-        seen.see(record.unit, record.table(), result.up.get(record.unit.scene))
-    beside = DrawingProcess()
-    assert figure_files(result, out, seen, beside) == from_files
-    beside.close()
-    assert figure_files(result, out, seen, beside) == from_files  # it is gone: all are drawn here
-
-
-def figure_files(result: Result, out: Path, views: Views, beside: DrawingProcess | None) -> dict[str, bytes]:
-    """Write the figures; their files' contents."""
-    write_figures(result, out, views, beside)
-    return {file.name: file.read_bytes() for file in (out / "figures").iterdir()}
 
 
 def test_large_frames_are_sampled_for_what_is_measured_in_the_image(root, monkeypatch) -> None:

@@ -13,7 +13,6 @@ from striped_floor import K, flight, sampler_of
 from semstab import backends
 from semstab.errors import DataError
 from semstab.model.contrast import CommonLooks
-from semstab.report.terminal_statistics import comparison_lines
 from semstab.statistics import Looks, compare_backbones, psa
 from semstab.statistics.looks.common import common, psa_bounds
 from semstab.statistics.versus.standard import Observed
@@ -71,7 +70,6 @@ def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
     assert whole.psa_low == whole.psa_high
     assert missing["silent"].psa_low < whole.psa_low < missing["silent"].psa_high
     assert missing["silent"].alpha < missing["better"].alpha
-    assert "the order depends on what was left out" in comparison_lines(found)
 
 
 def test_maps_that_left_nothing_out_have_an_order_that_depends_on_nothing():
@@ -93,7 +91,6 @@ def test_labels_and_scores_are_compared_by_what_they_decide():
     (proper,) = (row for row in found.paired.differences if row.measure == "alpha_between")
     assert proper.difference.value != 0  # of the scores themselves
     assert found.standardised.values == {}
-    assert any("each look reduced to its largest class" in line for line in comparison_lines(found))
 
 
 def test_bounds_of_agreement_by_hand():
@@ -114,7 +111,6 @@ def test_strata_of_op_that_hardly_overlap_are_said():
     ).table()
     found = compare_backbones({"a": tables["often"], "b": few})
     assert found.standardised.thin == 1
-    assert any("hardly overlap" in line for line in comparison_lines(found))
     same = {"a": tables["often"], "b": tables["often"]}
     assert Observed.of(same).thin(np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
 

@@ -47,7 +47,7 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     np.save(folder / "depth/0001.npy", np.full((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.nan, np.float32))
     result = semstab.run(configure(folder))
     assert result.select()[0].summary.frames_empty == 1
-    assert "scene, a: 1 of 3 frames hold no pixel with both depth and a label" in printed(result)
+    assert "a: 1 of 3 frames hold no pixel with both depth and a label" in printed(result)
 
 
 # --- The check against the reference ----------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
         assert row.agrees
         assert (row.backends, row.one_in) == (("numba", "numpy"), 16)
         assert 0 < row.voxels[0] == row.voxels[1] < result.select()[0].summary.table.voxels / 4
-    assert "numba against the numpy reference on" in printed(result)
+    assert "checked numba against numpy on" in printed(result)
     assert semstab.run(config, out=tmp_path / "run", report=False).manifest["units"]["kept"] == 2
 
 
@@ -104,8 +104,7 @@ def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_
     assert result.agrees
     assert semstab.load_result(tmp_path / "run").compared == result.compared
     told = printed(result)
-    assert "backends that differ by design" in told
-    assert told.count("open3d-projective") == 2
+    assert "open3d-projective differs from numba by design" in told
     assert {table.name for table in tables(result)} >= {"fusion", "fusion_compared"}
     assert "agreement" not in {table.name for table in tables(result)}
     assert any(sentence.startswith("open3d-projective, which") for sentence in reading(result, ()))
@@ -136,7 +135,6 @@ def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) 
     result = semstab.run(config, out=tmp_path / "run", report=False)
     size = result.advice["wide"].voxel_size
     assert size == checked.suggestion.voxel_size == result.select()[0].summary.table.voxel_size
-    assert f"Voxels of {size:g} m: the smallest in which half of the points fall again" in printed(result)
     assert read_yaml(tmp_path / "run" / "config.yaml")["voxel_size"] == size
     assert checked.persistence[1].voxel_size == size
 
@@ -144,12 +142,10 @@ def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) 
 def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0))
     assert not result.advice["wide"].chosen
-    told = printed(result)
-    assert "oxels of 1 m: " in told
-    assert "m would do, and tell apart what these blur" in told
     assert [size.voxel_size for size in result.select()[0].summary.sizes] == [0.5, 1, 2]
-    advice = dataclasses.replace(result.advice["wide"], voxel_size=result.advice["wide"].suggested)
-    assert "check suggests the same" in printed(dataclasses.replace(result, advice={"wide": advice}))
+    assert "noise tears" not in printed(result)
+    advice = dataclasses.replace(result.advice["wide"], voxel_size=0.5 * result.advice["wide"].suggested)
+    assert "noise tears locations apart: --voxel-size" in printed(dataclasses.replace(result, advice={"wide": advice}))
     assert "over voxel sizes, from 8 frames: alpha" in told
     assert "'background' is" in told
     assert "--set 'exclude.classes=[background]' leaves it out" in told
@@ -176,7 +172,7 @@ def test_a_crowded_last_stratum_is_split_by_its_op() -> None:
 
 
 def test_what_was_hardly_ever_seen_once_needs_no_remark(scene) -> None:
-    said = "were seen once: they say nothing"
+    said = "were seen once and look stable for that reason"
     assert said in printed(semstab.run(configure(scene, backbones=["a"])))
     assert said not in printed(semstab.run(configure(scene, backbones=["a"], voxel_size=4.0)))
 

@@ -83,6 +83,7 @@ def test_a_study_of_everything_has_every_table(walls):
         "sensitivity_agreement_depth_noise",
         "sensitivity_frame_count",
         "sensitivity_agreement_frame_count",
+        "voxel_sizes",
         "fusion",
         "agreement",
     ]

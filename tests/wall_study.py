@@ -78,4 +78,4 @@ def drawn_walls(base: Path) -> tuple[Result, Path, list[Path]]:
     (folder / "overview").mkdir(parents=True)
     frame = {"frame": 3, "labels": np.zeros((6, 8), np.uint8), "palette": np.zeros((len(CLASSES), 3), np.uint8)}
     np.savez(folder / "overview" / "often__calm.npz", **frame)
-    return calm, folder, write_figures(calm, folder)
+    return calm, folder, write_figures(calm, folder, svg=True)

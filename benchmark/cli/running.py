@@ -277,6 +277,8 @@ def execute(
                 print_remedies(result, console)
             elif result.select():
                 print_summary(result, console, out=out, seconds=time.monotonic() - began, verbose=verbose)
+            else:
+                console.print(f"  folder  {out}", highlight=False, markup=False, soft_wrap=True)
         for each in recording:
             each.serve()
     finally:

@@ -267,7 +267,7 @@ TOPICS = (
         "backbones",
         "Backbones in one taxonomy",
         "Compare backbones where voxels recur, and look at their recurrent shares beside.",
-        ("cross_backbone",),
+        ("cross_backbone", "reduced"),
     ),
     Topic(
         "comparison",
@@ -311,7 +311,7 @@ TOPICS = (
         "Voxel size, noise and sampling change which observations meet in a voxel, and so how many voxels could be"
         " contradicted at all. Compare the values over all voxels with those of the recurrent ones and their share, and"
         " with the share that agreement reaches of its ceiling, which hardly moves.",
-        ("sensitivity",),
+        ("sensitivity", "voxel_sizes"),
     ),
     Topic(
         "fusion",

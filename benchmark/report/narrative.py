@@ -20,9 +20,6 @@ HARDLY_ANY, MOSTLY_ONCE = 0.1, 0.5
 ONE_CLASS = 0.9
 """Share of one class from which on it makes most of the numbers."""
 
-COARSE = 5.0
-"""Voxels so many times the smallest that suits the data blur what the frames could tell apart."""
-
 
 def warnings(result: Result) -> Iterator[str]:
     """The facts without which a run would be misread, the weightiest first, with the command that mends each."""
@@ -73,11 +70,10 @@ def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
             f"{where}fewer than half of the points fall into the same voxel again when another frame sees them, at any"
             " voxel size: semstab-bench check examines depth and poses"
         )
-    if found.chosen or found.suggested <= found.voxel_size <= COARSE * found.suggested:
+    if found.chosen or found.suggested <= found.voxel_size:
         return ""
-    small = found.voxel_size < found.suggested
-    problem = "noise tears locations apart" if small else "voxels blur what frames tell apart"
-    return f"{where}voxels of {found.voxel_size:g} m do not suit the data ({problem}): --voxel-size {found.suggested:g}"
+    size = f"voxels of {found.voxel_size:g} m"
+    return f"{where}{size} are so small that noise tears locations apart: --voxel-size {found.suggested:g}"
 
 
 def _one_class(run: UnitSummary) -> str | None:
@@ -118,7 +114,7 @@ def verdicts(result: Result) -> list[str]:
 
 
 def _once(voxels: Pooled) -> Iterator[str]:
-    if voxels.once >= HARDLY_ANY:
+    if HARDLY_ANY <= voxels.once < MOSTLY_ONCE:
         yield (
             f"{voxels.once:.0%} of the voxels were seen once. They look stable because no second look could contradict"
             " them: read every measure where voxels recur (OP>=3)."

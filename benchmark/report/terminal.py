@@ -155,46 +155,49 @@ def _metres(size: float) -> str:
 # --- Several ----------------------------------------------------------------------------------------------------------
 
 
+COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
+UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
+WIDTHS = (14, -14, -17, 6, 8, 6, 7, 5)
+"""Of the columns of several models; text stands left, below 0."""
+
+
 def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
     """A row a scene and model; the differences to the first model where they are known."""
-    yield _head(
-        ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else ""), result, [r.summary for r in records]
-    )
+    listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
+    yield _head(listed, result, [record.summary for record in records])
     yield ""
-    accuracy = any(record.summary.statistics is not None and _miou(record) == _miou(record) for record in records)
-    width = min(20, max(len(record.unit.backbone) for record in records) + 2)
-    head = f"  {'model':<{width}} {'verdict':<14}{'alpha (95 % CI)':<19}{'agree':>6}{'flicker':>8}{'VSS':>7}{'SBD':>8}"
-    yield head + (f"{'mIoU':>6}" if accuracy else "")
-    yield f"  {'':<{width}} {'':<14}{'':<19}{'%':>6}{'%':>8}{'OP>=3':>7}{'bits':>8}" + (f"{'%':>6}" if accuracy else "")
+    known = any(not math.isnan(_miou(record)) for record in records)
+    columns = len(COLUMNS) if known else len(COLUMNS) - 1
+    yield _laid_out(COLUMNS[:columns])
+    yield _laid_out(UNITS[:columns])
     for scene in result.scenes:
         own = [record for record in records if record.unit.scene == scene]
         if len(result.scenes) > 1 and own:
             yield f"  {scene}"
-        for record in own:
-            yield _row(record, width, accuracy=accuracy)
+        yield from (_laid_out(_cells(record)[:columns]) for record in own)
     yield from _differences(result)
     yield from _classes(records)
     yield ""
 
 
-def _row(record: Record, width: int, *, accuracy: bool) -> str:
+def _laid_out(cells: Sequence[str]) -> str:
+    first, *rest = cells
+    name = first if len(first) <= WIDTHS[0] else f"{first[: WIDTHS[0] - 3]}..."
+    pairs = zip(rest, WIDTHS[1:], strict=False)
+    return f"  {name:<{WIDTHS[0]}}" + "".join(f" {c:<{-w - 1}}" if w < 0 else f"{c:>{w}}" for c, w in pairs)
+
+
+def _cells(record: Record) -> list[str]:
     run, found = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if found is not None:
-        judged = found.judged
-        level, agree = found.verdict.level, 100 * judged.psa.value
-        ends = (
-            ""
-            if math.isnan(judged.alpha_between.low)
-            else f" ({_short(judged.alpha_between.low)} to {_short(judged.alpha_between.high)})"
-        )
-        alpha = f"{judged.alpha_between.value:.2f}{ends}"
+        level, agree, between = found.verdict.level, 100 * found.judged.psa.value, found.judged.alpha_between
+        ends = "" if math.isnan(between.low) else f" ({_short(between.low)} to {_short(between.high)})"
+        alpha = f"{_number(between.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
-    name = run.unit.backbone if len(run.unit.backbone) <= width else run.unit.backbone[: width - 1] + "…"
     flicker = record.image_space.compensated_flicker_percent
-    cells = f"  {name:<{width}} {level:<14}{alpha:<19}{_number(agree, 0):>6}{_number(flicker, 1):>8}"
-    cells += f"{_number(vss, 3):>7}{_number(sbd, 4):>8}"
-    return cells + (f"{_number(100 * _miou(record), 1):>6}" if accuracy else "")
+    numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * _miou(record), 1))
+    return [run.unit.backbone, level, alpha, *(_number(value, digits) for value, digits in numbers)]
 
 
 def _miou(record: Record) -> float:

@@ -195,6 +195,9 @@ def _order(values: Mapping[str, float]) -> tuple[str, ...]:
 
 # The backbones beside each other, on the same places and at the same number of observations.
 
+THIN = 0.1
+"""Part of the weight in strata that hardly overlap, from which on the table says it."""
+
 _COMMON = "On the voxels that every backbone saw twice or more, and on looks (a place in a frame) that all labelled."
 
 
@@ -220,6 +223,8 @@ def _differences(result: Result) -> Table:
         f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
         f" which something may be claimed; the others describe. {INTERVALS}"
     )
+    if any(found.looks is not None and found.looks.decided for found in result.comparisons):
+        caption += " Labels stand beside scores: each observation is reduced to its largest class."
     groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
 
@@ -246,6 +251,9 @@ def _ranking(result: Result) -> Table:
         f"Same looks: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
         f" strata of OP weighted by those of all maps together. {INTERVALS}"
     )
+    thin = max(found.standardised.thin for found in result.comparisons)
+    if thin > THIN:
+        caption += f" {thin:.0%} of the weight is in strata of OP that hardly overlap."
     groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
     return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
 
