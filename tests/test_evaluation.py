@@ -83,7 +83,7 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
 def test_all_that_was_found_is_printed_where_it_was_asked_for(ran) -> None:
     _, printed, summary = ran
     assert len(summary["runs"]) == 3
-    for words in ("Agreement of the frames", "Order of the backbones", "Stable, wrong", "majority"):
+    for words in ("Agreement of the frames", "Order of the backbones", "Stable and right", "majority"):
         assert words in printed
     (found,) = summary["comparisons"]
     assert found["fusion_rules"]["voxels"] > 0  # the logs of both were kept

@@ -66,7 +66,7 @@ def test_a_study_killed_at_random_moments_ends_with_the_same_summary(root, file,
 
 def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
     arguments = (file, "--set", "backends=[numpy, numba]", "--set", "backbones=[a]", "--only", "backends")
-    out, errors = study(*arguments, "--set", "statistics=true", cwd=tmp_path, report=True)
+    out, _ = study(*arguments, "--set", "statistics=true", cwd=tmp_path, report=True)
     files = ("report.html", "manifest.json", "config.yaml", "tables/scenes.csv", "figures/persistence.png")
     for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex", "figures/correctness.png"):
         assert (tmp_path / "studies/tiny" / name).exists()

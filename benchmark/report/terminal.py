@@ -80,7 +80,7 @@ def _one(result: Result, record: Record) -> Iterator[str]:
     if run.worst_frames:
         yield f"  most drift in frames    {' '.join(str(frame.frame) for frame in run.worst_frames)}"
     means = "  ".join(f"{m.word} {recurrent[m]:.{m.digits[0]}f}{f' {m.unit}' if m.unit else ''}" for m in measures())
-    yield f"  paper's measures        OP>=3: {means}"
+    yield f"  paper (OP>=3)  {means}"
     yield ""
 
 
@@ -90,7 +90,8 @@ def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
     what = f"{counts} frames, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels"
-    return f"{name}    {what}    {_geometry(result)}".rstrip()
+    line = f"{name}    {what}    {_geometry(result)}".rstrip()
+    return line if len(line) <= WIDTH else f"{name}    {what}\n  {_geometry(result)}"
 
 
 def _geometry(result: Result) -> str:
@@ -127,7 +128,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
 def _flicker(record: Record) -> Iterator[str]:
     compensated = record.image_space.compensated_flicker_percent
     if not math.isnan(compensated):
-        yield f"  flicker      {compensated:.1f} % of the pixels change class between frames (camera motion removed)"
+        yield f"  flicker      {compensated:.1f} % of pixels change class per frame (camera motion removed)"
 
 
 def _interval(found: Estimate, scale: float = 1.0) -> str:
@@ -157,7 +158,7 @@ def _metres(size: float) -> str:
 
 COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
-WIDTHS = (14, -14, -17, 6, 8, 6, 7, 5)
+WIDTHS = (13, -14, -19, 6, 8, 6, 7, 5)
 """Of the columns of several models; text stands left, below 0."""
 
 
