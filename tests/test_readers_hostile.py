@@ -19,7 +19,7 @@ from image_files import raw_png
 from posed_scene import fails
 
 from semstab.config import FrameSelection
-from semstab.datasets.formats.colmap_model import read_model
+from semstab.datasets.colmap import read_model
 from semstab.datasets.formats.dense_depth import read_depth_map
 from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -56,158 +56,56 @@ class FrameSource:
         return self.name, *self.aliases
 
 
-# The frames of a sequence as text and numbers: as objects, each would take two kilobytes.
-
-AT_HAND = 64
-"""Sources that are kept as they were made last: a frame is asked for several times while it is read."""
-
-POSE = 16
-
-
-@dataclass(frozen=True)
-class Around:
-    """What frames alike have before and after the part of a path that is a frame's own.
-
-    named  whether that part is the frame's name; None: there is none
-    """
-
-    before: str
-    after: str = ""
-    named: bool | None = True
-
-
-@dataclass(frozen=True)
-class Shared:
-    """What frames have in common: see `FrameSource`. posed: whether a pose came with them; timed: a time stamp."""
-
-    depth: Around
-    pose_file: Around
-    color: Around | None
-    photograph: Around | None
-    aliases: tuple[Around, ...]
-    camera: Camera
-    label_camera: Camera | None
-    label_lens: Lens | None
-    color_lens: Lens | None
-    depth_scale: float | None
-    posed: bool
-    timed: bool
+FIELDS = tuple(field.name for field in dataclasses.fields(FrameSource))
+PATHS = tuple(FIELDS.index(name) for name in ("depth", "pose_file", "color", "photograph"))
 
 
 class FrameTable(Sequence[FrameSource]):
-    """The sources of frames, made again when they are asked for.
+    """The sources of a sequence's frames: tuples with paths as text, a third of the memory of the objects.
 
     Raises DataError, with the file of its pose, for a name that cannot be part of a path.
     """
 
     def __init__(self, frames: Iterable[FrameSource], folder: Path) -> None:
-        self._text = bytearray()
-        self._ends, self._kinds = array("q", [0]), array("i")
-        self._times, self._poses = array("d"), array("d")
-        kinds: dict[Shared, int] = {}
+        self._rows: list[tuple[Any, ...]] = []
         for frame in frames:
             inside_text(folder, frame.name, str(frame.pose_file))  # files of predictions are called so
-            shared, own = _apart(frame)
-            self._text += "\0".join((frame.name, *own)).encode("utf-8", "surrogatepass")
-            self._ends.append(len(self._text))
-            self._kinds.append(kinds.setdefault(shared, len(kinds)))
-            if frame.pose is not None:
-                self._poses.extend([np.nan] * (POSE * len(self) - POSE - len(self._poses)))
-                self._poses.extend(np.asarray(frame.pose, dtype=np.float64).ravel())
-            if frame.timestamp is not None:
-                self._times.extend([np.nan] * (len(self) - 1 - len(self._times)))
-                self._times.append(frame.timestamp)
-        self._shared = tuple(kinds)
-        self._source = functools.lru_cache(maxsize=AT_HAND)(self._made)
+            values = [getattr(frame, field) for field in FIELDS]
+            self._rows.append(tuple(str(value) if isinstance(value, Path) else value for value in values))
+        self._source = functools.lru_cache(maxsize=64)(
+            self._made
+        )  # a frame is asked for several times while it is read
 
     def __len__(self) -> int:
-        return len(self._kinds)
+        return len(self._rows)
 
     @overload
     def __getitem__(self, at: int) -> FrameSource: ...
     @overload
     def __getitem__(self, at: slice) -> Sequence[FrameSource]: ...
     def __getitem__(self, at: int | slice) -> FrameSource | Sequence[FrameSource]:
-        """The source of a frame, or of some."""
+        """The source of a frame, or those of some."""
         some = range(len(self))[at]
         return self._source(some) if isinstance(some, int) else [self._source(k) for k in some]
 
     @property
-    def names(self) -> Iterator[str]:
-        """What path templates call each frame."""
-        return (self._words(k)[0] for k in range(len(self)))
+    def names(self) -> list[str]:
+        """The names of all frames, as path templates have them."""
+        return [row[0] for row in self._rows]
 
     @property
     def times(self) -> Float64 | None:
         """(len,) seconds of each frame; None where one has none."""
-        return np.array(self._times) if all(shared.timed for shared in self._shared) else None
+        times = [row[FIELDS.index("timestamp")] for row in self._rows]
+        return None if None in times else np.array(times, dtype=np.float64)
 
     @property
     def distorted(self) -> bool:
         """Whether label maps of some frames are those of distorted photographs."""
-        return any(shared.label_lens is not None for shared in self._shared)
-
-    def _words(self, k: int) -> list[str]:
-        return self._text[self._ends[k] : self._ends[k + 1]].decode("utf-8", "surrogatepass").split("\0")
+        return any(row[FIELDS.index("label_lens")] is not None for row in self._rows)
 
     def _made(self, k: int) -> FrameSource:
-        shared = self._shared[self._kinds[k]]
-        name, *own = self._words(k)
-        rest = iter(own)
-
-        def text(around: Around) -> str:
-            part = "" if around.named is None else name if around.named else next(rest)
-            return f"{around.before}{part}{around.after}"
-
-        return FrameSource(  # its texts in the order in which `_apart` takes them
-            name,
-            depth=Path(text(shared.depth)),
-            pose_file=Path(text(shared.pose_file)),
-            color=None if shared.color is None else Path(text(shared.color)),
-            photograph=None if shared.photograph is None else Path(text(shared.photograph)),
-            aliases=tuple(map(text, shared.aliases)),
-            camera=shared.camera,
-            pose=self._pose(k) if shared.posed else None,
-            label_camera=shared.label_camera,
-            label_lens=shared.label_lens,
-            color_lens=shared.color_lens,
-            depth_scale=shared.depth_scale,
-            timestamp=self._times[k] if shared.timed else None,
-        )
-
-    def _pose(self, k: int) -> Poses:
-        return np.array(self._poses[POSE * k : POSE * (k + 1)]).reshape(4, 4)
-
-
-def _apart(frame: FrameSource) -> tuple[Shared, list[str]]:
-    """What a frame shares with others, and the parts of its paths that are its own, but for its name."""
-    own: list[str] = []
-
-    def around(text: str, stem: tuple[int, int]) -> Around:
-        before, found, after = text.rpartition(frame.name) if frame.name else (text, "", "")
-        if found:
-            return Around(before, after)
-        first, last = stem
-        own.append(text[first:last])
-        return Around(text[:first], text[last:], named=False)
-
-    def of(path: Path) -> Around:
-        text = str(path)
-        return around(text, (len(text) - len(path.name), len(text) - len(path.suffix)))
-
-    posed = frame.pose is not None
-    shared = Shared(
-        depth=of(frame.depth),
-        pose_file=Around(str(frame.pose_file), named=None) if posed else of(frame.pose_file),
-        color=None if frame.color is None else of(frame.color),
-        photograph=None if frame.photograph is None else of(frame.photograph),
-        aliases=tuple(around(alias, (0, len(alias))) for alias in frame.aliases),
-        camera=frame.camera,
-        label_camera=frame.label_camera,
-        label_lens=frame.label_lens,
-        color_lens=frame.color_lens,
-        depth_scale=frame.depth_scale,
-        posed=posed,
-        timed=frame.timestamp is not None,
-    )
-    return shared, own
+        row = list(self._rows[k])
+        for at in PATHS:
+            row[at] = None if row[at] is None else Path(row[at])
+        return FrameSource(*row)

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Float32
-from semstab.datasets.formats.codecs import MAX_PIXELS
 from semstab.datasets.formats.disk import AGAIN, read_bytes
-from semstab.datasets.formats.images import Read
+from semstab.datasets.formats.images import MAX_PIXELS, Read
 from semstab.errors import DataError
 
 Depth = Float32
