@@ -8,17 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64
-from semstab.datasets.city import buildings, traffic
+from semstab.datasets.city.buildings import build, bushes, fences, hedges, trees
 from semstab.datasets.city.mesh import CLUTTER, ROAD, Surface, box, join
 from semstab.datasets.city.options import Flight
 from semstab.datasets.city.plots import Inventory, Spot, columns, furnish
 from semstab.datasets.city.streets import MAIN_WIDTH, Layout, Plot, Rectangle, Street, plan_streets
 from semstab.datasets.city.terrain import Site, Terrain
+from semstab.datasets.city.traffic import ROAD_ABOVE, Traffic, parked_cars, roadside_cars, standing_people
 
 REACH = 125.0
 """Metres from the flight's path up to which the town is built; beyond it there is grass."""
 
-ASPHALT, PAINT = (0.30, 0.30, 0.31), (0.82, 0.82, 0.80)
+ASPHALT, MARKING = (0.30, 0.30, 0.31), (0.82, 0.82, 0.80)
 MARKING_ABOVE = 0.121
 
 
@@ -28,7 +29,7 @@ class World:
 
     terrain: Terrain
     still: Surface
-    traffic: traffic.Traffic
+    traffic: Traffic
 
 
 def build_world(seed: int, flight: Flight) -> World:
@@ -39,14 +40,14 @@ def build_world(seed: int, flight: Flight) -> World:
     path = np.stack(flight.path(np.linspace(0, 1, 60)), axis=1)
     streets, plots = plan_streets(_plan_area(layout, path), _rng(seed, flight, 2))
     town = _furnished(plots, layout, path, _rng(seed, flight, 3))
-    town.cars += traffic.roadside_cars(streets, _rng(seed, flight, 4))
+    town.cars += roadside_cars(streets, _rng(seed, flight, 4))
     town.trees += _street_trees(streets, _rng(seed, flight, 5))
     still = [
         terrain.mesh(path.min(axis=0) - REACH, path.max(axis=0) + REACH, _rng(seed, flight, 6)),
         *_ground(town, streets, site, path),
         *_standing(town, site, path, seed, flight),
     ]
-    return World(terrain, join(still), traffic.Traffic.random(streets, site, _rng(seed, flight, 15)))
+    return World(terrain, join(still), Traffic.random(streets, site, _rng(seed, flight, 15)))
 
 
 def _rng(seed: int, flight: Flight, purpose: int) -> np.random.Generator:
@@ -91,12 +92,12 @@ def _ground(town: Inventory, streets: Sequence[Street], site: Site, path: Float6
     for number, street in enumerate(streets):
         half = street.width / 2
         shade = np.array(ASPHALT) * (0.92 + 0.04 * (number % 4))
-        above = traffic.ROAD_ABOVE + 0.0007 * number  # crossing streets do not lie in one plane
+        above = ROAD_ABOVE + 0.0007 * number  # crossing streets do not lie in one plane
         lane = street.strip(-half - 0.3, half + 0.3)  # its edges lie under the kerbs: no grass shows between
         surfaces.append(site.drape(lane, above, ROAD, shade))
         for low in street.clear_of_crossings(np.arange(street.low + 3, street.high - 6, 7.0), list(streets), 6.0):
             dash = street.strip(-0.08, 0.08, float(low), float(low) + 3.0)
-            surfaces.append(site.drape(dash, MARKING_ABOVE + 0.0007 * number, ROAD, PAINT))
+            surfaces.append(site.drape(dash, MARKING_ABOVE + 0.0007 * number, ROAD, MARKING))
     return [_within(surface, path) for surface in surfaces]
 
 
@@ -106,13 +107,13 @@ def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Fli
         return [row for row, keep in zip(rows, near, strict=True) if keep]
 
     return [
-        *buildings.build(town.buildings, site, _rng(seed, flight, 7)),
-        *buildings.trees(close(town.trees), site, _rng(seed, flight, 8)),
-        buildings.bushes(close(town.bushes), site, _rng(seed, flight, 9)),
-        buildings.hedges(town.hedges, site, _rng(seed, flight, 10)),
-        buildings.fences(town.fences, site, _rng(seed, flight, 11)),
-        traffic.parked_cars(close(town.cars), site, _rng(seed, flight, 12)),
-        traffic.standing_people(close(town.people), site, _rng(seed, flight, 13)),
+        *build(town.buildings, site, _rng(seed, flight, 7)),
+        *trees(close(town.trees), site, _rng(seed, flight, 8)),
+        bushes(close(town.bushes), site, _rng(seed, flight, 9)),
+        hedges(town.hedges, site, _rng(seed, flight, 10)),
+        fences(town.fences, site, _rng(seed, flight, 11)),
+        parked_cars(close(town.cars), site, _rng(seed, flight, 12)),
+        standing_people(close(town.people), site, _rng(seed, flight, 13)),
         _bins(town, site, _rng(seed, flight, 14)),
     ]
 
