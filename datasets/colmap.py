@@ -16,8 +16,15 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions, Folders, PixelCentre, PoseConvention, Template, inside
+from semstab.datasets.files.options import (
+    FileOptions,
+    Folders,
+    FrameSource,
+    PixelCentre,
+    PoseConvention,
+    Template,
+    inside,
+)
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import AGAIN, natural, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES

@@ -13,12 +13,20 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
-from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
 from semstab.datasets.files.labels import ScenePlace
-from semstab.datasets.files.options import DepthKind, FileOptions, Folders, PoseConvention, Template, UpAxis, inside
+from semstab.datasets.files.options import (
+    DepthKind,
+    FileOptions,
+    Folders,
+    FrameSource,
+    PoseConvention,
+    Template,
+    UpAxis,
+    inside,
+)
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.formats.dense_depth import HEADER_BYTES, dmap_header
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.opensfm import GEOREFERENCING, Shot, georeference_of, read_reconstruction

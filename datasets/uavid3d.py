@@ -13,12 +13,12 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 from semstab.datasets.colmap import has_model, image_name, read_model
-from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
     Folders,
     FourIntrinsics,
+    FrameSource,
     GroundTruth,
     PixelCentre,
     PoseConvention,

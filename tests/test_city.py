@@ -13,8 +13,7 @@ from pydantic import ValidationError
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.datasets.city import City, CityScene, SimulatedBackbone
 from semstab.datasets.city.mesh import Surface
-from semstab.datasets.city.rendering import Caster
-from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.simulation import Caster, Simulation, View
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 
@@ -410,7 +409,7 @@ def test_soft_scores_sum_to_one_and_keep_the_class(small: City) -> None:
 
 def test_known_settings_give_known_results() -> None:
     """The hash is splitmix64, whose outputs for the states 0 and 1 are published."""
-    from semstab.datasets.city.rendering import splitmix64
+    from semstab.datasets.city.simulation import splitmix64
 
     assert [hex(int(x)) for x in splitmix64(np.array([0, 1], dtype=np.uint64))] == [
         "0xe220a8397b1dcdaf",

@@ -20,7 +20,7 @@ from posed_scene import fails
 
 from semstab.config import FrameSelection
 from semstab.datasets.colmap import read_model
-from semstab.datasets.formats.dense_depth import read_depth_map
+from semstab.datasets.files.depth import read_depth_map
 from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.scene import select_frames

@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 
 from semstab.core.types import UInt8, UInt16
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions, Folders, Template, inside_text, matching_folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside_text, matching_folders
 from semstab.datasets.formats.images import (
     LABEL_SUFFIXES,
     MASK_SUFFIXES,

@@ -14,9 +14,8 @@ import numpy as np
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
 from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
-from semstab.datasets.files.frame_source import FrameSource, FrameTable
 from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
-from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
