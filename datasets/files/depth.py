@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -131,13 +131,12 @@ def read_depth_map(path: Path, scale: float | None = None, read: Read = read_byt
         raise DataError(f"{path}: has {channels} channels (a normal map?); set depth to the depth maps")
     if not 0 < width * height <= MAX_PIXELS:
         raise DataError(f"{path}: claims {width}x{height} pixels (at most {MAX_PIXELS} are read); is it damaged?")
-    found, needed = len(data) - header.end(), 4 * width * height
-    if found != needed:
-        raise DataError(f"{path}: {width}x{height} pixels need {needed} bytes, the file has {found}; {AGAIN}")
-    stored = np.frombuffer(data, "<f4", offset=header.end()).reshape(height, width)
+    stored, needed = memoryview(data)[header.end() :], 4 * width * height
+    if len(stored) != needed:
+        raise DataError(f"{path}: {width}x{height} pixels need {needed} bytes, the file has {len(stored)}; {AGAIN}")
     with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
-        metres: Float32 = np.divide(stored, scale or 1, dtype=np.float32)
-    return metres
+        metres: Float32 = np.divide(np.frombuffer(stored, "<f4"), scale or 1, dtype=np.float32)
+    return metres.reshape(height, width)
 
 
 Depth = Float32
@@ -149,28 +148,8 @@ FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
 """What reads depth by the file's suffix; `read_depth` reads the rest."""
 
 
-class DepthSource(Protocol):
-    """The depth of a scene's frames."""
-
-    def path(self, frame: FrameSource) -> Path:
-        """The file that a frame's depth comes from."""
-        ...
-
-    def scale(self, frame: FrameSource) -> float | None:
-        """Units of stored depth in a metre, None where depth is not stored."""
-        ...
-
-    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
-        """Depth (H, W) along the optical axis in metres, of a file whose bytes `read` gives. Raises DataError."""
-        ...
-
-    def digest(self, frame: FrameSource) -> bytes | None:
-        """A hash of the content behind the frame's depth, None where the file has to be read for it."""
-        ...
-
-
 class StoredDepth:
-    """A file a frame."""
+    """Depth from a file a frame."""
 
     def __init__(self, options: FileOptions) -> None:
         self._options = options
@@ -204,7 +183,7 @@ class StoredDepth:
 
 
 class CastDepth:
-    """Rays cast at one surface. `views` are those of all frames, which say what is wrong where one sees nothing."""
+    """Depth of rays cast at one surface. `views` of all frames tell what is wrong where one sees nothing."""
 
     def __init__(self, surface: Surface, options: FileOptions, views: Callable[[], Iterable[View]]) -> None:
         self._surface = surface

@@ -1,4 +1,4 @@
-"""Options that every dataset of files has: where its label maps are, its units and its conventions."""
+"""Options that every dataset of files has, path templates, and where the files of a frame are."""
 
 from __future__ import annotations
 
@@ -295,7 +295,7 @@ class Folders:
         return self._names[folder]
 
 
-
+# Where the files of a frame are.
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,9 +353,7 @@ class FrameTable(Sequence[FrameSource]):
             inside_text(folder, frame.name, str(frame.pose_file))  # files of predictions are called so
             values = [getattr(frame, field) for field in FIELDS]
             self._rows.append(tuple(str(value) if isinstance(value, Path) else value for value in values))
-        self._source = functools.lru_cache(maxsize=64)(
-            self._made
-        )  # a frame is asked for several times while it is read
+        self._source = functools.lru_cache(maxsize=64)(self._made)
 
     def __len__(self) -> int:
         return len(self._rows)

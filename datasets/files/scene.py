@@ -13,7 +13,7 @@ import numpy as np
 
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
-from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
+from semstab.datasets.files.depth import CastDepth, StoredDepth, shape_of
 from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
 from semstab.datasets.files.surfaces import Surface, View
@@ -32,8 +32,6 @@ PLACES = {
     "casts", "images",
 }  # fmt: skip
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
-
-DIGEST_BYTES = 32
 
 AT_ONCE = 64
 """Files that a thread reads one after the other for their digests."""
@@ -77,7 +75,7 @@ class FileScene(Scene):
         self.label_paths = tuple(label_paths(options, place, frames))
         self._digests: dict[str, UInt8] = {}
         self._tracked: list[bool | None] = [None] * len(frames)
-        self._depth: DepthSource = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
+        self._depth = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
         self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
         self.on_photographs = frames.distorted
@@ -235,19 +233,20 @@ class FileScene(Scene):
         for first in range(0, len(indices), BATCH):
             some = indices[first : first + BATCH]
             files = [self._images(index, backbone) for index in some]
-            unread = [
-                (index, what, path)
-                for index, own in zip(some, files, strict=True)
-                for what, path in own.items()
-                if self._known_digest(index, what) is None
-            ]
-            read = _digests_of(unread)
+            self._read_digests(
+                [
+                    (index, what, path)
+                    for index, own in zip(some, files, strict=True)
+                    for what, path in own.items()
+                    if self._known_digest(index, what) is None
+                ]
+            )
             for index, own in zip(some, files, strict=True):
                 source = self._frame(index)
                 digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
                 digest.update(self._depth.digest(source) or b"")
                 for what in own:
-                    digest.update(read.get((index, what)) or self._known_digest(index, what) or b"")
+                    digest.update(self._known_digest(index, what) or b"")
         return digest.hexdigest()
 
     def _images(self, index: int, backbone: str) -> dict[str, Path]:
@@ -329,11 +328,22 @@ class FileScene(Scene):
 
         def read(path: Path) -> bytes:
             data = disk.read_bytes(path)
-            digests = self._digests.setdefault(what, np.zeros((len(self), DIGEST_BYTES), dtype=np.uint8))
-            digests[index] = np.frombuffer(disk.digest(data), dtype=np.uint8)
+            self._remember_digest(index, what, disk.digest(data))
             return data
 
         return read
+
+    def _remember_digest(self, index: int, what: str, digest: bytes) -> None:
+        digests = self._digests.setdefault(what, np.zeros((len(self), len(digest)), dtype=np.uint8))
+        digests[index] = np.frombuffer(digest, dtype=np.uint8)
+
+    def _read_digests(self, files: Sequence[tuple[int, str, Path]]) -> None:
+        """Read files of frames for their digests, some in each of several threads."""
+        some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
+        digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
+        for own, fetched in zip(some, digests, strict=True):
+            for (index, what, _), digest in zip(own, fetched.item, strict=True):
+                self._remember_digest(index, what, digest)
 
     def _known_digest(self, index: int, what: str) -> bytes | None:
         """The digest of a frame's file; None where it was not read."""
@@ -351,14 +361,3 @@ class FileScene(Scene):
         if not 0 <= index < len(self):
             raise ConfigError(f"{self.folder}: there is no frame {index}; it has {len(self)}, counted from 0")
         return self._frames[index]
-
-
-def _digests_of(files: Sequence[tuple[int, str, Path]]) -> dict[tuple[int, str], bytes]:
-    """Those of files of frames that have to be read for it, some in each of several threads."""
-    some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
-    digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
-    return {
-        (index, what): digest
-        for own, fetched in zip(some, digests, strict=True)
-        for (index, what, _), digest in zip(own, fetched.item, strict=True)
-    }
