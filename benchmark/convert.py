@@ -44,7 +44,9 @@ from semstab.model.labels import LabelSpace
 from semstab.model.results import slug
 from semstab.task import frame_indices, selected
 
-# A posed folder that is being written: each file whole or not there, what is there already kept.
+__all__ = ["Converted", "convert", "convert_scene"]
+
+# A posed folder that is being written: each file is whole or missing, and existing files stay.
 
 SCHEMA = 1
 """Version of conversion.json."""
@@ -73,7 +75,7 @@ class DepthFormat:
         return "float32 .npy" if self.scale is None else f"16-bit PNG, {self.scale:g} units a metre"
 
     def stored(self, depth: Float32, tolerance: float) -> npt.NDArray[Any] | None:
-        """What a file of this format holds; None where a pixel would be off by more than `tolerance` metres."""
+        """Return the depth as a file holds it; None where a pixel would be off by more than `tolerance` metres."""
         if self.scale is None:
             return depth
         units, error = quantised(depth, self.scale)
@@ -105,7 +107,7 @@ def depth_format(depths: Sequence[Float32], tolerance: float) -> DepthFormat:
 
 @dataclass(frozen=True)
 class _Conversion:
-    """What conversion.json says that a later start needs."""
+    """The values of conversion.json that a later start needs."""
 
     key: str
     depth_scale: float | None
@@ -138,7 +140,7 @@ class SceneFolder:
         self._lock: FolderLock | None = None
 
     def begin(self, form: DepthFormat, scene_settings: Mapping[str, Any]) -> None:
-        """Say how depth is stored, in scene.yaml and for a later start; depth of another format is removed."""
+        """Write into scene.yaml and conversion.json how depth is stored; remove depth of another format."""
         if self.form is not None and self.form != form:
             for file in (self.path / "depth").glob(f"*{self.form.suffix}"):
                 file.unlink()
@@ -155,7 +157,7 @@ class SceneFolder:
         write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
 
     def close(self) -> None:
-        """Let another process have it."""
+        """Release the lock of the folder."""
         if self._lock is not None:
             self._lock.release()
 
@@ -179,7 +181,7 @@ class SceneFolder:
         return scores.is_dir() and not labels.is_dir()
 
     def write_geometry(self, name: str, frame: Frame) -> None:
-        """Write what a frame shows beside labels.
+        """Write depth, pose, colour and mask of a frame.
 
         Raises DepthFormatError, or DataError where its intrinsics are not those of the frames before.
         """
@@ -216,7 +218,7 @@ class SceneFolder:
         space.save(folder / LABEL_SPACE_FILE)
 
     def read_as(self, backbone: str) -> str:
-        """The name under which the backbone is found in the folder."""
+        """Return the name of the backbone as posed_folder reads it."""
         return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else folder_name(backbone)
 
     def _depth_path(self, name: str, form: DepthFormat) -> Path:
@@ -273,23 +275,21 @@ def _bare(backbone: str) -> str:
     return folder_name(backbone.removesuffix(SCORES_SUFFIX))
 
 
-__all__ = ["Converted", "convert", "convert_scene"]
-
 PROBED_FRAMES = 3
-"""Frames that are looked at to see whether depth fits into 16 bits; where a later one does not, all are floats."""
+"""Frames whose depth is tried in 16 bits; where a later frame does not fit, all become floats."""
 
 Reporter = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Converted:
-    """What came of a scene.
+    """The result of converting one scene.
 
-    folder   where it is
-    frames   how many were selected, of which `written` were not there before
+    folder   of the converted scene
+    frames   how many were selected, of which `written` were new or not complete
     depth    how its depth is stored, in words
     renamed  label sources that have another name in the folder
-    lost     what a posed folder does not hold
+    lost     things of the scene that a posed folder does not hold
     """
 
     scene: str
@@ -306,9 +306,9 @@ def convert(
 ) -> Iterator[Converted]:
     """Write the scenes, frames and label sources that a resolved configuration selects to OUT/SCENE, one by one.
 
-    Where no label source is named, all are written, the ground truth too. Files that an earlier start finished are
-    kept. Depth becomes 16-bit PNG where no pixel is off by more than `depth_error` metres, else float32 .npy; with 0
-    the folder gives the voxels of the source. `progress` is told of each frame: what, how many are done, of how many.
+    Where no label source is named, all are written, the ground truth too. Files that an earlier start finished
+    stay. Depth becomes 16-bit PNG where no pixel is off by more than `depth_error` metres, else float32 .npy; with 0
+    the folder gives the voxels of the source. `progress` is called after each frame: task, frames done, all frames.
 
     Raises ConfigError for a folder that holds something else, DataError for frames that a posed folder cannot hold.
     """
@@ -322,19 +322,19 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     known = (*scene.backbones, *((GROUND_TRUTH,) if scene.ground_truth else ()))
     backbones = selected(config.backbones, known, (), "backbone", scene.name)
     indices = frame_indices(scene, config, backbones)
-    settings = {
-        "dataset": config.dataset.model_dump(mode="json"),
-        "scene": scene.name,
-        "depth_error": depth_error,
-    }
-    folder = SceneFolder(path, settings, depth_error)
+    dataset = config.dataset.model_dump(mode="json")
+    folder = SceneFolder(path, {"dataset": dataset, "scene": scene.name, "depth_error": depth_error}, depth_error)
     if others := folder.frames - set(map(_name, indices)):
         raise ConfigError(f"{path}: holds frame {min(others)}, which is not selected now; choose another --out")
-    _require_places(scene, backbones)
+    folders = [folder_name(name) for name in backbones]
+    if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
+        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
     work = _Work(scene, indices, backbones, folder, progress)
-    up = _up_axis(scene)
     said: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
-    said |= ({"up_axis": up} if up else {}) | _georeference(scene)
+    if up := _up_axis(scene):
+        said["up_axis"] = up
+    if scene.georeference is not None:
+        said |= {"crs": scene.georeference.crs, "offset": list(scene.georeference.offset)}
     with contextlib.closing(folder):
         folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
         try:
@@ -365,31 +365,29 @@ class _Work:
     timed: bool = False
     without_classes: tuple[str, ...] = ()
 
-    @property
-    def sources(self) -> Sequence[str | None]:
-        """The label sources; one, None, where there are no labels."""
-        return self.backbones or (None,)
-
     def probe(self) -> list[Float32]:
-        """Depth of some frames."""
-        read = reader(self.scene, self.sources[0])
+        """Return the depth of some frames."""
+        read = reader(self.scene, self.backbones[0] if self.backbones else None)
         return [read(self.indices[position]).depth for position in evenly(len(self.indices), PROBED_FRAMES)]
 
     def write(self) -> int:
-        """Write what is not there, and say how many frames were not complete."""
+        """Write the files that are missing, and return how many frames were not complete."""
         written = set()
-        for source in self.sources:
+        for source in self.backbones or (None,):
             missing = [index for index in self.indices if not self._has(index, source)]
             written.update(missing)
             for done, fetched in enumerate(prefetch(self._reading(source), missing), start=1):
                 self._write_frame(fetched.item, source)
                 self.progress(f"{self.scene.name} · {source or 'geometry'}", done, len(missing))
             if source is not None:
-                self._write_classes(source)
+                try:
+                    self.folder.write_classes(source, self.scene.label_space(source))
+                except DataError:
+                    self.without_classes += (source,)
         return len(written)
 
     def lost(self) -> Iterator[str]:
-        """What a posed folder does not hold."""
+        """Name everything of the scene that a posed folder does not hold."""
         if self.timed:
             yield "time stamps"
         if self.scene.up is not None and _up_axis(self.scene) is None:
@@ -416,31 +414,10 @@ class _Work:
                 raise ConfigError(f"{source} and {source}{SCORES_SUFFIX} would get one folder; choose with --backbone")
             self.folder.write_labels(name, frame, source)
 
-    def _write_classes(self, source: str) -> None:
-        try:
-            space = self.scene.label_space(source)
-        except DataError:
-            self.without_classes += (source,)
-        else:
-            self.folder.write_classes(source, space)
-
-
-def _require_places(scene: Scene, backbones: Sequence[str]) -> None:
-    """Each label source needs a folder of its own."""
-    folders = [folder_name(name) for name in backbones]
-    if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
-        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
-
 
 def _name(index: int) -> str:
     """The name of a frame's files: frames keep their order, and their number where all are converted."""
     return f"{index:06d}"
-
-
-def _georeference(scene: Scene) -> dict[str, Any]:
-    """The settings that say where the scene lies on Earth, where that is known."""
-    known = scene.georeference
-    return {} if known is None else {"crs": known.crs, "offset": list(known.offset)}
 
 
 def _up_axis(scene: Scene) -> str | None:
@@ -453,7 +430,7 @@ def _up_axis(scene: Scene) -> str | None:
 
 @contextmanager
 def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Frames written of one label source; to be called with what, how many are done, of how many."""
+    """A progress bar of the frames of one label source; call it with task, frames done, all frames."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
     with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
         work = bar.add_task("starting", total=None)
@@ -461,9 +438,9 @@ def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 
 
 def print_converted(converted: Converted, console: Console) -> None:
-    """What was written, and what is different or missing in it."""
-    kept = converted.frames - converted.written
-    there = f", {kept} of them from before" if kept else ""
+    """Print the scene, its frames and folder, renamed label sources, and things that were not converted."""
+    before = converted.frames - converted.written
+    there = f", {before} of them from before" if before else ""
     console.print(
         f"{converted.scene}: {converted.frames} frames{there}, depth as {converted.depth}: {converted.folder}",
         soft_wrap=True,

@@ -5,15 +5,32 @@ Sources: Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016; col
 
 from __future__ import annotations
 
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
+import numpy as np
 from pydantic import BaseModel, Field
 
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions, Folders, PixelCentre, PoseConvention, Template, inside
+from semstab.core.files import open_file
+from semstab.datasets.files.options import (
+    FileOptions,
+    Folders,
+    FrameSource,
+    PixelCentre,
+    PoseConvention,
+    Template,
+    inside,
+)
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
+from semstab.datasets.formats.disk import AGAIN, natural, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES
+from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
+from semstab.errors import DataError
+from semstab.model.frames import Intrinsics
 
 MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 
@@ -80,3 +97,164 @@ class Colmap(FileDataset[ColmapOptions]):
         names = MODEL_FOLDERS if self.options.model is None else (self.options.model,)
         candidates = (inside(self.options.root, folder, name, "option model") for name in names)
         return next((candidate for candidate in candidates if has_model(candidate)), None)
+
+
+# The sparse model, text and binary (colmap.github.io/format.html): the cameras and the images; points are skipped.
+
+MODELS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+)  # fmt: skip
+"""By model id."""
+PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16)
+FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
+"""Focal lengths among the parameters of the models that are a pinhole where their distortion is zero."""
+
+MAX_SIDE = 2**24
+MAX_NAME = 1000
+
+Stated = tuple[str, int, int, list[float]]
+"""A camera as a file states it: model, width, height, parameters."""
+
+Registered = tuple[list[float], int, str]
+"""An image as a file states it: [qw qx qy qz tx ty tz], camera id, name."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """One registered image: its name in the model, its pose (4, 4) world-to-camera, its camera."""
+
+    name: str
+    T_cw: Poses
+    camera: Camera
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder holds a sparse model."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def read_model(folder: Path) -> tuple[Path, list[ModelImage]]:
+    """Return the file of the images, and the images in the natural order of their names; binary goes before text.
+
+    Raises DataError for a damaged file, an image without its camera, or a camera that distorts.
+    """
+    binary = (folder / "cameras.bin").is_file()
+    path, cameras_path = (folder / f"{part}{'.bin' if binary else '.txt'}" for part in ("images", "cameras"))
+    try:
+        with open_file(cameras_path) as file:
+            cameras = dict((_cameras_bin if binary else _cameras_txt)(file, cameras_path))
+        with open_file(path) as file:
+            registered = list((_images_bin if binary else _images_txt)(file, path))
+    except OSError as error:
+        raise DataError(f"{error.filename or path}: cannot be read ({error.strerror})") from error
+    if not registered:
+        raise DataError(f"{path}: holds no image; reconstruct again, or set model to the folder of another model")
+    numbers = np.array([image[0] for image in registered])
+    poses = from_quaternions(numbers[:, 4:], numbers[:, [1, 2, 3, 0]], path)
+    images = []
+    for (_, camera_id, name), T_cw in zip(registered, poses, strict=True):
+        if camera_id not in cameras:
+            raise DataError(f"{path}: image {name[:80]!r} has camera {camera_id}, which is not in {cameras_path.name}")
+        images.append(ModelImage(name, T_cw, _pinhole(cameras[camera_id], f"{cameras_path}: camera {camera_id}")))
+    return path, sorted(images, key=lambda image: natural(image.name))
+
+
+def image_name(name: str) -> str:
+    """Return the name of an image in the model without its suffix: the frame's name in path templates."""
+    return os.path.splitext(name)[0]  # noqa: PTH122  a name, not a path
+
+
+def _pinhole(camera: Stated, where: str) -> Camera:
+    model, width, height, parameters = camera
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise DataError(f"{where} has images of {width}x{height} pixels; {AGAIN}")
+    focals = FOCALS.get(model)
+    if focals is None or any(parameters[focals + 2 :]):
+        raise DataError(
+            f"{where} is {model}, which distorts; undistort the images ('colmap image_undistorter')"
+            " and use the model that it writes"
+        )
+    fx, fy, (cx, cy) = parameters[0], parameters[focals - 1], parameters[focals : focals + 2]
+    try:
+        return Camera(Intrinsics(fx, fy, cx, cy), (width, height))
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+
+
+def _cameras_txt(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
+    for line, text in _lines(file):
+        if not text or text.startswith("#"):
+            continue
+        words = text.split()
+        model = words[1] if len(words) > 1 else ""
+        if model not in MODELS or len(words) != 4 + PARAMETERS[MODELS.index(model)]:
+            raise DataError(f"{path}: line {line} is {text[:60]!r}; expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+        camera_id, width, height = (_whole(words[k], path, line) for k in (0, 2, 3))
+        yield camera_id, (model, width, height, [to_number(word, path, line) for word in words[4:]])
+
+
+def _cameras_bin(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
+    (count,) = _unpack(file, "<Q", path)
+    for _ in range(count):
+        camera_id, model_id, width, height = _unpack(file, "<IiQQ", path)
+        if not 0 <= model_id < len(MODELS):
+            raise DataError(
+                f"{path}: camera {camera_id} has the model {model_id}, which is not known; undistort the images"
+            )
+        yield camera_id, (MODELS[model_id], width, height, [*_unpack(file, f"<{PARAMETERS[model_id]}d", path)])
+
+
+def _images_txt(file: BinaryIO, path: Path) -> Iterator[Registered]:
+    """Each image has two lines, of which the second, with its points, may be empty."""
+    lines = _lines(file)
+    for line, text in lines:
+        if not text or text.startswith("#"):
+            continue
+        words = text.split(maxsplit=9)
+        if len(words) != 10:
+            raise DataError(
+                f"{path}: line {line} is {text[:60]!r}; expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            )
+        yield [to_number(word, path, line) for word in words[1:8]], _whole(words[8], path, line), words[9]
+        _, points = next(lines, (0, ""))
+        if len(points.split()) % 3:
+            raise DataError(f"{path}: line {line + 1} does not hold points X Y POINT3D_ID; an image has two lines")
+
+
+def _images_bin(file: BinaryIO, path: Path) -> Iterator[Registered]:
+    size = path.stat().st_size
+    (count,) = _unpack(file, "<Q", path)
+    for _ in range(count):
+        _, *numbers, camera_id = _unpack(file, "<I7dI", path)
+        start = file.tell()
+        text, end, _ = file.read(MAX_NAME + 1).partition(b"\0")
+        if not end:
+            raise DataError(f"{path}: the name of an image does not end within {MAX_NAME} bytes; {AGAIN}")
+        file.seek(start + len(text) + 1)
+        name = text.decode("utf-8", errors="replace")
+        (points,) = _unpack(file, "<Q", path)
+        if points > (size - file.tell()) // 24:
+            raise DataError(f"{path}: truncated in the points of image {name[:80]!r}; {AGAIN}")
+        file.seek(24 * points, os.SEEK_CUR)
+        yield numbers, camera_id, name
+
+
+def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
+    """Number and stripped text of every line: points can take gigabytes, so no file is read whole."""
+    for number, line in enumerate(file, start=1):
+        yield number, line.decode("utf-8", errors="replace").strip()
+
+
+def _unpack(file: BinaryIO, layout: str, path: Path) -> tuple[Any, ...]:
+    data = file.read(struct.calcsize(layout))
+    if len(data) < struct.calcsize(layout):
+        raise DataError(f"{path}: truncated after {file.tell()} bytes; {AGAIN}")
+    return struct.unpack(layout, data)
+
+
+def _whole(word: str, path: Path, line: int) -> int:
+    value = to_number(word, path, line)
+    if not value.is_integer() or abs(value) > 2**53:
+        raise DataError(f"{path}: line {line}: {word[:40]!r} is not a whole number")
+    return int(value)

@@ -5,7 +5,7 @@ Sources: opendronemap.org (docs, Outputs); opensfm.org; the folders of real proj
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,12 +13,20 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
-from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
 from semstab.datasets.files.labels import ScenePlace
-from semstab.datasets.files.options import DepthKind, FileOptions, Folders, PoseConvention, Template, UpAxis, inside
+from semstab.datasets.files.options import (
+    DepthKind,
+    FileOptions,
+    Folders,
+    FrameSource,
+    PoseConvention,
+    Template,
+    UpAxis,
+    inside,
+)
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.formats.dense_depth import HEADER_BYTES, dmap_header
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.opensfm import GEOREFERENCING, Shot, georeference_of, read_reconstruction
@@ -123,32 +131,8 @@ class Images:
 # --- depth ----------------------------------------------------------------------------------------------------------
 
 
-def _mesh(project: Project, _: str) -> Path | None:
-    return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
-
-
-def _dsm(project: Project, _: str) -> Path | None:
-    path = project.folder / DSM
-    return path if path.is_file() else None
-
-
-def _mve(project: Project, _: str) -> Path | None:
-    return next(iter(sorted(project.folder.glob("mve/views/*/depth-L0.mvei"))), None)
-
-
-def _openmvs(project: Project, _: str) -> Path | None:
-    return next(iter(_dmap_files(project)), None)
-
-
-def _files(project: Project, template: str) -> Path | None:
-    folder = (project.folder / template).parent
-    return folder if "{" not in str(folder) and folder.is_dir() else None
-
-
-LOOK_FOR: dict[Kind, Callable[[Project, str], Path | None]] = {
-    "mesh": _mesh, "dsm": _dsm, "mve": _mve, "openmvs": _openmvs, "files": _files,
-}  # fmt: skip
-"""By source of depth what finds it in a project, with the template of depth files; the one taken first in front."""
+KINDS: tuple[Kind, ...] = ("mesh", "dsm", "mve", "openmvs", "files")
+"""Sources of depth; the first of them that a project has is taken."""
 
 PLACES: dict[Kind, str] = {
     "mesh": "odm_meshing/odm_mesh.ply, odm_25dmesh.ply, odm_texturing*/*_geo.obj",
@@ -157,6 +141,19 @@ PLACES: dict[Kind, str] = {
     "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
     "files": "depth/NAME.png",
 }
+
+
+def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
+    """Return the file or folder of a source of depth, None where the project lacks it; `template` is that of files."""
+    if kind == "mesh":
+        return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
+    if kind == "mve":
+        return next(iter(sorted(project.folder.glob("mve/views/*/depth-L0.mvei"))), None)
+    if kind == "openmvs":
+        return next(iter(_dmap_files(project)), None)
+    path = project.folder / DSM if kind == "dsm" else (project.folder / template).parent
+    there = path.is_file() if kind == "dsm" else "{" not in str(path) and path.is_dir()
+    return path if there else None
 
 
 def _dmap_files(project: Project) -> list[Path]:
@@ -246,9 +243,9 @@ class Odm(FileDataset[OdmOptions]):
         if options.surface is not None:
             return options.model_copy(update={"depth_kind": options.depth_kind or "planar"})
         project = self._project(folder)
-        kinds = [options.depth_from] if options.depth_from else list(LOOK_FOR)
+        kinds = [options.depth_from] if options.depth_from else list(KINDS)
         for kind in kinds:
-            if (found := LOOK_FOR[kind](project, options.depth)) is not None:
+            if (found := find_depth(project, kind, options.depth)) is not None:
                 surface = found if kind in ("mesh", "dsm") else None
                 along = options.depth_kind or ("ray" if kind == "mve" else "planar")
                 return options.model_copy(update={"surface": surface, "depth_from": kind, "depth_kind": along})

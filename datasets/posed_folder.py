@@ -9,12 +9,12 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.config import read_yaml, validated
-from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.options import (
     CameraAxes,
     DepthKind,
     FileOptions,
     FileSettings,
+    FrameSource,
     MetresPerUnit,
     PixelCentre,
     PoseConvention,

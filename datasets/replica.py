@@ -12,8 +12,15 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions, FourIntrinsics, GroundTruth, UpAxis, VoidIds, zero_is_void
+from semstab.datasets.files.options import (
+    FileOptions,
+    FourIntrinsics,
+    FrameSource,
+    GroundTruth,
+    UpAxis,
+    VoidIds,
+    zero_is_void,
+)
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.disk import number, read_matrices, read_object
 from semstab.datasets.geometry.cameras import Camera, camera_of

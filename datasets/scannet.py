@@ -14,9 +14,17 @@ from pydantic import BaseModel, Field
 
 from semstab.core.types import UInt16
 from semstab.datasets import GROUND_TRUTH
-from semstab.datasets.files.frame_source import FrameSource
 from semstab.datasets.files.labels import NO_ID
-from semstab.datasets.files.options import DepthScale, FileOptions, GroundTruth, Size, UpAxis, VoidIds, zero_is_void
+from semstab.datasets.files.options import (
+    DepthScale,
+    FileOptions,
+    FrameSource,
+    GroundTruth,
+    Size,
+    UpAxis,
+    VoidIds,
+    zero_is_void,
+)
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.disk import read_bytes, read_intrinsics
 from semstab.datasets.geometry.cameras import Camera

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, InvalidDepth, Size
+from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, FrameSource, InvalidDepth, Size
 from semstab.datasets.files.reader import FileDataset, files_named, frames_of
 from semstab.datasets.formats.disk import read_intrinsics
 from semstab.datasets.geometry.cameras import Camera, camera_of

@@ -11,8 +11,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import CameraAxes, FileOptions, FourIntrinsics, MaxDepth, UpAxis
+from semstab.datasets.files.options import CameraAxes, FileOptions, FourIntrinsics, FrameSource, MaxDepth, UpAxis
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.disk import read_table
 from semstab.datasets.geometry.cameras import camera_of, from_quaternions

@@ -15,8 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import CameraAxes, FileOptions, Folders, PixelCentre, Template, inside
+from semstab.datasets.files.options import CameraAxes, FileOptions, Folders, FrameSource, PixelCentre, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import matrix, natural, number, read_object
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES

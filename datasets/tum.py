@@ -14,8 +14,15 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.core.types import Float64
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, Positive, UpAxis, inside
+from semstab.datasets.files.options import (
+    DepthScale,
+    FileOptions,
+    FourIntrinsics,
+    FrameSource,
+    Positive,
+    UpAxis,
+    inside,
+)
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import read_table, records, to_number
 from semstab.datasets.geometry.cameras import at_times, camera_of, from_quaternions, nearest

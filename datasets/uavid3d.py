@@ -12,12 +12,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.files.frame_source import FrameSource
+from semstab.datasets.colmap import has_model, image_name, read_model
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
     Folders,
     FourIntrinsics,
+    FrameSource,
     GroundTruth,
     PixelCentre,
     PoseConvention,
@@ -25,7 +26,6 @@ from semstab.datasets.files.options import (
     inside,
 )
 from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.formats.colmap_model import has_model, image_name, read_model
 from semstab.datasets.formats.disk import read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from semstab.datasets.formats.codecs import PNG_SIGNATURE
+from semstab.datasets.formats.images import PNG_SIGNATURE
 from semstab.errors import DataError
 from semstab.model.labels import LabelSpace
 

@@ -28,8 +28,7 @@ from image_files import (
 )
 
 from semstab.datasets.formats import disk
-from semstab.datasets.formats.codecs import PNG_SIGNATURE
-from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
+from semstab.datasets.formats.images import PNG_SIGNATURE, read_color, read_depth, read_labels, read_scores
 from semstab.errors import DataError
 
 NOISE = np.random.default_rng(7).integers(0, 256, (24, 32, 3)).astype(np.uint8)

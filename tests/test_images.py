@@ -25,7 +25,7 @@ from image_files import (
     written,
 )
 
-from semstab.datasets.formats import codecs
+from semstab.datasets.formats import images
 from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
 from semstab.errors import ConfigError
 from semstab.model.labels import LabelSpace
@@ -99,7 +99,7 @@ def test_depth_of_another_type_is_refused(tmp_path, name, content, match):
 
 def test_exr_says_what_to_convert_to_where_opencv_cannot_read_it(tmp_path):
     path = written(tmp_path / "d.exr", exr_header(7, 5))
-    refused(read_depth, path, match="damaged" if codecs.reads_exr() else r"convert the depth to \.npy")
+    refused(read_depth, path, match="damaged" if images.reads_exr() else r"convert the depth to \.npy")
 
 
 # --- labels

@@ -1,13 +1,8 @@
-"""Small files with huge contents, files that are none, names that lead out: one short line, no memory, no waiting."""
+"""Files that are none, aliases without end, names that lead out: one short line, no memory, no waiting."""
 
 from __future__ import annotations
 
-import io
 import os
-import resource
-import struct
-import zipfile
-import zlib
 
 import numpy as np
 import pytest
@@ -16,64 +11,10 @@ from posed_scene import fails, first_frame, write_scene
 from posed_scene import opened as opened_folder
 
 from semstab.config import read_yaml
-from semstab.datasets.formats.images import read_color, read_depth, read_labels
+from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import LabelSpace
 from semstab.predict.folder import PredictionFolder
-
-
-def chunk(kind: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-
-def png_of_zeros(side: int, kind: int, channels: int) -> bytes:
-    """A whole PNG of side x side zeros, of a thousandth of its content's size."""
-    rows = zlib.compressobj(9)
-    row = bytes(1 + side * channels)
-    data = b"".join([*(rows.compress(row) for _ in range(side)), rows.flush()])
-    header = struct.pack(">IIBBBBB", side, side, 8, kind, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-
-
-def grown_by() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def test_a_small_image_of_huge_content_is_refused(tmp_path):
-    path = tmp_path / "labels.png"
-    path.write_bytes(png_of_zeros(16384, 6, 4))
-    assert path.stat().st_size < 2_000_000
-    before = grown_by()
-    fails(DataError, "claims 16384x16384 pixels", read_labels, path, LabelSpace("two", ("a", "b")))
-    fails(DataError, "claims 16384x16384 pixels", read_color, path)
-    assert grown_by() - before < 100_000  # kilobytes
-
-
-def test_a_small_archive_of_huge_content_is_refused(tmp_path):
-    path = tmp_path / "labels.npz"
-    out = io.BytesIO()
-    np.lib.format.write_array_header_1_0(out, {"descr": "<i8", "fortran_order": False, "shape": (1 << 14, 1 << 15)})
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("labels.npy", "w") as member:
-        member.write(out.getvalue())
-        for _ in range(520):
-            member.write(bytes(1 << 20))
-    assert path.stat().st_size < 2_000_000
-    before = grown_by()
-    fails(DataError, "claims 5.* bytes", read_labels, path)
-    fails(DataError, "claims 5.* bytes", read_depth, path)
-    assert grown_by() - before < 100_000
-
-
-def test_a_jpeg_that_claims_4_gigapixels_is_refused(tmp_path):
-    from PIL import Image
-
-    path = tmp_path / "frame.jpg"
-    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(path)
-    data = bytearray(path.read_bytes())
-    at = data.index(b"\xff\xc0") + 5
-    data[at : at + 4] = struct.pack(">HH", 65000, 65000)
-    path.write_bytes(data)
-    fails(DataError, "claims 65000x65000 pixels", read_color, path)
 
 
 def test_colours_of_a_large_label_map_are_looked_up_in_parts(tmp_path):

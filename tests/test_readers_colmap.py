@@ -27,8 +27,8 @@ from dataset_writers import (
 )
 from posed_scene import fails
 
-from semstab.datasets.formats.colmap_model import read_model
-from semstab.datasets.formats.dense_depth import read_depth_map
+from semstab.datasets.colmap import read_model
+from semstab.datasets.files.depth import read_depth_map
 from semstab.errors import DataError
 
 TEXT, BINARY = FORMATS["colmap, text"], FORMATS["colmap, binary"]

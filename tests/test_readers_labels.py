@@ -12,9 +12,8 @@ from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
-from semstab.datasets.files.frame_source import FrameSource, FrameTable
 from semstab.datasets.files.labels import ScenePlace, find_sources
-from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
 from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import fit_labels, fit_scores
 from semstab.datasets.scannet import read_class_table

@@ -13,8 +13,7 @@ from dataset_writers import COUNT, FORMATS, numbers, opened, source, write_label
 from posed_scene import fails
 
 from semstab.config import FrameSelection
-from semstab.datasets.files.frame_source import FrameSource, FrameTable
-from semstab.datasets.files.options import Folders
+from semstab.datasets.files.options import Folders, FrameSource, FrameTable
 from semstab.datasets.formats.disk import natural, naturally
 from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import Lens

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from posed_scene import fails
 
 from semstab.datasets import open_dataset
-from semstab.datasets.formats.dense_depth import read_dmap, read_mvei
+from semstab.datasets.files.depth import read_dmap, read_mvei
 from semstab.errors import ConfigError, DataError
 from semstab.model.georeference import Georeference, wkt
 

@@ -11,7 +11,6 @@ import pytest
 
 from semstab.core import rows
 from semstab.core.rows import Rows
-from semstab.datasets.files.scene import Digests
 
 
 @pytest.fixture
@@ -70,27 +69,6 @@ def test_memory_does_not_grow_with_the_rows(monkeypatch) -> None:
     assert sum(len(block) for block in found.blocks()) == len(found) == 48 * rows.BLOCK
     assert tracemalloc.get_traced_memory()[1] < 4 * rows.BLOCK * 21 * 8 + 10_000
     tracemalloc.stop()
-
-
-@pytest.mark.parametrize("small", [0, rows.SMALL])
-def test_digests_are_there_for_files_that_were_read(monkeypatch, small) -> None:
-    monkeypatch.setattr(rows, "SMALL", small)
-    digests = Digests(5)
-    digests.keep(3, "depth", bytes(range(32)))
-    digests.keep(4, "labels", bytes(range(1, 33)))
-    assert digests.of(3, "depth") == bytes(range(32))
-    assert digests.of(4, "labels") == bytes(range(1, 33))
-    assert digests.of(4, "depth") is digests.of(3, "mask") is digests.of(0, "labels") is None
-
-
-def test_a_digest_that_finds_no_room_is_not_kept(monkeypatch) -> None:
-    monkeypatch.setattr(rows, "SMALL", 0)
-    digests = Digests(5)
-    digests.keep(0, "depth", bytes(range(32)))
-    with monkeypatch.context() as full:
-        full.setattr(rows.os, "pwrite", disk_is_full)
-        digests.keep(1, "depth", bytes(range(32)))
-    assert (digests.of(0, "depth"), digests.of(1, "depth")) == (bytes(range(32)), None)
 
 
 def test_what_is_large_is_where_tmpdir_says(monkeypatch, tmp_path) -> None:

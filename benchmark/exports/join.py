@@ -16,7 +16,7 @@ import numpy.typing as npt
 from semstab.core.at_hand import AtHand
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64, Int64
-from semstab.datasets.formats.las_files import opened, points_at_once
+from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.errors import ConfigError, DataError
 from semstab.exports import las, ply
 from semstab.exports.voxels import Chosen, Column, Voxels
@@ -221,7 +221,7 @@ def _beside(cloud: Path, finder: _Finder) -> DataError:
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
     module = las.with_lazrs(cloud)
-    with opened(cloud) as reader:
+    with open_las(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
         header = _extended(reader.header, voxels)
         compress = out.suffix.lower() == ".laz"

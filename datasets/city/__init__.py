@@ -19,8 +19,7 @@ from semstab.config import nearest
 from semstab.core.types import Float64, UInt8
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedBackbone
-from semstab.datasets.city.rendering import Caster, Rendered, render
-from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.simulation import Caster, Rendered, Simulation, View, render
 from semstab.datasets.city.world import World, build_world
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import ConfigError, DataError

@@ -11,7 +11,7 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.datasets.city.mesh import CLUTTER, LOW_VEGETATION, Color
-from semstab.datasets.city.streets import Plot, Rectangle
+from semstab.datasets.city.terrain import Plot, Rectangle
 
 SIDEWALK = 1.9
 YARD_ABOVE, FIELD_ABOVE, SIDEWALK_ABOVE = 0.052, 0.047, 0.163

@@ -1,18 +1,218 @@
-"""Simulated backbones: the true label map with errors tied to places, views, frames and class borders."""
+"""Ray casting: depth, class, incidence and colour of each pixel, with trimesh's embree intersector."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
-from semstab.core.types import Float32, Float64, Int64, UInt8, UInt64
-from semstab.datasets.city.mesh import uavid8
+from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt64
+from semstab.datasets.city.mesh import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE, Surface, uavid8
 from semstab.datasets.city.options import CONFUSION, SimulatedBackbone
-from semstab.datasets.city.rendering import CHUNK, Rendered, hash_integers, rehash, salt, uniform
 from semstab.model.frames import Intrinsics
 from semstab.model.labels import IGNORE_8BIT
+
+# Random numbers that are a function of integers: the same place, view or frame always draws the same number.
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX2 = np.uint64(0x94D049BB133111EB)
+
+
+def splitmix64(x: UInt64) -> UInt64:
+    """The output function of splitmix64 (Steele, Lea, Flood 2014) for states x, an array with an axis."""
+    x = x + _GOLDEN
+    x ^= x >> np.uint64(30)
+    x *= _MIX1
+    x ^= x >> np.uint64(27)
+    x *= _MIX2
+    x ^= x >> np.uint64(31)
+    return x
+
+
+def salt(*parts: str | int) -> int:
+    """A 64-bit number that stands for names and numbers; the same in every process, unlike `hash`."""
+    text = "\x1f".join(str(part) for part in parts)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def hash_integers(seed: int, *coordinates: Int64) -> UInt64:
+    """Hash integer coordinates, arrays of one shape, one after the other into 64 bits."""
+    state = np.full(coordinates[0].shape, seed, dtype=np.uint64)
+    for coordinate in coordinates:
+        state = splitmix64(state ^ coordinate.astype(np.int64, copy=False).view(np.uint64))
+    return state
+
+
+def rehash(state: UInt64, seed: int) -> UInt64:
+    """A second, independent hash of what `state` is a hash of."""
+    return splitmix64(state ^ np.uint64(seed))
+
+
+def uniform(state: UInt64) -> Float64:
+    """Hashes as numbers in [0, 1), from their upper 53 bits."""
+    numbers: Float64 = (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return numbers
+
+
+CHUNK = 1 << 18
+"""Rays cast at a time: what bounds the memory of a large image."""
+
+SUN = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
+AMBIENT, SUNLIGHT = 0.52, 0.60
+SKY = np.array([0.62, 0.72, 0.85])
+SHADOW_OFFSET = 0.02
+GRAIN = np.zeros((256, 2))  # by class: share by which colour varies over 0.3 m and over 2.3 m
+GRAIN[:] = 0.04, 0.04
+GRAIN[TREE] = 0.34, 0.14
+GRAIN[LOW_VEGETATION] = 0.17, 0.13
+GRAIN[ROAD] = 0.06, 0.06
+GRAIN[CLUTTER] = 0.08, 0.05
+GRAIN[BUILDING] = 0.06, 0.04
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What the camera sees, shared by all backbones of a scene.
+
+    depth      (H, W) float32, planar z in metres; 0 where a ray hits nothing
+    classes    (H, W) uint8 uavid8 ids; 255 where a ray hits nothing
+    incidence  (H, W) float32, cosine of the angle between ray and surface normal, 0..1
+    color      (H, W, 3) uint8 RGB
+    """
+
+    depth: Float32
+    classes: UInt8
+    incidence: Float32
+    color: UInt8
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all images together."""
+        return self.depth.nbytes + self.classes.nbytes + self.incidence.nbytes + self.color.nbytes
+
+
+class Caster:
+    """Triangles to cast rays at: embree finds the triangle in float32, its plane gives the place in float64."""
+
+    def __init__(self, surface: Surface) -> None:
+        import trimesh
+        from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+        self.surface = surface
+        corners = surface.vertices[surface.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.normals: Float64 = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        self.offsets: Float64 = (self.normals * corners[:, 0]).sum(axis=1)
+        if not len(surface.faces):
+            return
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
+        self._intersector: Any = RayMeshIntersector(mesh)
+
+    def first(self, origin: Float64, directions: Float64) -> tuple[Int64, Float64]:
+        """The triangle that each ray of `directions` (n, 3) hits first (-1: none) and its ray parameter (inf: none)."""
+        if not len(self.normals):
+            return np.full(len(directions), -1), np.full(len(directions), np.inf)
+        origins = np.broadcast_to(origin, directions.shape)
+        face: Int64 = np.asarray(self._intersector.intersects_first(origins, directions)).astype(np.int64)
+        normal = self.normals[face]
+        along = np.einsum("ij,ij->i", normal, directions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parameter = (self.offsets[face] - normal @ origin) / along
+        missed = (face < 0) | ~np.isfinite(parameter) | (parameter <= 0)
+        face[missed], parameter[missed] = -1, np.inf
+        return face, parameter
+
+    def blocks(self, points: Float64, direction: Float64) -> Mask:
+        """Whether a ray from each point (n, 3) along one direction hits anything."""
+        if not len(self.normals):
+            return np.zeros(len(points), dtype=bool)
+        towards = np.broadcast_to(direction, points.shape)
+        hit: Mask = np.asarray(self._intersector.intersects_first(points, towards)) >= 0
+        return hit
+
+
+def render(still: Caster, moving: Caster, T: Float64, intrinsics: Intrinsics, shape: tuple[int, int]) -> Rendered:
+    """Render (H, W) pixels from the pose T (4, 4), relative to the town's origin."""
+    H, W = shape
+    depth, incidence = np.zeros((2, H * W), dtype=np.float32)
+    classes = np.full(H * W, IGNORE_8BIT, dtype=np.uint8)
+    color = np.empty((H * W, 3), dtype=np.uint8)
+    rows = max(1, CHUNK // W)
+    for top in range(0, H, rows):
+        part = slice(top * W, min(top + rows, H) * W)
+        directions = pixel_rays(intrinsics, T, top, min(top + rows, H), W)
+        hit = _nearest((still, moving), T[:3, 3], directions)
+        depth[part] = np.where(hit.classes == IGNORE_8BIT, 0.0, hit.depth)
+        incidence[part], classes[part] = hit.incidence, hit.classes
+        color[part] = _shade(hit, (still, moving))
+    return Rendered(depth.reshape(shape), classes.reshape(shape), incidence.reshape(shape), color.reshape(H, W, 3))
+
+
+def pixel_rays(intrinsics: Intrinsics, T: Float64, top: int, bottom: int, width: int) -> Float64:
+    """World directions ((bottom - top) * width, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
+    x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
+    y = (np.arange(top, bottom) - intrinsics.cy) / intrinsics.fy
+    rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]
+    directions: Float64 = rays.reshape(-1, 3)
+    return directions
+
+
+@dataclass(frozen=True)
+class _Hit:
+    """Per ray: planar depth (inf for none), place, normal towards the camera, incidence, class, material colour."""
+
+    depth: Float64
+    points: Float64
+    normals: Float64
+    incidence: Float64
+    classes: UInt8
+    material: Float64
+
+
+def _nearest(casters: tuple[Caster, Caster], origin: Float64, directions: Float64) -> _Hit:
+    n = len(directions)
+    depth, normals = np.full(n, np.inf), -directions
+    classes, material = np.full(n, IGNORE_8BIT, dtype=np.uint8), np.tile(SKY, (n, 1))
+    for caster in casters:
+        face, parameter = caster.first(origin, directions)
+        nearer = np.flatnonzero(parameter < depth)
+        hit = face[nearer]
+        depth[nearer], normals[nearer] = parameter[nearer], caster.normals[hit]
+        classes[nearer], material[nearer] = caster.surface.classes[hit], caster.surface.colors[hit]
+    towards = np.einsum("ij,ij->i", normals, directions)
+    normals[towards > 0] *= -1
+    incidence = np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", directions, directions))
+    points = origin + directions * np.where(np.isinf(depth), 0.0, depth)[:, None]
+    return _Hit(depth, points, normals, np.where(np.isinf(depth), 0.0, np.minimum(incidence, 1.0)), classes, material)
+
+
+def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> UInt8:
+    """Lambert's law under one sun with cast shadows, with grain that is tied to the place."""
+    light = np.maximum(hit.normals @ SUN, 0.0)
+    lit = np.flatnonzero(light > 0)
+    start = hit.points[lit] + SHADOW_OFFSET * (hit.normals[lit] + SUN)
+    for caster in casters:
+        light[lit] *= ~caster.blocks(start, SUN)
+    brightness = AMBIENT + SUNLIGHT * light
+    fine, coarse = GRAIN[hit.classes].T
+    brightness *= 1 + fine * _noise(hit.points, 0.3) + coarse * _noise(hit.points, 2.3)
+    seen = hit.classes != IGNORE_8BIT
+    shaded = np.where(seen[:, None], hit.material * brightness[:, None], SKY)
+    color: UInt8 = np.clip(shaded * 255, 0, 255).astype(np.uint8)
+    return color
+
+
+def _noise(points: Float64, cell: float) -> Float64:
+    """Numbers in [-1, 1], one for each cubic cell of space."""
+    x, y, z = np.floor(points / cell).astype(np.int64).T
+    return 2 * uniform(hash_integers(17, x, y, z)) - 1
+
+
+# Simulated backbones: the true label map with errors tied to places, views, frames and class borders.
 
 Labels = UInt8
 Scores = Float32

@@ -2,21 +2,142 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+import re
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
 from semstab.core.types import Float32, Float64
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions
+from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
-from semstab.datasets.formats.dense_depth import read_depth_map, read_dmap, read_mvei
-from semstab.datasets.formats.images import MILLIMETRES, Read, color_size, read_depth
+from semstab.datasets.formats.disk import AGAIN, read_bytes
+from semstab.datasets.formats.images import MAX_PIXELS, MILLIMETRES, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
+
+# Depth maps of multi-view stereo programs, MVE's .mvei and OpenMVS's .dmap: metres, or one DataError with the file.
+#
+# Sources: Fuhrmann et al., MVE, GCH 2014 (libs/mve/image_io); openMVS (libs/MVS/Interface.h, HeaderDepthDataRaw).
+
+MVEI = b"\x89MVE_IMAGE\n"
+MVEI_HEADER = struct.Struct("<4i")
+MVEI_FLOAT = 9
+"""Of a sample: 32-bit float."""
+
+DMAP_HEADER = struct.Struct("<2sBb4I2f")
+"""Magic, what it holds, exponent; width and height of the image, then of the depth; least and largest depth."""
+DMAP_CAMERA = 21 * 8
+"""Bytes of K, R and C."""
+HEADER_BYTES = 2**18
+"""In which all that `dmap_header` reads lies: a name and the numbers of some thousand neighbours at most."""
+SAMPLES: Mapping[bytes, np.dtype[Any]] = {b"DR": np.dtype("<f4"), b"D2": np.dtype("<f2")}
+"""Of a depth map, by its magic: of today's files halves, that 2 ** exponent makes metres."""
+
+
+def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
+    """Depth (H, W) of a depth-LN.mvei, float32, as lengths of rays; 0 where there is none.
+
+    `scale` is units in a metre. Raises DataError where the file is no depth map, or truncated.
+    """
+    data = read(path)
+    start = len(MVEI) + MVEI_HEADER.size
+    if not data.startswith(MVEI) or len(data) < start:
+        raise DataError(f"{path}: not an MVE image (it begins with {data[:11]!r}); {AGAIN}")
+    width, height, channels, kind = MVEI_HEADER.unpack_from(data, len(MVEI))
+    if (channels, kind) != (1, MVEI_FLOAT):
+        raise DataError(f"{path}: {channels} channels of type {kind}; a depth map has one of type {MVEI_FLOAT} (float)")
+    return _metres(path, data, start, (height, width), np.dtype("<f4"), 1 / (scale or 1))
+
+
+@dataclass(frozen=True)
+class DmapHeader:
+    """What a .dmap says of its depth: shape (H, W), samples of `dtype` from byte `start`, times 2 ** exponent.
+
+    image  the name of the file that it is of
+    """
+
+    image: str
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+    exponent: int
+    start: int
+
+
+def dmap_header(path: Path, data: bytes) -> DmapHeader:
+    """From the first bytes of a file, a few thousand suffice. Raises DataError where it is none."""
+    magic = data[:2]
+    if magic not in SAMPLES or len(data) < DMAP_HEADER.size:
+        raise DataError(f"{path}: not an OpenMVS depth map (it begins with {magic!r}); {AGAIN}")
+    _, holds, exponent, _, _, width, height, _, _ = DMAP_HEADER.unpack_from(data)
+    new = magic == b"D2"
+    at = DMAP_HEADER.size + (4 if new else 0)  # after the scale of confidences
+    try:
+        (length,) = struct.unpack_from("<H", data, at)
+        name = data[at + 2 : at + 2 + length].decode(errors="replace")
+        at += 2 + length
+        (views,) = struct.unpack_from("<I", data, at)
+    except struct.error as error:
+        raise DataError(f"{path}: the depth map is truncated after {len(data)} bytes; {AGAIN}") from error
+    if not holds & 1:
+        raise DataError(f"{path}: holds no depth; {AGAIN}")
+    start = at + 4 + 4 * views + DMAP_CAMERA  # beyond the file where that is damaged, which `_metres` says
+    return DmapHeader(name, (height, width), SAMPLES[magic], exponent if new else 0, start)
+
+
+def read_dmap(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
+    """Depth (H, W) of a .dmap along the optical axis, float32, 0 where there is none; raises as `read_mvei`."""
+    data = read(path)
+    header = dmap_header(path, data)
+    return _metres(path, data, header.start, header.shape, header.dtype, 2.0**header.exponent / (scale or 1))
+
+
+def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any], unit: float) -> Float32:
+    """Samples (H, W) in a unit, as float32 metres. Raises DataError where there are not as many."""
+    if not (min(shape) > 0 and math.prod(shape) <= MAX_PIXELS):
+        raise DataError(f"{path}: claims {shape[1]}x{shape[0]} pixels; is it damaged?")
+    end = start + math.prod(shape) * dtype.itemsize
+    if len(data) < end:
+        raise DataError(
+            f"{path}: truncated: {shape[1]}x{shape[0]} pixels need {end} bytes, it has {len(data)}; {AGAIN}"
+        )
+    stored = np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape)
+    with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
+        metres: Float32 = np.multiply(stored, unit, dtype=np.float32, casting="same_kind")
+    return metres
+
+
+# COLMAP's dense depth maps: the text 'width&height&channels&', then float32 values, x fastest.
+
+HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
+
+
+def read_depth_map(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
+    """Depth (H, W) float32 in metres; `scale` is units per metre, 1 where not given.
+
+    Raises DataError for a normal map, another format, or a file of another size than it says.
+    """
+    data = read(path)
+    header = HEADER.match(data)
+    if header is None:
+        raise DataError(f"{path}: not a depth map of COLMAP (it begins with {data[:12]!r}); {AGAIN}")
+    width, height, channels = (int(number) for number in header.groups())
+    if channels != 1:
+        raise DataError(f"{path}: has {channels} channels (a normal map?); set depth to the depth maps")
+    if not 0 < width * height <= MAX_PIXELS:
+        raise DataError(f"{path}: claims {width}x{height} pixels (at most {MAX_PIXELS} are read); is it damaged?")
+    stored, needed = memoryview(data)[header.end() :], 4 * width * height
+    if len(stored) != needed:
+        raise DataError(f"{path}: {width}x{height} pixels need {needed} bytes, the file has {len(stored)}; {AGAIN}")
+    with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
+        metres: Float32 = np.divide(np.frombuffer(stored, "<f4"), scale or 1, dtype=np.float32)
+    return metres.reshape(height, width)
+
 
 Depth = Float32
 Shape = tuple[int, int]
@@ -27,28 +148,8 @@ FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
 """What reads depth by the file's suffix; `read_depth` reads the rest."""
 
 
-class DepthSource(Protocol):
-    """The depth of a scene's frames."""
-
-    def path(self, frame: FrameSource) -> Path:
-        """The file that a frame's depth comes from."""
-        ...
-
-    def scale(self, frame: FrameSource) -> float | None:
-        """Units of stored depth in a metre, None where depth is not stored."""
-        ...
-
-    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
-        """Depth (H, W) along the optical axis in metres, of a file whose bytes `read` gives. Raises DataError."""
-        ...
-
-    def digest(self, frame: FrameSource) -> bytes | None:
-        """A hash of the content behind the frame's depth, None where the file has to be read for it."""
-        ...
-
-
 class StoredDepth:
-    """A file a frame."""
+    """Depth from a file a frame."""
 
     def __init__(self, options: FileOptions) -> None:
         self._options = options
@@ -82,7 +183,7 @@ class StoredDepth:
 
 
 class CastDepth:
-    """Rays cast at one surface. `views` are those of all frames, which say what is wrong where one sees nothing."""
+    """Depth of rays cast at one surface. `views` of all frames tell what is wrong where one sees nothing."""
 
     def __init__(self, surface: Surface, options: FileOptions, views: Callable[[], Iterable[View]]) -> None:
         self._surface = surface

@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 
 from semstab.core.types import UInt8, UInt16
-from semstab.datasets.files.frame_source import FrameSource
-from semstab.datasets.files.options import FileOptions, Folders, Template, inside_text, matching_folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside_text, matching_folders
 from semstab.datasets.formats.images import (
     LABEL_SUFFIXES,
     MASK_SUFFIXES,
@@ -211,25 +210,6 @@ NO_ID = IGNORE_16BIT - 1
 """In a table of class ids: an id that is not in it."""
 
 
-def translated(labels: Labels, table: UInt16, path: Path) -> Labels:
-    """table[labels]. Raises DataError for an id that the table does not have."""
-    ids: Labels = table[labels]
-    if (unknown := ids == NO_ID).any():
-        raise DataError(f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?")
-    return ids
-
-
-def without_labels(labels: Labels, void: Collection[int]) -> Labels:
-    """The ids, where one of `void` is the ignore id."""
-    return np.where(np.isin(labels, [*void]), labels.dtype.type(ignore_id(labels)), labels)
-
-
-def without_scores(scores: Scores, ids: Sequence[int], void: Collection[int]) -> Scores:
-    """The scores (H, W, K) of classes with these ids, 0 where one of `void` has the largest."""
-    ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
-    return np.where(ignored[..., None], scores.dtype.type(0), scores)
-
-
 # The label maps, scores and masks of a scene's frames, read into the ids of its taxonomies, in their own pixels.
 
 
@@ -307,16 +287,24 @@ class LabelMaps:
         """Ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
         labels = read_labels(path, self.space(backbone), read)
         if backbone in self._class_ids:
-            labels = translated(labels, self._class_ids[backbone], path)
-        void = self._options.void_ids.get(backbone)
-        return without_labels(labels, void) if void else labels
+            ids: Labels = self._class_ids[backbone][labels]
+            if (unknown := ids == NO_ID).any():
+                raise DataError(
+                    f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?"
+                )
+            labels = ids
+        if void := self._options.void_ids.get(backbone):
+            labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
+        return labels
 
     def scores(self, backbone: str, path: Path, size: Size, read: Read) -> Scores:
         """Scores (H, W, K) of one file; `size` is (H, W) of the depth. Raises DataError that names it."""
         scores = read_scores(path, self._options.scores_layout or "KHW", size, read)
         if void := self._options.void_ids.get(backbone):
             space = self.space(backbone)
-            scores = without_scores(scores, range(scores.shape[2]) if space is None else space.ids, void)
+            ids = range(scores.shape[2]) if space is None else space.ids
+            ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
+            scores = np.where(ignored[..., None], scores.dtype.type(0), scores)
         return scores
 
     def mask_file(self, frame: FrameSource) -> Path | None:

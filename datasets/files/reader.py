@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from semstab.core.types import UInt16
-from semstab.datasets.files.frame_source import FrameSource, FrameTable
 from semstab.datasets.files.labels import ScenePlace
-from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface, usual_folder
 from semstab.datasets.formats.disk import naturally, subfolders

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from semstab.core.prefetch import prefetch
-from semstab.core.rows import Memory, Scratch, room_for
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
-from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
-from semstab.datasets.files.frame_source import FrameSource, FrameTable
+from semstab.datasets.files.depth import CastDepth, StoredDepth, shape_of
 from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
-from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
@@ -29,33 +26,6 @@ from semstab.datasets.scene import Scene
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
-
-# Digests of the files of frames, as far as these were read.
-
-BYTES = 32
-
-
-class Digests:
-    """32 bytes for each file of a frame, of a long sequence in a file; several threads may keep them."""
-
-    def __init__(self, frames: int) -> None:
-        self._frames = frames
-        self._kept: dict[str, Memory | Scratch] = {}
-
-    def keep(self, index: int, what: str, digest: bytes) -> None:
-        """That of what file of a frame it is; not where the disk is full: the frame's file is read again then."""
-        if what not in self._kept:
-            self._kept.setdefault(what, room_for(BYTES * self._frames))
-        with contextlib.suppress(OSError):
-            self._kept[what].write(np.frombuffer(digest, np.uint8), BYTES * index)
-
-    def of(self, index: int, what: str) -> bytes | None:
-        """That of a frame's file; None where it was not read."""
-        if what not in self._kept:
-            return None
-        digest = self._kept[what].read(np.uint8, BYTES, BYTES * index).tobytes()
-        return digest if any(digest) else None
-
 
 PLACES = {
     "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",
@@ -103,9 +73,9 @@ class FileScene(Scene):
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
         self.label_paths = tuple(label_paths(options, place, frames))
-        self._digests = Digests(len(frames))
+        self._digests: dict[str, UInt8] = {}
         self._tracked: list[bool | None] = [None] * len(frames)
-        self._depth: DepthSource = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
+        self._depth = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
         self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
         self.on_photographs = frames.distorted
@@ -263,19 +233,20 @@ class FileScene(Scene):
         for first in range(0, len(indices), BATCH):
             some = indices[first : first + BATCH]
             files = [self._images(index, backbone) for index in some]
-            unread = [
-                (index, what, path)
-                for index, own in zip(some, files, strict=True)
-                for what, path in own.items()
-                if self._digests.of(index, what) is None
-            ]
-            read = _digests_of(unread)
+            self._read_digests(
+                [
+                    (index, what, path)
+                    for index, own in zip(some, files, strict=True)
+                    for what, path in own.items()
+                    if self._known_digest(index, what) is None
+                ]
+            )
             for index, own in zip(some, files, strict=True):
                 source = self._frame(index)
                 digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
                 digest.update(self._depth.digest(source) or b"")
                 for what in own:
-                    digest.update(read.get((index, what)) or self._digests.of(index, what) or b"")
+                    digest.update(self._known_digest(index, what) or b"")
         return digest.hexdigest()
 
     def _images(self, index: int, backbone: str) -> dict[str, Path]:
@@ -353,14 +324,31 @@ class FileScene(Scene):
         return self._stored_pose(source).tobytes() + repr(cameras).encode()
 
     def _reader(self, index: int, what: str) -> Read:
-        """What gives the content of a frame's file; its digest is kept, so that `digest` need not read it again."""
+        """Give the content of a frame's file; its digest is remembered, so that `digest` need not read it again."""
 
         def read(path: Path) -> bytes:
             data = disk.read_bytes(path)
-            self._digests.keep(index, what, disk.digest(data))
+            self._remember_digest(index, what, disk.digest(data))
             return data
 
         return read
+
+    def _remember_digest(self, index: int, what: str, digest: bytes) -> None:
+        digests = self._digests.setdefault(what, np.zeros((len(self), len(digest)), dtype=np.uint8))
+        digests[index] = np.frombuffer(digest, dtype=np.uint8)
+
+    def _read_digests(self, files: Sequence[tuple[int, str, Path]]) -> None:
+        """Read files of frames for their digests, some in each of several threads."""
+        some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
+        digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
+        for own, fetched in zip(some, digests, strict=True):
+            for (index, what, _), digest in zip(own, fetched.item, strict=True):
+                self._remember_digest(index, what, digest)
+
+    def _known_digest(self, index: int, what: str) -> bytes | None:
+        """The digest of a frame's file; None where it was not read."""
+        digest = self._digests[what][index].tobytes() if what in self._digests else b""
+        return digest if any(digest) else None
 
     def _stored_pose(self, source: FrameSource) -> Poses:
         return read_pose(source.pose_file) if source.pose is None else source.pose
@@ -373,14 +361,3 @@ class FileScene(Scene):
         if not 0 <= index < len(self):
             raise ConfigError(f"{self.folder}: there is no frame {index}; it has {len(self)}, counted from 0")
         return self._frames[index]
-
-
-def _digests_of(files: Sequence[tuple[int, str, Path]]) -> dict[tuple[int, str], bytes]:
-    """Those of files of frames that have to be read for it, some in each of several threads."""
-    some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
-    digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
-    return {
-        (index, what): digest
-        for own, fetched in zip(some, digests, strict=True)
-        for (index, what, _), digest in zip(own, fetched.item, strict=True)
-    }

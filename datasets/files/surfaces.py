@@ -8,20 +8,20 @@ import math
 import os
 import struct
 import threading
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import deflate
 import numpy as np
 
 from semstab.core.files import atomic_path
 from semstab.core.types import Float32, Float64, Int32
 from semstab.datasets.formats.disk import file_digest
-from semstab.datasets.formats.las_files import opened, points_at_once
-from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError, one_line
 from semstab.model.frames import Intrinsics
 from semstab.model.georeference import INSTALL, Georeference
 
@@ -114,7 +114,7 @@ def require_same_projection(path: Path, crs: str, georeference: Georeference) ->
 
 DAMAGE = (
     ValueError, TypeError, LookupError, AttributeError, OSError, EOFError, AssertionError, NotImplementedError,
-    struct.error, RuntimeError, OverflowError, NameError,
+    struct.error, RuntimeError, OverflowError, NameError, MemoryError,
 )  # fmt: skip
 """What reading a damaged file may raise in libraries."""
 
@@ -162,7 +162,7 @@ def _las(path: Path, cell: float | None, georeference: Georeference | None) -> T
     offset = np.zeros(3) if georeference is None else np.array(georeference.offset)
 
     def chunks() -> Iterator[Float64]:
-        with opened(path) as file:
+        with open_las(path) as file:
             if georeference is not None and (crs := file.header.parse_crs()) is not None:
                 require_same_projection(path, crs.to_wkt(), georeference)
             for points in file.chunk_iterator(points_at_once(file.header)):
@@ -219,6 +219,96 @@ READERS: Mapping[str, Callable[[Path, float | None, Georeference | None], Triang
 
 SEEN_FROM_ABOVE = tuple(READERS)
 """Suffixes of files that hold heights over x and y, whatever is in them."""
+
+
+# LAS and LAZ clouds: laspy and lazrs take the memory that a header asks for, so sizes are checked first.
+
+LAS_HEADER, LAS_1_4_HEADER = 227, 375
+"""Bytes of a header, and of one that has the fields of LAS 1.4."""
+
+LAS_RECORD, LAS_EXTENDED_RECORD = 54, 60
+"""Least bytes of a variable length record, and of an extended one."""
+
+POINT_BYTES_AT_ONCE = 2**26
+"""Bytes of points that are read at a time, and of one chunk of LAZ, which is decoded at once."""
+
+
+@contextmanager
+def open_las(path: Path) -> Iterator[Any]:
+    """A laspy.LasReader. Whatever is wrong with the file is a DataError of one line, also while it is read."""
+    import laspy
+
+    try:
+        _require_whole_las(path)
+        with laspy.open(path) as reader:
+            if reader.header.are_points_compressed:
+                _require_whole_chunks(path, reader.header)
+            yield reader
+    except (SemstabError, ImportError):
+        raise
+    except (laspy.errors.LaspyException, *DAMAGE) as error:
+        raise DataError(f"{path}: cannot be read ({one_line(error)})") from error
+    except BaseException as error:
+        if type(error).__module__ != "pyo3_runtime":  # lazrs panics with an error that has no public name
+            raise
+        raise DataError(f"{path}: cannot be read ({one_line(error)})") from error
+
+
+def points_at_once(header: Any) -> int:
+    """How many points of a LAS file to read at a time."""
+    return int(max(1, POINT_BYTES_AT_ONCE // header.point_format.size))
+
+
+def _require_whole_las(path: Path) -> None:
+    """Raise ValueError where the file is too small for the records, points or chunks that its header claims."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(LAS_1_4_HEADER)
+        if len(head) < LAS_HEADER or head[:4] != b"LASF":
+            raise ValueError("it is no LAS file")
+        length, start, records, kind, record, points = struct.unpack_from("<HIIBHI", head, 94)
+        if not LAS_HEADER <= length <= start <= size:
+            raise ValueError(f"its points would begin at byte {start}, of {size}; it is cut short")
+        first, extended = 0, 0
+        if head[25] >= 4 and len(head) == LAS_1_4_HEADER:
+            first, extended, points = struct.unpack_from("<QIQ", head, 235)
+        if length + LAS_RECORD * records > start or (extended and first + LAS_EXTENDED_RECORD * extended > size):
+            raise ValueError(f"it has no room for the {records + extended} records that its header names")
+        compressed = bool(kind & 0x80)
+        if not compressed and points * record > size - start:
+            raise ValueError(f"ends after {(size - start) // record:,} of {points:,} points; it is cut short")
+        if compressed:
+            file.seek(start)
+            table = int.from_bytes(file.read(8), "little", signed=True)
+            if table == -1:  # its writer could not seek: the place of the table stands at the end
+                file.seek(max(start, size - 8))
+                table = int.from_bytes(file.read(8), "little", signed=True)
+            if not start + 8 <= table <= size - 8:
+                raise ValueError("its table of chunks is not in the file; it is cut short")
+            file.seek(table + 4)
+            chunks = int.from_bytes(file.read(4), "little")
+            if chunks > table - start:
+                raise ValueError(f"it names {chunks} chunks in {table - start} bytes")
+
+
+def _require_whole_chunks(path: Path, header: Any) -> None:
+    """Raise ValueError where the chunks of a LAZ file are too large to decode at once, or hold too few points."""
+    import lazrs
+
+    laz = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    if laz.item_size() != header.point_format.size:
+        raise ValueError(f"its points have {header.point_format.size} bytes, and {laz.item_size()} where compressed")
+    with path.open("rb") as file:
+        file.seek(header.offset_to_point_data)
+        chunks = lazrs.read_chunk_table(file, laz)
+        first = file.tell()
+    most = max((points for points, _ in chunks), default=0)
+    if most * laz.item_size() > POINT_BYTES_AT_ONCE:
+        raise ValueError(f"it has chunks of {most:,} points; compress it anew (laszip writes 50,000)")
+    if sum(points for points, _ in chunks) < header.point_count:
+        raise ValueError(f"its chunks hold fewer points than the {header.point_count:,} that its header names")
+    if first + sum(length for _, length in chunks) > path.stat().st_size:
+        raise ValueError("its chunks are longer than it; it is cut short")
 
 
 # Rays cast at triangles with embree: the depth of each pixel of a camera.
@@ -336,7 +426,7 @@ def _packed(depth: Float32) -> bytes:
     change = np.diff(depth.view(np.uint32), axis=1, prepend=np.uint32(0))
     planes = np.ascontiguousarray(change.view(np.uint8).reshape(-1, 4).T)
     content = bytes(pa.Codec("zstd", 1).compress(planes, asbytes=True))
-    return MAGIC + HEADER.pack(*depth.shape, deflate.crc32(content)) + content
+    return MAGIC + HEADER.pack(*depth.shape, zlib.crc32(content)) + content
 
 
 def _unpacked(data: bytes, shape: tuple[int, int]) -> Float32 | None:
@@ -347,7 +437,7 @@ def _unpacked(data: bytes, shape: tuple[int, int]) -> Float32 | None:
         return None
     *size, checksum = HEADER.unpack(data[len(MAGIC) : start])
     content = memoryview(data)[start:]
-    if tuple(size) != shape or deflate.crc32(content) != checksum:
+    if tuple(size) != shape or zlib.crc32(content) != checksum:
         return None
     H, W = shape
     planes = np.frombuffer(pa.Codec("zstd").decompress(content, H * W * 4), np.uint8).reshape(4, -1)

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import yaml
 from image_files import png_chunk
 
-from semstab.datasets.formats.codecs import PNG_SIGNATURE
+from semstab.datasets.formats.images import PNG_SIGNATURE
 
 Damage = Callable[[bytes, random.Random], bytes]
 

@@ -33,10 +33,17 @@ from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
 from semstab.datasets import open_dataset
+from semstab.datasets.files.depth import read_depth_map, read_dmap, read_mvei
 from semstab.datasets.files.surfaces import Surface
-from semstab.datasets.formats.codecs import reads_exr
-from semstab.datasets.formats.dense_depth import read_depth_map, read_dmap, read_mvei
-from semstab.datasets.formats.images import color_size, read_color, read_depth, read_labels, read_mask, read_scores
+from semstab.datasets.formats.images import (
+    color_size,
+    read_color,
+    read_depth,
+    read_labels,
+    read_mask,
+    read_scores,
+    reads_exr,
+)
 from semstab.datasets.scannet import read_class_table
 from semstab.engine import load_result
 from semstab.exports import export
