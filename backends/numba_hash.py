@@ -33,7 +33,7 @@ from semstab.backends.numba_loops import (
 )
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys, mix
+from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys, partitions_of
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import is_kept, settings
@@ -290,7 +290,7 @@ class NumbaHash:
     def _listed(self) -> npt.NDArray[Any]:
         """Keys and rows of all voxels by partition, as `rehash` takes them."""
         keys = self._records["key"][: len(self)]
-        partition = (mix.py_func(keys) >> np.uint64(58)).astype(np.int64)
+        partition = partitions_of(keys)
         row = np.argsort(partition, kind="stable")
         partition, at = partition[row], np.arange(len(row)) - np.repeat(np.cumsum(self._used) - self._used, self._used)
         slots = np.empty((PARTITIONS, int(self._used.max())), dtype=SLOT)

@@ -94,7 +94,7 @@ LINE = 64
 
 
 class WorkSpace:
-    """Arrays that are kept from frame to frame, by name."""
+    """Arrays that one frame after the other uses, by name."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, npt.NDArray[Any]] = {}
