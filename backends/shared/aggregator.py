@@ -177,7 +177,7 @@ class Aggregator:
             pixels=np.bincount(place[voxel], length, len(order)).astype(np.int64),
             start=np.searchsorted(entries, np.arange(len(order) + 1) * self.num_classes),
             label=(entries % self.num_classes).astype(np.uint16),
-            weight=np.bincount(entry, length, len(entries)),
+            weight=np.bincount(entry, length, len(entries)).astype(np.float64),
             bounds=np.searchsorted(partition[order], np.arange(PARTITIONS + 1)),
         )
 
