@@ -70,20 +70,10 @@ class History:
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
         """Keep a copy of the observations of the map's rows that outlives the next frame."""
-        some = seen.weight > 0
-        entries = (
-            np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if len(seen.key) else seen.key.astype(np.uint16)
-        )
-        self._seen.append(
-            _Seen(
-                frame,
-                row.astype(np.int32),
-                seen.pixels.astype(np.int32),
-                entries,
-                seen.label[some],
-                seen.weight[some],
-            )
-        )
+        some, n = seen.weight > 0, len(seen.key)
+        entries = np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
+        pixels = seen.pixels.astype(np.int32)
+        self._seen.append(_Seen(frame, row.astype(np.int32), pixels, entries, seen.label[some], seen.weight[some]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
         """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
