@@ -21,7 +21,7 @@ from semstab.model.voxels import Extent, VoxelTable
 OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
 
 GIVEN = ("voxel_size", "num_classes", "within")
-"""What every map is made with; the rest are options of its backend."""
+"""Settings of every map; the rest are options of its backend."""
 
 REGISTRY = Registry(
     "backend",
@@ -85,7 +85,7 @@ class FusionBackend(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What one frame did to each of the n voxels that it saw.
+    """The change that one frame made to each of the n voxels that it saw.
 
     row            (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation
     key            (n,) int64 its index, packed, relative to the map's origin; overwritten by the next frame
@@ -108,7 +108,7 @@ class Changes:
 
 @runtime_checkable
 class GrowingMap(FusionBackend, Protocol):
-    """A backend whose map can be followed voxel by voxel while it grows: what the recording asks for.
+    """A backend whose map can be followed voxel by voxel while it grows, as the recording needs it.
 
     A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.keys`.
     """
@@ -123,7 +123,7 @@ class GrowingMap(FusionBackend, Protocol):
 
     @property
     def changes(self) -> Changes:
-        """What the last frame did to each voxel."""
+        """The change of each voxel by the last frame."""
 
     def __len__(self) -> int:
         """The number of voxels."""
@@ -173,17 +173,17 @@ def _restricted(
 
 
 def restrictable(name: str) -> bool:
-    """Whether maps of the backend of that name can be restricted to an extent."""
+    """Maps of the backend of that name can be restricted to an extent."""
     return bool(getattr(REGISTRY.load(name), "pointwise", True))
 
 
 def takes_option(name: str, option: str) -> bool:
-    """Whether the backend of that name has such an option, for example 'device'."""
+    """The backend of that name has such an option, for example 'device'."""
     return option in _options(REGISTRY.load(name))
 
 
 def keeps_log(name: str) -> bool:
-    """Whether the backend of that name can give the log of its observations: with option `history`, or always."""
+    """The backend of that name can give the log of its observations: with option `history`, or always."""
     return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
 
 
@@ -205,13 +205,13 @@ def expected_bytes(
 
 
 def takes_blocks(name: str) -> bool:
-    """Whether a backend's map takes memory for whole blocks of space: see `expected_bytes`."""
+    """A backend's map takes memory for whole blocks of space: see `expected_bytes`."""
     says = getattr(REGISTRY.load(name), "expected_bytes", None)
     return says is not None and "filled" in inspect.signature(says).parameters
 
 
 def frame_bytes(name: str, voxels: int, num_classes: int) -> int:
-    """Bytes that a backend takes beside its map while it fuses a frame of so many voxels; 0 for one that does not say.
+    """Bytes that a backend takes next to its map while it fuses a frame of so many voxels; 0 for one that does not say.
 
     A backend says it with a static method of that name and these two parameters.
     """

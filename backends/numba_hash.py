@@ -33,7 +33,7 @@ from semstab.backends.numba_loops import (
 )
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys, mix
+from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys, partitions_of
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import is_kept, settings
@@ -70,20 +70,10 @@ class History:
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
         """Keep a copy of the observations of the map's rows that outlives the next frame."""
-        some = seen.weight > 0
-        entries = (
-            np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if len(seen.key) else seen.key.astype(np.uint16)
-        )
-        self._seen.append(
-            _Seen(
-                frame,
-                row.astype(np.int32),
-                seen.pixels.astype(np.int32),
-                entries,
-                seen.label[some],
-                seen.weight[some],
-            )
-        )
+        some, n = seen.weight > 0, len(seen.key)
+        entries = np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
+        pixels = seen.pixels.astype(np.int32)
+        self._seen.append(_Seen(frame, row.astype(np.int32), pixels, entries, seen.label[some], seen.weight[some]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
         """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
@@ -290,7 +280,7 @@ class NumbaHash:
     def _listed(self) -> npt.NDArray[Any]:
         """Keys and rows of all voxels by partition, as `rehash` takes them."""
         keys = self._records["key"][: len(self)]
-        partition = (mix.py_func(keys) >> np.uint64(58)).astype(np.int64)
+        partition = partitions_of(keys)
         row = np.argsort(partition, kind="stable")
         partition, at = partition[row], np.arange(len(row)) - np.repeat(np.cumsum(self._used) - self._used, self._used)
         slots = np.empty((PARTITIONS, int(self._used.max())), dtype=SLOT)

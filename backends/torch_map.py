@@ -1,25 +1,32 @@
 """Backend `torch`: the whole of fusion on an accelerator, or on a CPU, and several backbones over the same depth.
 
 Frames may be tensors that are on the device already: the logits of a model go into the map without a copy to memory.
-On a CUDA device Triton kernels do the work (`triton_launch`), elsewhere plain tensor operations (`eager`).
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from semstab.backends import FusionBackend, torch_eager
+from semstab.backends import FusionBackend
 from semstab.backends.shared.association import INDEX_LIMIT, check_depth, check_settings
 from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
 from semstab.backends.shared.observations import Change, MapTotal
-from semstab.backends.torch_eager import LOST, Association, ViewEvidence
+from semstab.backends.torch_operations import (
+    LOST,
+    Association,
+    ViewEvidence,
+    associate,
+    count_labels,
+    parts,
+    sum_scores,
+    update,
+)
 from semstab.backends.torch_storage import (
     EMPTY,
     SLOT_BYTES,
@@ -34,13 +41,11 @@ from semstab.backends.torch_storage import (
     evidence_of,
     evidence_of_frame,
 )
-from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, DataError
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
 from semstab.model.voxels import VoxelTable, index_columns
-
-# Where the torch backend runs, and which of its kernels do the work there.
 
 
 def device_of(name: str | None) -> torch.device:
@@ -56,25 +61,6 @@ def device_of(name: str | None) -> torch.device:
     if device.type != "cuda" or (device.index or 0) >= torch.cuda.device_count():
         raise ConfigError(f"device '{name}': torch sees {torch.cuda.device_count()} CUDA devices here; use CPU:0")
     return torch.device("cuda", device.index or 0)
-
-
-def kernels_for(name: str, device: torch.device) -> ModuleType:
-    """The module that does the work on that device. Raises ConfigError or MissingDependencyError where it cannot."""
-    if name not in ("auto", "torch", "triton"):
-        raise ConfigError(f"kernels = '{name}': use auto, torch or triton")
-    if name == "torch" or (name == "auto" and device.type == "cpu"):
-        return torch_eager
-    try:
-        from semstab.backends import triton_launch
-    except ImportError as error:
-        if name == "auto":
-            return torch_eager
-        raise MissingDependencyError(
-            f"kernels = 'triton' cannot be used ({one_line(error)}); pip install triton"
-        ) from error
-    if not triton_launch.runs_on(device):
-        raise ConfigError(f"kernels = 'triton': they run on a CUDA device, not on {device}; use torch, or auto")
-    return triton_launch
 
 
 # Maps on a device, and how a view goes into them.
@@ -101,7 +87,6 @@ class TorchMaps:
         num_classes: Mapping[str, int],
         device: str | None = None,
         precision: str = "float64",
-        kernels: str = "auto",
         memory_gb: float | None = None,
         reserve: int = 0,
     ) -> None:
@@ -118,11 +103,9 @@ class TorchMaps:
         self.voxel_size = voxel_size
         self.device = device_of(device)
         self._dtype = torch.float64 if precision == "float64" else torch.float32
-        self._kernels: Any = kernels_for(kernels, self.device)
-        self._associate = self._kernels.Associator()
         self._grid: MapGrid | None = None
         with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
-            self.storage = Storage(num_classes, self._dtype, self.device, self._kernels.insert, memory_gb)
+            self.storage = Storage(num_classes, self._dtype, self.device, memory_gb)
             first = min(FIRST_ROWS, FIRST_BYTES // sum(c.row_bytes for c in self.storage.columns.values()))
             self.storage.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or first)
         self._totals = {name: MapTotal(K) for name, K in num_classes.items()}
@@ -155,13 +138,12 @@ class TorchMaps:
 
     def fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
         """Fuse a view that is on the device, with what some backbones say of its pixels; timed from `started`."""
-        on_device = torch.cuda.device(-1 if self.device.index is None else self.device.index)  # for Triton's launches
-        with torch.inference_mode(False), torch.no_grad(), on_device:
+        with torch.inference_mode(False), torch.no_grad():
             return self._fuse(view, said, started)
 
     def _fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
         grid = self._grid or self._first_grid(view)
-        seen = self._associate(view, grid)
+        seen = associate(view, grid)
         evidence = {name: self._evidence(seen, image, name, view) for name, image in said.items()}
         rows, voxels = self._look_up(seen, evidence, view, grid)
         associated = time.perf_counter()
@@ -169,8 +151,7 @@ class TorchMaps:
         self.storage.add(seen.keys, rows, voxels)
         self._grid = grid
         changes = [
-            self._kernels.update(self.storage.columns[name], rows, of_name, view.camera.index)
-            for name, of_name in evidence.items()
+            update(self.storage.columns[name], rows, of_name, view.camera.index) for name, of_name in evidence.items()
         ]
         sums = torch.stack(changes).tolist() if changes else []
         return {
@@ -200,21 +181,18 @@ class TorchMaps:
 
     def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
         K = self.storage.columns[name].num_classes
-        evidence: ViewEvidence
         if isinstance(said, Labels):
-            evidence = self._kernels.count_labels(seen, said, K)
-        else:
-            if len(said.values) != K:
-                kind = "logits" if said.softmax else "scores"
-                raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(said.values)} classes, the map {K}")
-            evidence = self._kernels.sum_scores(seen, said, K)
-        return evidence
+            return count_labels(seen, said, K)
+        if len(said.values) != K:
+            kind = "logits" if said.softmax else "scores"
+            raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(said.values)} classes, the map {K}")
+        return sum_scores(seen, said, K)
 
     def _look_up(
         self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
     ) -> tuple[torch.Tensor, int]:
         """Rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
-        rows = self._kernels.find(self.storage.hash, seen.keys)
+        rows = self.storage.hash.find(seen.keys)
         observed = torch.zeros_like(rows, dtype=torch.bool)
         for of_name in evidence.values():
             observed |= of_name.pixels > 0
@@ -263,7 +241,7 @@ def _where(view: DepthView, kind: str, name: str) -> str:
 def _at_home(column: torch.Tensor, rows: torch.Tensor) -> npt.NDArray[Any]:
     """Rows of a column in memory; they are gathered a part at a time, so that the device needs no second column."""
     home = torch.empty((len(rows), *column.shape[1:]), dtype=column.dtype)
-    for part in torch_eager.parts(len(rows), COPIED_ROWS):
+    for part in parts(len(rows), COPIED_ROWS):
         home[part] = column[rows[part]].cpu()
     values: npt.NDArray[Any] = home.numpy()
     return values
@@ -277,7 +255,6 @@ class TorchMap(FusionBackend):
     device     'CUDA:0', 'CPU:0', ...; the first CUDA device where torch sees one, else the CPU
     precision  'float64', which decides at a voxel's face as the other backends do, or 'float32' for points and
                evidence: less memory, and faster where the device is slow in float64
-    kernels    'triton' or 'torch'; 'auto' is Triton's where the device runs them
     memory_gb  the most that the map may take of the device, the copy that growing takes included; no bound if not given
     reserve    voxels to make room for at once: a map that does not outgrow them copies nothing
     """
@@ -288,12 +265,11 @@ class TorchMap(FusionBackend):
         num_classes: int,
         device: str | None = None,
         precision: str = "float64",
-        kernels: str = "auto",
         memory_gb: float | None = None,
         reserve: int = 0,
     ) -> None:
         self.num_classes = num_classes
-        self.maps = TorchMaps(voxel_size, {"": num_classes}, device, precision, kernels, memory_gb, reserve)
+        self.maps = TorchMaps(voxel_size, {"": num_classes}, device, precision, memory_gb, reserve)
 
     @property
     def voxel_size(self) -> float:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -61,6 +61,46 @@ class VoxelHash:
     def bytes(self) -> int:
         """Memory that it takes."""
         return SLOT_BYTES * len(self.keys)
+
+    def find(self, keys: torch.Tensor) -> torch.Tensor:
+        """Rows (n,) int64 of keys (n,), EMPTY for those that the hash does not hold."""
+        rows = torch.full_like(keys, EMPTY)
+        mask = len(self.keys) - 1
+        at, searched = mix(keys) & mask, torch.arange(len(keys), device=keys.device)
+        while len(searched):
+            held = self.keys[at]
+            hit = held == keys[searched]
+            rows[searched[hit]] = self.rows[at[hit]].to(torch.int64)
+            further = ~hit & (held != EMPTY)
+            at, searched = (at[further] + 1) & mask, searched[further]
+        return rows
+
+    def insert(self, keys: torch.Tensor, rows: torch.Tensor, first: int = 0) -> None:
+        """Add distinct keys (n,) which the hash does not hold and has slots for, with their rows (n,).
+
+        EMPTY keys are left out, and those whose row is below `first`.
+        """
+        wanted = (keys != EMPTY) & (rows >= first)
+        keys, rows, mask = keys[wanted], rows[wanted].to(torch.int32), len(self.keys) - 1
+        at = mix(keys) & mask
+        while len(keys):
+            free = self.keys[at] == EMPTY
+            self.keys[at[free]] = keys[free]  # several keys may want a slot: one of them gets it
+            placed = free & (self.keys[at] == keys)
+            self.rows[at[placed]] = rows[placed]
+            at, keys, rows = (at[~placed] + 1) & mask, keys[~placed], rows[~placed]
+
+
+def mix(key: torch.Tensor) -> torch.Tensor:
+    """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
+    key = (key ^ _shifted(key, 30)) * (0xBF58476D1CE4E5B9 - (1 << 64))
+    key = (key ^ _shifted(key, 27)) * (0x94D049BB133111EB - (1 << 64))
+    return key ^ _shifted(key, 31)
+
+
+def _shifted(x: torch.Tensor, bits: int) -> torch.Tensor:
+    """A logical shift to the right, which torch has for unsigned numbers only."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def slots_for(voxels: int) -> int:
@@ -116,14 +156,12 @@ class Storage:
         num_classes: Mapping[str, int],
         evidence: torch.dtype,
         device: torch.device,
-        insert: Callable[[VoxelHash, torch.Tensor, torch.Tensor, int], None],
         memory_gb: float | None,
     ) -> None:
         self.voxels = 0
         self.hash = VoxelHash(slots_for(0), device)
         self.columns = {name: Columns(K, evidence, device) for name, K in num_classes.items()}
         self.memory_gb = memory_gb
-        self._insert = insert
 
     @property
     def capacity(self) -> int:
@@ -138,7 +176,7 @@ class Storage:
     def add(self, keys: torch.Tensor, rows: torch.Tensor, voxels: int) -> None:
         """Enter those keys (n,) whose row is a new one; with them there are so many voxels."""
         if voxels > self.voxels:
-            self._insert(self.hash, keys, rows, self.voxels)
+            self.hash.insert(keys, rows, self.voxels)
             self.voxels = voxels
 
     def make_room(self, needed: int, where: str, wanted: int = 0) -> None:
@@ -181,7 +219,7 @@ class Storage:
             grown = VoxelHash(slots, self.hash.keys.device)
             for start in range(0, len(self.hash.keys), MOVED_SLOTS):
                 part = slice(start, start + MOVED_SLOTS)
-                self._insert(grown, self.hash.keys[part], self.hash.rows[part], 0)
+                grown.insert(self.hash.keys[part], self.hash.rows[part])
             self.hash = grown
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.metadata
 import logging
 from collections.abc import Callable
 from statistics import median
@@ -84,9 +83,9 @@ def copy_bandwidth(device: torch.device, megabytes: int) -> float:
     return 2 * source.numel() * source.element_size() / best
 
 
-def measure(case: Case, K: int, voxels: int, kernels: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+def measure(case: Case, K: int, voxels: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of the table for one map: ids, logits, and ids of several backbones on a map of the first size."""
-    backend = TorchMap(VOXEL_SIZE, K, device=arguments.device, kernels=kernels, reserve=voxels + voxels // 5)
+    backend = TorchMap(VOXEL_SIZE, K, device=arguments.device, reserve=voxels + voxels // 5)
     places = seen = 0
     while seen < voxels:
         report = backend.integrate_tensors(*case.view(places), index=places, labels=case.ids)
@@ -99,7 +98,7 @@ def measure(case: Case, K: int, voxels: int, kernels: str, arguments: argparse.N
     def fuse(place: int, **said: torch.Tensor) -> None:
         backend.integrate_tensors(*case.view(place), index=place, **said)
 
-    several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:BACKBONES], K), device=arguments.device, kernels=kernels)
+    several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:BACKBONES], K), device=arguments.device)
 
     def fuse_several(place: int) -> None:
         said = {name: TensorPrediction(labels=case.ids) for name in "abc"[:BACKBONES]}
@@ -140,20 +139,11 @@ def agreement(K: int, size: tuple[int, int], arguments: argparse.Namespace) -> b
     return compare(tables[0], tables[1], units).agrees
 
 
-def version(package: str) -> str:
-    """The version of a package, or 'none'."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "none"
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="also write the figures there")
     parser.add_argument("--device", default="CUDA:0" if torch.cuda.is_available() else "CPU:0")
-    parser.add_argument("--kernels", nargs="+", help="torch, triton; both where Triton runs")
     parser.add_argument("--sizes", nargs="+", default=["3840x2160"])
     parser.add_argument("--classes", nargs="+", type=int, default=[7, 20])
     parser.add_argument("--voxels", nargs="+", type=int, default=[1_000_000, 20_000_000])
@@ -164,11 +154,9 @@ def main() -> None:
     arguments = parser.parse_args()
     logging.getLogger("semstab").setLevel(logging.ERROR)
     device = TorchMap(VOXEL_SIZE, 2, device=arguments.device).device
-    on_cuda = device.type == "cuda"
-    kernels = arguments.kernels or (["triton", "torch"] if on_cuda and version("triton") != "none" else ["torch"])
     bandwidth = copy_bandwidth(device, arguments.copied_megabytes)
-    name = torch.cuda.get_device_name(device) if on_cuda else "CPU"
-    print(f"{name}, torch {torch.__version__}, triton {version('triton')}; a copy moves {bandwidth / 1e9:.0f} GB/s")
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    print(f"{name}, torch {torch.__version__}; a copy moves {bandwidth / 1e9:.0f} GB/s")
     print(f"{'size':>10} {'K':>4} {'voxels':>12}  {'input':<16} {'by':<8} {'ms':>9} {'floor ms':>9} {'ratio':>7}")
     rows = []
 
@@ -186,15 +174,14 @@ def main() -> None:
         for K in arguments.classes:
             case = Case.of(flight.frame(0, width, height, K), K, getattr(torch, arguments.logits), device)
             for voxels in arguments.voxels:
-                for by in kernels:
-                    for row in measure(case, K, voxels, by, arguments):
-                        say(size, K, row, by)
+                for row in measure(case, K, voxels, arguments):
+                    say(size, K, row, "torch")
             for by in arguments.cpu_backends:
                 say(size, K, on_the_cpu(case.frame, K, by, min(arguments.rounds, 10)), by)
     agrees = agreement(arguments.classes[0], (width, height), arguments)
     print(f"torch and numba {'agree' if agrees else 'DISAGREE'}")
     if arguments.json:
-        about = {"device": name, "torch": torch.__version__, "triton": version("triton")}
+        about = {"device": name, "torch": torch.__version__}
         write_json(arguments.json, about | {"copy_bytes_per_second": bandwidth, "agrees": agrees, "rows": rows})
 
 

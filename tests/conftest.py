@@ -15,8 +15,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it
 os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")
 atexit.register(shutil.rmtree, os.environ["SEMSTAB_CACHE"], ignore_errors=True)
 settle()  # threads that spin would take the time of the other workers' tests
-if not Path("/dev/nvidiactl").exists():
-    os.environ["TRITON_INTERPRET"] = "1"  # before any test imports Triton: its kernels then run without a GPU
 
 
 def pytest_configure() -> None:

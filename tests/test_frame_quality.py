@@ -8,7 +8,7 @@ import numpy as np
 import predicted_scene
 import pytest
 
-from semstab.metrics import FrameJudge
+from semstab.metrics import FrameQualityMeter
 
 SHAPE = predicted_scene.HEIGHT, predicted_scene.WIDTH
 
@@ -19,7 +19,7 @@ def frame(k, labels):
 
 
 def judged(filtered, model=None, truth=None, still=False):
-    judge = FrameJudge(3)
+    judge = FrameQualityMeter(3)
     for k, labels in enumerate(filtered):
         place = 0 if still else k
         others = [None if maps is None else frame(place, maps[k]) for maps in (model or filtered, truth)]

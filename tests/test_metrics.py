@@ -32,23 +32,12 @@ from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
 
 def voxel_table(op, evidence, drift_sum=None, classes=()):
     """A map of voxels (0, 0, 0), (0, 0, 1), ... with these rows."""
-    n = len(op)
-    zeros = np.zeros(n)
+    zeros = np.zeros(len(op))
     return VoxelTable(
-        zeros,
-        zeros,
-        np.arange(n),
-        op=op,
-        evidence=evidence,
-        drift_sum=zeros if drift_sum is None else drift_sum,
-        pixels=op,
-        first_frame=zeros,
-        last_frame=zeros,
-        self_sum=zeros,
-        frame_entropy_sum=zeros,
-        voxel_size=0.2,
+        zeros, zeros, np.arange(len(op)), op=op, evidence=evidence, drift_sum=zeros if drift_sum is None else drift_sum,
+        pixels=op, first_frame=zeros, last_frame=zeros, self_sum=zeros, frame_entropy_sum=zeros, voxel_size=0.2,
         classes=classes,
-    )
+    )  # fmt: skip
 
 
 def fuse(frames, K=3):
@@ -97,26 +86,16 @@ def test_the_last_row_of_the_scene_table_holds_totals_and_macro_means():
     assert (sum(voxels), sum(points)) == (705902, 1353903)
     mean_op = [p / v for p, v in zip(points, voxels, strict=True)]
     assert round(macro_mean(mean_op), 2) == 1.51
-    assert [round(macro_mean(column), digits) for column, digits in zip(measures, (3, 4, 4), strict=True)] == [
-        0.957,
-        0.0845,
-        0.0336,
-    ]
-
-
-def test_the_scene_table_is_not_pooled():
-    voxels, points, *_ = zip(*SCENES.values(), strict=True)
-    assert round(sum(points) / sum(voxels), 2) == 1.92
-
-
-def test_mean_op_is_observations_by_voxels():
-    summary = summarise(voxel_table(op=[1, 1, 3, 7], evidence=[[1, 0]] * 4))
-    assert (summary.observations, summary.voxels, summary.mean_op) == (12, 4, 3.0)
+    assert round(sum(points) / sum(voxels), 2) == 1.92  # pooled it would be
+    means = [round(macro_mean(column), digits) for column, digits in zip(measures, (3, 4, 4), strict=True)]
+    assert means == [0.957, 0.0845, 0.0336]
 
 
 def test_points_and_observations_are_counted_apart():
     summary = summarise(fuse([sight_line(0, [(0.2, 0), (0.4, 0), (1.5, 1)]), sight_line(1, [(0.5, 0)])]))
     assert (summary.points, summary.observations, summary.voxels, summary.mean_op) == (4, 3, 2, 1.5)
+    summary = summarise(voxel_table(op=[1, 1, 3, 7], evidence=[[1, 0]] * 4))
+    assert (summary.observations, summary.voxels, summary.mean_op) == (12, 4, 3.0)
 
 
 def test_the_shares_of_the_persistence_table_are_of_all_voxels():
@@ -131,13 +110,14 @@ def test_the_shares_of_the_persistence_table_are_of_all_voxels():
 # --- Strata, recurrent voxels, classes --------------------------------------------------------------------------------
 
 
-def test_the_papers_strata():
-    assert [row[0] for row in strata([1, 2, 5])] == ["OP=1", "OP=2", "3<=OP<=5", "OP>5"]
-
-
 @pytest.mark.parametrize(
     ("edges", "names"),
-    [([1], ["OP=1", "OP>1"]), ([3], ["1<=OP<=3", "OP>3"]), ([2, 3, 9], ["1<=OP<=2", "OP=3", "4<=OP<=9", "OP>9"])],
+    [
+        ([1, 2, 5], ["OP=1", "OP=2", "3<=OP<=5", "OP>5"]),
+        ([1], ["OP=1", "OP>1"]),
+        ([3], ["1<=OP<=3", "OP>3"]),
+        ([2, 3, 9], ["1<=OP<=2", "OP=3", "4<=OP<=9", "OP>9"]),
+    ],
 )
 def test_strata_follow_their_edges(edges, names):
     assert [row[0] for row in strata(edges)] == names
@@ -176,9 +156,6 @@ def test_classes_hold_the_voxels_that_they_dominate():
     classes = summarise(table).classes
     assert [(row.name, row.voxels) for row in classes] == [("road", 2), ("tree", 1), ("car", 1)]
     assert classes[0][VSS] == pytest.approx((2 / 3 + 1 / 3) / 2)
-
-
-def test_classes_without_names_go_by_number():
     assert [row.name for row in summarise(voxel_table([1], [[1, 0, 0]])).classes] == ["0", "1", "2"]
 
 
@@ -263,30 +240,24 @@ def labelled(labels, depth=None, dtype=np.uint8, index=0, **more):
     return Frame(index, depth, Intrinsics(1, 1, 0, 0), np.eye(4), **kind, **more)
 
 
-def test_flicker_is_the_share_of_labels_that_change():
-    assert flicker_percent(labelled([[0, 1, 2, 0]]), labelled([[0, 1, 1, 1]])) == 50
-    assert flicker_percent(labelled([[0, 1]]), labelled([[0, 1]])) == 0
+SOFT = {"dtype": np.float32}
 
 
-def test_flicker_counts_pixels_that_are_valid_in_both_frames():
-    previous = labelled([[0, 0, 0, 255, 0]], depth=[[1, 1, 0, 1, 1]])
-    current = labelled([[1, 0, 1, 1, 255]], depth=[[1, 1, 1, 1, 1]])
-    assert flicker_percent(previous, current) == 50
-
-
-def test_flicker_is_undefined_where_no_pixel_is_valid_in_both():
-    assert math.isnan(flicker_percent(labelled([[0, 255]]), labelled([[255, 0]])))
-
-
-def test_flicker_of_soft_scores_is_that_of_the_largest_class():
-    previous = labelled([[[0.6, 0.4], [0.2, 0.8], [0, 0]]], dtype=np.float32)
-    current = labelled([[[0.4, 0.6], [0.1, 0.9], [1, 0]]], dtype=np.float32)
-    assert flicker_percent(previous, current) == 50
-
-
-def test_flicker_compares_labels_with_scores_and_16_bit_maps():
-    assert flicker_percent(labelled([[0, 1]]), labelled([[[1, 0], [1, 0]]], dtype=np.float32)) == 50
-    assert flicker_percent(labelled([[0, 255]]), labelled([[0, 65535]], dtype=np.uint16)) == 0
+@pytest.mark.parametrize(
+    ("previous", "current", "percent"),
+    [
+        (labelled([[0, 1, 2, 0]]), labelled([[0, 1, 1, 1]]), 50),
+        (labelled([[0, 1]]), labelled([[0, 1]]), 0),
+        (labelled([[0, 0, 0, 255, 0]], depth=[[1, 1, 0, 1, 1]]), labelled([[1, 0, 1, 1, 255]]), 50),
+        (labelled([[0, 255]]), labelled([[255, 0]]), math.nan),
+        (labelled([[[6, 4], [2, 8], [0, 0]]], **SOFT), labelled([[[4, 6], [1, 9], [1, 0]]], **SOFT), 50),
+        (labelled([[0, 1]]), labelled([[[1, 0], [1, 0]]], **SOFT), 50),
+        (labelled([[0, 255]]), labelled([[0, 65535]], dtype=np.uint16), 0),
+    ],
+    ids=["changes", "none", "valid in both", "none valid", "largest class", "labels with scores", "8 with 16 bits"],
+)
+def test_flicker_is_the_share_of_labels_that_change(previous, current, percent):
+    assert flicker_percent(previous, current) == pytest.approx(percent, nan_ok=True)
 
 
 def test_flicker_needs_frames_of_one_size():
@@ -376,24 +347,17 @@ def test_maps_that_share_no_voxel():
     assert math.isnan(result.differences["vss"].max)
 
 
-def test_two_empty_maps_agree():
+def test_empty_maps():
     empty = voxel_table([], np.zeros((0, 2)))
     result = compare(empty, backends.create("numpy", voxel_size=0.2, num_classes=2).table(), UNITS)
     assert result.agrees
     assert (result.voxels, result.only_in) == ((0, 0), (0, 0))
-
-
-def test_an_empty_map_disagrees_with_another():
-    empty = without(without(without(TABLE, 0), 0), 0)
     assert compare(empty, TABLE, UNITS).only_in == (0, 3)
     assert not compare(TABLE, empty, UNITS).agrees
 
 
-def test_maps_of_different_numbers_of_classes_cannot_be_compared():
+def test_maps_of_other_classes_or_voxel_sizes_cannot_be_compared():
     with pytest.raises(DataError, match=r"2 classes in voxels of 0\.2 m and of 5 in 0\.2 m cannot be compared"):
         compare(TABLE, voxel_table([1, 2, 4], np.ones((3, 5))), UNITS)
-
-
-def test_maps_of_different_voxel_sizes_cannot_be_compared():
     with pytest.raises(DataError, match="cannot be compared"):
         compare(TABLE, dataclasses.replace(TABLE, voxel_size=0.4), UNITS)

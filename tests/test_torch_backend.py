@@ -1,13 +1,9 @@
-"""Backend `torch` keeps the contract in either precision, its kernels agree, and tensors are fused as frames are."""
+"""Backend `torch` keeps the contract in either precision, and tensors are fused as frames are."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -17,16 +13,13 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch", reason="pip install 'semstab[torch]'")
 
 HAS_CUDA = torch.cuda.is_available()
-RUNS_TRITON = importlib.util.find_spec("triton") is not None and (
-    HAS_CUDA or os.environ.get("TRITON_INTERPRET") == "1"  # set in conftest.py, where there is no device
-)
 
 from semstab import backends  # noqa: E402
-from semstab.backends import torch_eager, torch_map, torch_storage  # noqa: E402
+from semstab.backends import torch_map, torch_operations, torch_storage  # noqa: E402
 from semstab.backends.shared.association import back_project  # noqa: E402
 from semstab.backends.torch_map import TorchMap, TorchMaps  # noqa: E402
 from semstab.backends.torch_storage import EMPTY, DepthView, MapGrid, TensorPrediction, VoxelHash, slots_for  # noqa: E402
-from semstab.errors import ConfigError, DataError, MissingDependencyError  # noqa: E402
+from semstab.errors import ConfigError, DataError  # noqa: E402
 from semstab.model.frames import Frame, Intrinsics  # noqa: E402
 from semstab.testing import EXACT, SUMS, BackendConformance, assert_same_map, checks, random_frames, sight_line, voxels  # noqa: E402
 
@@ -75,15 +68,11 @@ if HAS_CUDA:
 
     class TestTorchOnCuda(TestTorch):
         def create(self, voxel_size, num_classes):
-            return new_map(voxel_size, num_classes, device="CUDA:0", kernels="torch")
+            return new_map(voxel_size, num_classes, device="CUDA:0")
 
-    class TestTritonOnCuda(TestTorch):
+    class TestTorchInSinglePrecisionOnCuda(TestTorchInSinglePrecision):
         def create(self, voxel_size, num_classes):
-            return new_map(voxel_size, num_classes, device="CUDA:0", kernels="triton")
-
-    class TestTritonInSinglePrecision(TestTorchInSinglePrecision):
-        def create(self, voxel_size, num_classes):
-            return new_map(voxel_size, num_classes, device="CUDA:0", kernels="triton", precision="float32")
+            return new_map(voxel_size, num_classes, device="CUDA:0", precision="float32")
 
 
 # --- Precision and determinism ----------------------------------------------------------------------------------------
@@ -103,9 +92,9 @@ def survey(seed, camera=(4.5e5, 5.5e6, 80.0), shape=(90, 160)):
 
 
 def voxel_of_pixels(frame, dtype):
-    """(H, W, 3) voxel indices from the map's origin, as the kernels find them."""
+    """(H, W, 3) voxel indices from the map's origin, as the backend finds them."""
     origin = tuple(int(x) for x in np.floor(frame.T_wc[:3, 3] / 0.2))
-    seen = torch_eager.Associator()(DepthView.of_frame(frame, CPU), MapGrid(0.2, origin, dtype))
+    seen = torch_operations.associate(DepthView.of_frame(frame, CPU), MapGrid(0.2, origin, dtype))
     key = seen.keys[seen.voxel.to(torch.int64)].numpy()
     return np.stack([key >> 42, (key >> 21) & (2**21 - 1), key & (2**21 - 1)], axis=-1) - 2**20 + origin
 
@@ -143,7 +132,7 @@ def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
     frames = [*random_frames(3, count=4), survey(0, camera=(0, 0, 80), shape=(20, 30))]
     whole = fused(frames)
     for size in (50, 333):
-        monkeypatch.setattr(torch_eager, "chunk_of", lambda device, size=size: size)
+        monkeypatch.setattr(torch_operations, "chunk_of", lambda device, size=size: size)
         assert_equal(fused(frames), whole)
 
 
@@ -154,9 +143,9 @@ def test_the_same_frames_give_the_same_bits():
 
 def test_sums_of_scores_are_as_fine_as_they_say():
     """10^5 pixels of share 1/3 in one voxel, in units of 2^-45 (17 bits count the pixels), each rounded to nearest."""
-    seen = torch_eager.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
+    seen = torch_operations.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
     values = torch.tensor([[1.0], [2.0]]).expand(2, 10**5)
-    evidence = torch_eager.sum_scores(seen, torch_storage.Scores(values, softmax=False), 2)
+    evidence = torch_operations.sum_scores(seen, torch_storage.Scores(values, softmax=False), 2)
     assert evidence.scale == 2.0**45
     s_bar = evidence.sums[:, 0].to(torch.float64) / (evidence.scale * evidence.pixels)
     assert s_bar.tolist() == pytest.approx([1 / 3, 2 / 3], abs=2.0**-46)
@@ -441,7 +430,7 @@ KEYS = st.sets(st.integers(0, 2**63 - 1) | st.integers(0, 40), max_size=300)
 @checks
 @given(KEYS)
 def test_keys_are_mixed_as_splitmix64_does(keys):
-    mixed = torch_eager.mix(torch.tensor(sorted(keys), dtype=torch.int64))
+    mixed = torch_storage.mix(torch.tensor(sorted(keys), dtype=torch.int64))
     assert [m % 2**64 for m in mixed.tolist()] == [splitmix64(key) for key in sorted(keys)]
 
 
@@ -451,11 +440,11 @@ def test_the_hash_finds_what_was_put_in(known, asked):
     table = VoxelHash(slots_for(300), CPU)
     keys = torch.tensor(list(known), dtype=torch.int64)
     rows = torch.arange(len(known))
-    torch_eager.insert(table, keys[:100], rows[:100])
-    torch_eager.insert(table, keys, rows, first=100)
+    table.insert(keys[:100], rows[:100])
+    table.insert(keys, rows, first=100)
     row_of = dict(zip(known, range(len(known)), strict=True))
     wanted = [*known, *asked]
-    found = torch_eager.find(table, torch.tensor(wanted, dtype=torch.int64)).tolist()
+    found = table.find(torch.tensor(wanted, dtype=torch.int64)).tolist()
     assert found == [row_of.get(key, EMPTY) for key in wanted]
     assert int((table.keys != EMPTY).sum()) == len(known)
 
@@ -467,7 +456,6 @@ def test_the_hash_finds_what_was_put_in(known, asked):
     ("options", "message"),
     [
         ({"precision": "float16"}, "precision = 'float16': use float64 or float32"),
-        ({"kernels": "cuda"}, "kernels = 'cuda': use auto, torch or triton"),
         ({"memory_gb": 0.0}, "memory_gb = 0: it must be positive"),
         ({"reserve": -1}, "reserve = -1"),
         ({"device": "TPU:0"}, "device 'TPU:0'"),
@@ -480,118 +468,7 @@ def test_options_that_cannot_be_used_are_refused(options, message):
         new_map(**options)
 
 
-def test_triton_that_is_not_installed_is_left_out_or_asked_for(monkeypatch):
-    monkeypatch.setitem(sys.modules, "semstab.backends.triton_launch", None)
-    assert torch_map.kernels_for("auto", torch.device("cuda", 0)) is torch_eager
-    with pytest.raises(MissingDependencyError, match="pip install triton"):
-        new_map(kernels="triton")
-
-
-def test_a_map_on_a_cpu_takes_plain_torch():
-    assert torch_map.kernels_for("auto", CPU) is torch_eager
-    assert backends.takes_option("torch", "device")
-
-
 def test_the_default_device_is_the_accelerator_where_there_is_one():
     backend = backends.create("torch", voxel_size=0.2, num_classes=2)
     assert backend.device.type == ("cuda" if HAS_CUDA else "cpu")
     assert backend.events() is None
-
-
-# --- The kernels ------------------------------------------------------------------------------------------------------
-
-needs_triton = pytest.mark.skipif(not RUNS_TRITON, reason="pip install triton: it runs the kernels without a GPU too")
-DEVICE = "CUDA:0" if HAS_CUDA else "CPU:0"
-
-
-@pytest.fixture
-def triton_kernels(monkeypatch):
-    """The module, with a hash so small that it overflows."""
-    from semstab.backends import triton_launch
-
-    monkeypatch.setattr(triton_launch, "FIRST_SLOTS", 1 << 8)
-    return triton_launch
-
-
-@needs_triton
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.filterwarnings("ignore:(invalid value|overflow) encountered:RuntimeWarning")
-def test_triton_agrees_with_plain_torch(triton_kernels, precision):
-    """Labels, scores with gaps, logits, and a point out of reach that nobody asks for."""
-    plain, tuned = (new_map(device=DEVICE, precision=precision, kernels=name) for name in ("torch", "triton"))
-    frames = random_frames(11, count=3)
-    scores = frames[1].scores.copy()
-    scores[0, :4], scores[1, :4], scores[2, :4] = 0, math.nan, math.inf
-    frames[1] = dataclasses.replace(frames[1], scores=scores)
-    depth, labels = frames[2].depth.copy(), frames[2].labels.copy()
-    depth[0], labels[0] = 1e9, 255
-    frames[2] = dataclasses.replace(frames[2], depth=depth, labels=labels)
-    for frame in frames:
-        a, b = plain.integrate(frame), tuned.integrate(frame)
-        assert (a.points, a.voxels, a.new_voxels, a.map_voxels) == (b.points, b.voxels, b.new_voxels, b.map_voxels)
-        assert [a.drift_sum, a.map_vss, a.map_entropy] == pytest.approx([b.drift_sum, b.map_vss, b.map_entropy])
-    assert_same_map(tuned.table(), plain.table(), 1e-10)
-    logits = 3 * torch.randn((K, *frames[0].shape), generator=torch.Generator().manual_seed(1))
-    logits[0, :2] = -math.inf
-    logits[:, 2] = -math.inf
-    logits[1, 3] = math.nan
-    for backend in (plain, tuned):
-        fuse_tensors(backend, frames[0], logits=logits)
-    assert_same_map(tuned.table(), plain.table(), 2e-6)
-
-
-@needs_triton
-def test_triton_refuses_what_plain_torch_refuses(triton_kernels):
-    backend = new_map(1.0, 3, device=DEVICE, kernels="triton")
-    backend.integrate(sight_line(0, [(0.5, 0)]))
-    with pytest.raises(DataError, match="label id 5 is outside 0 to 2"):
-        backend.integrate(sight_line(1, [(0.5, 0), (1.5, 5)]))
-    with pytest.raises(DataError, match="frame 2 spans"):
-        backend.integrate(sight_line(2, [(0.5, 0), (3e6, 1)]))
-    with pytest.raises(DataError, match="scores are negative"):
-        fuse_tensors(backend, sight_line(3, [(0.5, 0)]), scores=torch.tensor([[[2.0]], [[-1.0]], [[0.0]]]))
-    assert len(backend.table()) == 1
-
-
-@needs_triton
-def test_a_view_outgrows_its_hash(triton_kernels):
-    """Slots for 256, then for 1024: 700 voxels in a view settle, and their order does not depend on that of pixels."""
-    hits = [(i + 0.5, i % 3) for i in range(700)]
-    shuffled = [hits[i] for i in np.random.default_rng(0).permutation(700)]
-    orders = []
-    for line in (hits, shuffled):
-        associator = triton_kernels.Associator()
-        view = DepthView.of_frame(sight_line(0, line), torch.device(DEVICE.lower()))
-        seen = associator(view, MapGrid(1.0, (0, 0, 0), torch.float64))
-        z = (seen.keys[seen.voxel.to(torch.int64)] & (2**21 - 1)) - 2**20
-        assert z[0].tolist() == [int(depth) for depth, _ in line]
-        assert associator.slots == 4096
-        orders.append(seen.keys.tolist())
-    assert orders[0] == orders[1]
-
-
-@needs_triton
-def test_the_compiled_kernel_keeps_multiplications_and_additions_apart(tmp_path):
-    """In the code for an H100, compiled without one: what is fused would round otherwise at a voxel's face."""
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"TRITON_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", COMPILE]
-    code = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    assert "mul.rn.f64" in code
-    assert "div.rn.f64" in code
-    assert "fma" not in code
-
-
-COMPILE = """
-import triton
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
-from semstab.backends.triton_launch import SEPARATE
-from semstab.backends.triton_kernels import insert_pixels as kernel
-
-types = dict.fromkeys(kernel.arg_names, "i32")
-types |= {"depth": "*fp32", "overflow": "*i32", "PROBES": "constexpr", "BLOCK": "constexpr"}
-types |= dict.fromkeys(("ray_x", "ray_y", "camera"), "*fp64") | dict.fromkeys(("keys", "table"), "*i64")
-fixed = {(kernel.arg_names.index("PROBES"),): 8, (kernel.arg_names.index("BLOCK"),): 256}
-compiled = triton.compile(ASTSource(kernel, types, fixed), target=GPUTarget("cuda", 90, 32), options=SEPARATE)
-print(compiled.asm["ptx"])
-"""

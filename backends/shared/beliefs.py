@@ -90,7 +90,7 @@ def _looked_up(context: Any, builder: Any, step: Any, table: list[float]) -> Any
 # What an observation changes in a voxel's dense evidence, eight classes at a time.
 
 HALVES, ZEROS = ir.Constant(DOUBLES, [0.5] * LANES), ir.Constant(DOUBLES, [0.0] * LANES)
-FOUND = types.Tuple([types.float64] * 5 + [types.intp])
+RESULT = types.Tuple([types.float64] * 5 + [types.intp])
 
 
 @intrinsic
@@ -142,18 +142,13 @@ def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before
         lanes = builder.add(builder.load(classes), ir.Constant(INTS, list(range(LANES))))
         leads = builder.fcmp_ordered("==", builder.load(most), spread(builder, top, DOUBLES))
         first = builder.select(leads, lanes, ir.Constant(INTS, [1 << 62] * LANES))
-        found = [
-            *(
-                _over_lanes(builder, "fadd", DOUBLE, [DOUBLE(0.0), builder.load(total)], ["reassoc"])
-                for total in totals
-            ),
-            top,
-            _over_lanes(builder, "smin", INT, [first], []),
+        sums = [
+            _over_lanes(builder, "fadd", DOUBLE, [DOUBLE(0.0), builder.load(total)], ["reassoc"]) for total in totals
         ]
-        return context.make_tuple(builder, FOUND, found)
+        return context.make_tuple(builder, RESULT, [*sums, top, _over_lanes(builder, "smin", INT, [first], [])])
 
     number = types.float64
-    return FOUND(evidence, _sums, number, number, number), generate
+    return RESULT(evidence, _sums, number, number, number), generate
 
 
 def _over_lanes(builder: Any, what: str, kind: Any, values: list[Any], flags: list[str]) -> Any:
@@ -195,8 +190,8 @@ def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """
     before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
     top_before = evidence[dominant] * before
-    found: Any = observe_eights(evidence, sums, 1.0 / pixels, before, after)
-    plogp_after, plogp_between, squares, plogp_seen, top, then = found
+    result: Any = observe_eights(evidence, sums, 1.0 / pixels, before, after)
+    plogp_after, plogp_between, squares, plogp_seen, top, then = result
     out[0] = top * after - top_before
     out[1] = plogp_before - plogp_after
     out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0

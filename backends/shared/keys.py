@@ -67,3 +67,9 @@ def mix(key):
 def partition_of(key):
     """The partition of a key: the top 6 bits of its hash."""
     return np.int64(mix(key) >> np.uint64(58))
+
+
+def partitions_of(keys: Int64) -> Int64:
+    """The partition of each key (n,)."""
+    partition: Int64 = (mix.py_func(keys) >> np.uint64(58)).astype(np.int64)
+    return partition

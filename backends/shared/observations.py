@@ -1,4 +1,4 @@
-"""What compiled backends take from a frame: its observations as sparse rows, and the space to work them out in."""
+"""The observations of a frame as compiled backends take them, and what they change in a map."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ LINE = 64
 
 
 class WorkSpace:
-    """Arrays that are kept from frame to frame, by name."""
+    """Arrays that one frame after the other uses, by name."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, npt.NDArray[Any]] = {}
@@ -114,10 +114,10 @@ def _aligned(size: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     return room[start : start + size * dtype.itemsize].view(dtype)
 
 
-# What is kept of a map as it grows, whatever holds its voxels: totals, and each frame's report made of them.
+# Totals of a map as it grows, whatever holds its voxels, and the report of each frame made of them.
 
 PIECE = 1 << 20
-"""Numbers of evidence that are looked at together, about: each takes some hundred bytes meanwhile."""
+"""Numbers of evidence that are worked on together, about: each takes some hundred bytes meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ class Change:
         pixels         (n,) of the frame
         """
         known = op > 1
-        found = [_voxel_by_voxel(before[some], after[some], known[some]) for some in _pieces(*after.shape)]
-        drift, vss, vss_before, entropy, entropy_before = map(np.concatenate, zip(*found, strict=True))
+        pieces = [_voxel_by_voxel(before[some], after[some], known[some]) for some in _pieces(*after.shape)]
+        drift, vss, vss_before, entropy, entropy_before = map(np.concatenate, zip(*pieces, strict=True))
         return cls(
             points=int(pixels.sum()),
             voxels=len(op),
@@ -186,7 +186,7 @@ def _voxel_by_voxel(before: Float64, after: Float64, known: Mask) -> tuple[Float
 
 
 class MapTotal:
-    """Totals over the voxels of a map of K classes, kept from frame to frame: no work that grows with the map."""
+    """Running totals over the voxels of a map of K classes: no work that grows with the map."""
 
     def __init__(self, num_classes: int) -> None:
         self.num_classes = num_classes

@@ -220,12 +220,8 @@ def find_words(
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
         table, table_count = tables[thread], table_counts[thread]
-        words, keys, run_word, run_end = (
-            stretches[thread, 0],
-            stretches[thread, 1],
-            stretches[thread, 2],
-            stretches[thread, 3],
-        )
+        words, keys = stretches[thread, 0], stretches[thread, 1]
+        run_word, run_end = stretches[thread, 2], stretches[thread, 3]
         own_word = word[band * room : (band + 1) * room]
         own_count = count[band * room : (band + 1) * room]
         n = np.int64(0)
@@ -323,18 +319,12 @@ def _sort(word, count, word2, count2, bits, histogram):
 
 
 @parallel
-def merge_words(word, count, word2, count2, edges, bits, label_bits, flipped, voxels, kept):
+def merge_words(word, count, word2, count2, edges, bits, label_bits, flipped, voxels, left):
     """Sort each partition and add up equal words; numbers of voxels and of entries that are left."""
     for p in nb.prange(PARTITIONS):
         low, high = edges[p], edges[p + 1]
-        flipped[p] = _sort(
-            word[low:high],
-            count[low:high],
-            word2[low:high],
-            count2[low:high],
-            bits,
-            np.empty(1 << DIGIT_BITS, np.int32),
-        )
+        histogram = np.empty(1 << DIGIT_BITS, np.int32)
+        flipped[p] = _sort(word[low:high], count[low:high], word2[low:high], count2[low:high], bits, histogram)
         w, c = (word2[low:high], count2[low:high]) if flipped[p] else (word[low:high], count[low:high])
         n = v = 0
         voxel = np.int64(-1)
@@ -346,28 +336,14 @@ def merge_words(word, count, word2, count2, edges, bits, label_bits, flipped, vo
             voxel = w[i] >> label_bits
             w[n], c[n] = w[i], c[i]
             n += 1
-        voxels[p], kept[p] = v, n
+        voxels[p], left[p] = v, n
 
 
 @parallel
 def emit_voxels(
-    word,
-    count,
-    word2,
-    count2,
-    edges,
-    flipped,
-    bounds,
-    entry_bounds,
-    low,
-    shift,
-    corner,
-    key,
-    pixels,
-    start,
-    label,
+    word, count, word2, count2, edges, flipped, bounds, entry_bounds, low, shift, corner, key, pixels, start, label,
     weight,
-):
+):  # fmt: skip
     """The observations: close the gaps between partitions, and unpack the words."""
     label_mask = (np.int64(1) << shift[2]) - 1
     b_mask, c_mask = (np.int64(1) << (shift[0] - shift[1])) - 1, (np.int64(1) << (shift[1] - shift[2])) - 1

@@ -1,4 +1,4 @@
-"""The paper's measures as pure functions of a voxel table, and what follows from them."""
+"""The paper's measures as pure functions of a voxel table, and measures in the image."""
 
 from semstab.metrics.agreement import compare
 from semstab.metrics.flicker import (
@@ -10,7 +10,7 @@ from semstab.metrics.flicker import (
     flicker_percent,
     matched_region_flicker,
 )
-from semstab.metrics.frame_quality import FrameJudge
+from semstab.metrics.frame_quality import FrameQualityMeter
 from semstab.metrics.summary import (
     CATEGORIES,
     CATEGORY_COLORS,
@@ -30,7 +30,7 @@ __all__ = [
     "CATEGORY_COLORS",
     "CategoryThresholds",
     "CompensatedFlicker",
-    "FrameJudge",
+    "FrameQualityMeter",
     "RegionChange",
     "SelfConsistency",
     "VideoConsistency",

@@ -56,7 +56,7 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
 
 
 def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:
-    """Whether all tables have the same voxels."""
+    """All tables have the same voxels."""
     names = ("ix", "iy", "iz")
     return all(np.array_equal(getattr(first, name), getattr(other, name)) for other in others for name in names)
 
@@ -191,11 +191,11 @@ class _Rows:
 
 def _differences(a: _Rows, b: _Rows) -> dict[str, tuple[float, float]]:
     """The largest difference of each quantity and the mean over the classes summed over the voxels."""
-    found = {measure.key: _difference(measure.of(a), measure.of(b)) for measure in measures()}
+    of_measures = {measure.key: _difference(measure.of(a), measure.of(b)) for measure in measures()}
     other = dominant(a) != dominant(b)
     return {
         "op": _difference(a.op, b.op),
-        **found,
+        **of_measures,
         "evidence": _difference(a.evidence, b.evidence),
         LABEL: (float(other.max(initial=False)), float(other.sum())),
     }

@@ -1,4 +1,4 @@
-"""Frame-wise flicker: what image space sees of instability (paper, Frame-wise Temporal Semantic Flicker)."""
+"""Frame-wise flicker: instability in image space (paper, Frame-wise Temporal Semantic Flicker)."""
 
 from __future__ import annotations
 
@@ -203,10 +203,10 @@ IOU_THRESHOLD = 0.25
 
 @dataclass(frozen=True)
 class RegionChange:
-    """What happened between two frames.
+    """The change of regions between two frames.
 
     flicker_percent           of the pixels valid in both, those that left their region; NaN where there are none
-    matched                   regions found again
+    matched                   regions in both frames
     births, deaths            regions of the current frame that are new, of the previous one that are gone
     variation_of_information  between the two partitions, bits, the unassigned pixels being one part; NaN likewise
     """

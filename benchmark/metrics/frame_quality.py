@@ -1,4 +1,4 @@
-"""What labels of single frames are worth: right, steady, what the model says next, how late they follow a change."""
+"""Quality of the labels of single frames: accuracy, stability, next-frame consistency, lag behind a true change."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HORIZON = 8
 NONE = -1
 
 
-class FrameJudge:
+class FrameQualityMeter:
     """Takes the frames of a sequence in order, each as a filter left it, as the model said it, and as it truly is.
 
     All have labels in one label space of K classes and one size; the truth may be missing.
@@ -39,17 +39,17 @@ class FrameJudge:
         if truth is not None:
             known = frame.valid & truth.valid
             pairs = truth.predicted[known].astype(np.int64) * self._K + frame.predicted[known]
-            found = np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
-            self._confusion += found
-            self._accuracy.append(_share(np.trace(found), found.sum()))
+            confusion = np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
+            self._confusion += confusion
+            self._accuracy.append(_share(np.trace(confusion), confusion.sum()))
         self._count(labelled=frame.valid, sayable=model.valid)
         if self._before is not None and self._before[0].shape == frame.shape:
             self._compare(*self._before, frame, model, truth)
         self._before = frame, model, truth
 
     def result(self, model: str, filters: str, milliseconds: float) -> FrameQuality:
-        """What was found so far of filters over a model, which took so many milliseconds a frame."""
-        labelled, sayable, foreseen, met, stale, looked = self._counts
+        """The quality so far of filters over a model, which took so many milliseconds a frame."""
+        labelled, sayable, foreseen, met, stale, compared = self._counts
         right = np.diag(self._confusion)
         union = self._confusion.sum(axis=0) + self._confusion.sum(axis=1) - right
         there = union > 0
@@ -60,7 +60,7 @@ class FrameJudge:
             foresight=_share(foreseen, met),
             accuracy=_share(right.sum(), self._confusion.sum()),
             miou=float(np.mean(right[there] / union[there])) if there.any() else math.nan,
-            stable_wrong=_share(stale, looked),
+            stable_wrong=_share(stale, compared),
             lag=self._lag.mean,
             changes=self._lag.changes,
             milliseconds=milliseconds,
@@ -80,13 +80,15 @@ class FrameJudge:
         self._count(foreseen=foreseen, met=met)
         if truth is None or truth_now is None:
             return
-        looked = labelled & now.valid & truth_now.valid
-        self._count(stale=looked & (before == now.predicted) & (now.predicted != truth_now.predicted), looked=looked)
+        compared = labelled & now.valid & truth_now.valid
+        self._count(
+            stale=compared & (before == now.predicted) & (now.predicted != truth_now.predicted), compared=compared
+        )
         where = correspond(now, frame, depth_tolerance=math.inf)
         self._lag.add(where, now, model_now, truth, truth_now)
 
     def _count(self, **masks: Mask) -> None:
-        names = ("labelled", "sayable", "foreseen", "met", "stale", "looked")
+        names = ("labelled", "sayable", "foreseen", "met", "stale", "compared")
         for name, mask in masks.items():
             self._counts[names.index(name)] += np.count_nonzero(mask)
 
@@ -138,7 +140,7 @@ class Lag:
 
 
 def _near(truth: Frame, where: Correspondence, true: npt.NDArray[Any]) -> Mask:
-    """Whether a pixel's class was seen within a pixel of where it lay before."""
+    """Pixels whose class was seen within a pixel of where they lay before."""
     padded = np.pad(truth.predicted, 1, mode="edge")
     H, W = truth.shape
     near = np.zeros(true.shape, dtype=np.bool_)

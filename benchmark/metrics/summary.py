@@ -39,7 +39,7 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
 
 @dataclass(frozen=True, eq=False)
 class TableSums:
-    """What a map's summary is made of; that of a map in parts is their sum.
+    """The sums behind a map's summary; those of the parts of a map add up to those of the map.
 
     total    (3,) points, observations, voxels
     stratum, kind, recurrence, step  sums of every measure by stratum, by dominant class, of the voxels below OP 3 and
@@ -85,7 +85,7 @@ class TableSums:
         return TableSums(*(own + more for own, more in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def summary(self, voxel_size: float, classes: Sequence[str], edges: Sequence[int] = STRATA) -> TableSummary:
-        """What is reported; the edges are those of the sums."""
+        """The summary; the edges are those of the sums."""
         points, observations, voxels = (int(value) for value in self.total)
         K = self.kind.shape[1]
         names = classes or tuple(str(k) for k in range(K))
@@ -150,7 +150,7 @@ def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
 def split_last(tables: Sequence[TableSummary]) -> list[Means]:
     """The last stratum of several tables together in about equal parts, where most of their voxels are in it.
 
-    Beside the strata, whose edges are the paper's: `well_seen` names the finer ones.
+    In addition to the strata, whose edges are the paper's: `well_seen` names the finer ones.
     """
     voxels = sum(table.voxels for table in tables)
     steps: dict[str, list[Means]] = {}
@@ -204,7 +204,7 @@ def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
     return sum(v * w for v, w in zip(values, weights, strict=True) if w) / total if total else math.nan
 
 
-# What kind of place a voxel is: low persistence, drifting, uncertain or stable (paper, Qualitative Analysis).
+# Categories of voxels: low persistence, drifting, uncertain or stable (paper, Qualitative Analysis).
 
 LOW_PERSISTENCE, DRIFTING, UNCERTAIN, STABLE = range(4)
 

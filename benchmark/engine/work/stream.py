@@ -20,7 +20,7 @@ from semstab.engine.series import Series
 from semstab.engine.work.image_space import ImageSpaceMeter
 from semstab.engine.work.jobs import Request
 from semstab.engine.work.sizes import SizeMaps
-from semstab.metrics import FrameJudge, flicker_percent
+from semstab.metrics import FrameQualityMeter, flicker_percent
 from semstab.model.events import Events
 from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
@@ -122,7 +122,7 @@ class Stream:
         self.previous: Frame | None = None
         self.image_space = ImageSpaceMeter() if any(one.request.image_space for one in maps) else None
         wanted = self.image_space is not None and maps[0].request.config.frame_quality
-        self.judge = FrameJudge(len(self.task.mapping.target)) if wanted else None
+        self.judge = FrameQualityMeter(len(self.task.mapping.target)) if wanted else None
         takes_truth = self.image_space is not None or any(one.truth is not None for one in maps)
         self.truth_task = truth_task(self.task) if takes_truth else None
         self._poses = Rows(AXES) if self.image_space is not None and self.task.scene.up is None else None

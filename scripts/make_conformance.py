@@ -1,4 +1,4 @@
-"""Write all cases anew, fused by the reference: python -m semstab.conformance.make conformance/cases."""
+"""Write all conformance cases anew, fused by the reference: python scripts/make_conformance.py conformance/cases."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.conformance.cases import EXPECTED, write_case
+from semstab.conformance import EXPECTED, write_case
 from semstab.conformance.fuse import fuse
 from semstab.core.files import write_text
 from semstab.core.types import Float64

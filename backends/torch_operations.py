@@ -1,4 +1,4 @@
-"""The torch backend in plain tensor operations, on any device: the fallback of its Triton kernels, and what they match.
+"""The tensor operations of the torch backend, on any device: pixels to voxels, evidence, and the update of a map.
 
 Every sum over pixels is one of integers: counts of labels, and scores in units of a fixed fraction. Integer sums do not
 depend on their order, so that the numbers are the same run after run, although on an accelerator the order is not.
@@ -17,7 +17,7 @@ import torch
 
 from semstab.backends.shared.keys import HALF
 from semstab.backends.shared.observations import Change
-from semstab.backends.torch_storage import EMPTY, Columns, DepthView, Labels, MapGrid, Scores, VoxelHash
+from semstab.backends.torch_storage import Columns, DepthView, Labels, MapGrid, Scores
 from semstab.model.results import RECURRENT
 
 NONE, LOST = -1, -2
@@ -77,21 +77,18 @@ def parts(total: int, size: int) -> Iterator[slice]:
 # --- Pixels to voxels -------------------------------------------------------------------------------------------------
 
 
-class Associator:
-    """Finds the voxels of views."""
-
-    def __call__(self, view: DepthView, grid: MapGrid) -> Association:
-        """The voxels of a view, ascending by key, and the one of each pixel."""
-        H, W = view.depth.shape
-        keys_of = _Keys(view, grid)
-        rows = parts(H, chunk_of(view.depth.device) // W)
-        runs = [torch.unique_consecutive(keys_of(part), return_counts=True) for part in rows]
-        key, length = (torch.cat(part) for part in zip(*runs, strict=True))
-        keys, place = torch.unique(key, return_inverse=True)
-        nowhere = int((keys < 0).sum())
-        voxel = torch.where(key < 0, key, place - nowhere).to(torch.int32)
-        pixels = torch.repeat_interleave(voxel, length, output_size=H * W)
-        return Association(keys[nowhere:], pixels.reshape(H, W))
+def associate(view: DepthView, grid: MapGrid) -> Association:
+    """The voxels of a view, ascending by key, and the one of each pixel."""
+    H, W = view.depth.shape
+    keys_of = _Keys(view, grid)
+    rows = parts(H, chunk_of(view.depth.device) // W)
+    runs = [torch.unique_consecutive(keys_of(part), return_counts=True) for part in rows]
+    key, length = (torch.cat(part) for part in zip(*runs, strict=True))
+    keys, place = torch.unique(key, return_inverse=True)
+    nowhere = int((keys < 0).sum())
+    voxel = torch.where(key < 0, key, place - nowhere).to(torch.int32)
+    pixels = torch.repeat_interleave(voxel, length, output_size=H * W)
+    return Association(keys[nowhere:], pixels.reshape(H, W))
 
 
 class _Keys:
@@ -211,48 +208,6 @@ def shares(values: torch.Tensor, softmax: bool) -> tuple[torch.Tensor, torch.Ten
 
 
 # --- The map ----------------------------------------------------------------------------------------------------------
-
-
-def mix(key: torch.Tensor) -> torch.Tensor:
-    """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
-    key = (key ^ _shifted(key, 30)) * (0xBF58476D1CE4E5B9 - (1 << 64))
-    key = (key ^ _shifted(key, 27)) * (0x94D049BB133111EB - (1 << 64))
-    return key ^ _shifted(key, 31)
-
-
-def _shifted(x: torch.Tensor, bits: int) -> torch.Tensor:
-    """A logical shift to the right, which torch has for unsigned numbers only."""
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
-
-
-def find(table: VoxelHash, keys: torch.Tensor) -> torch.Tensor:
-    """Rows (n,) int64 of keys (n,), EMPTY for those that the hash does not hold."""
-    rows = torch.full_like(keys, EMPTY)
-    mask = len(table.keys) - 1
-    at, searched = mix(keys) & mask, torch.arange(len(keys), device=keys.device)
-    while len(searched):
-        found = table.keys[at]
-        hit = found == keys[searched]
-        rows[searched[hit]] = table.rows[at[hit]].to(torch.int64)
-        goes_on = ~hit & (found != EMPTY)
-        at, searched = (at[goes_on] + 1) & mask, searched[goes_on]
-    return rows
-
-
-def insert(table: VoxelHash, keys: torch.Tensor, rows: torch.Tensor, first: int = 0) -> None:
-    """Add distinct keys (n,) which the hash does not hold and has slots for, with their rows (n,).
-
-    EMPTY keys are left out, and those whose row is below `first`.
-    """
-    wanted = (keys != EMPTY) & (rows >= first)
-    keys, rows, mask = keys[wanted], rows[wanted].to(torch.int32), len(table.keys) - 1
-    at = mix(keys) & mask
-    while len(keys):
-        free = table.keys[at] == EMPTY
-        table.keys[at[free]] = keys[free]  # several keys may want a slot: one of them gets it
-        placed = free & (table.keys[at] == keys)
-        table.rows[at[placed]] = rows[placed]
-        at, keys, rows = (at[~placed] + 1) & mask, keys[~placed], rows[~placed]
 
 
 def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: int) -> torch.Tensor:
