@@ -13,7 +13,6 @@ import numpy as np
 
 from semstab.core.compiled import compiled, serial
 from semstab.core.types import Int64
-from semstab.statistics.loops.asking import ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.logarithm import EIGHT, add_plogp
 
@@ -163,10 +162,6 @@ def measure_few(chunk, voxels, first, T, log, K, entries, orders, steps, taken, 
     last = (chunk + 1) * voxels.shape[0] // CHUNKS
     for begin in range(chunk * voxels.shape[0] // CHUNKS, last, EIGHT):
         end = min(begin + EIGHT, last)
-        for j in range(end, min(end + EIGHT, last)):
-            ask_for_entries(log, first[voxels[j]], T)
-        for j in range(end + EIGHT, min(end + 2 * EIGHT, last)):
-            ask_for_bounds(log, first[voxels[j]], T)
         A = dense_eight(log, first, T, voxels, begin, end, number, x)
         drifts_of_steps(x, A, T, steps, belief, logs, mean, drift)
         for i in range(taken.shape[0]):

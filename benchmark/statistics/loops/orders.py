@@ -11,7 +11,6 @@ import numpy as np
 
 from semstab.backends.shared.keys import mix
 from semstab.core.compiled import compiled, serial
-from semstab.statistics.loops.asking import SOON, ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.few_looks import ROUNDING
 from semstab.statistics.loops.logarithm import EIGHT, add_step
@@ -246,9 +245,7 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
             _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
             open_ = 0
             for j in range(left):
-                i, soon, later = voxels[j], voxels[min(j + SOON, left - 1)], voxels[min(j + 2 * SOON, left - 1)]
-                ask_for_bounds(log, first[later], steps)
-                ask_for_entries(log, first[soon], steps)
+                i = voxels[j]
                 _own_order(at, steps, seeds[i], own)
                 A = dense(log, first[i], steps, number, at, x)
                 if tried == 0:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.core.compiled import compiled, serial
-from semstab.statistics.loops.asking import ask_for_bounds, ask_for_entries
 from semstab.statistics.loops.chunks import CHUNKS
 from semstab.statistics.loops.logarithm import EIGHT, add_plogp, exp2_fast
 
@@ -154,11 +153,6 @@ def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules
             of[:seen, lane] = 1.0
             of[A, lane] = K - seen
         drift[:] = 0.0
-        for j in range(begin + LANES, min(begin + 3 * LANES, end)):
-            if j >= begin + 2 * LANES:
-                ask_for_bounds(log, starts[rank[j]], ends[rank[j]] - starts[rank[j]])
-            else:
-                ask_for_entries(log, starts[rank[j]], ends[rank[j]] - starts[rank[j]])
         for t in range(T):
             for lane in range(lanes):
                 e = at[row[lane] + t]
