@@ -35,7 +35,7 @@ from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.order.fusion_rules import fuse_all
+from semstab.statistics.fusion_rules import fuse_all
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 

@@ -33,7 +33,7 @@ from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
 from semstab.statistics import CellObservations, Estimate, MapSample, ObservationSample, Reliability, analyse, describe
 from semstab.statistics.correctness import ACCURACY
-from semstab.statistics.steady import steady
+from semstab.statistics.stability import stability_posterior
 
 BACKBONES = ("a", "b", "gt")
 
@@ -318,8 +318,8 @@ def test_what_is_right_and_stable_by_voxel() -> None:
     """Five observations of two classes: 5 to 0 is stable, 3 to 2 is not; OP = 2 does not count."""
     table = voxels((1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 2, [2, 0, 0]))
     one_hot = dataclasses.replace(table, self_sum=table.op.astype(float))
-    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1]), steady(one_hot)).tolist() == [1, 2, 4, 3, 0]
-    assert right_or_wrong(one_hot, np.full(5, -1), steady(one_hot)).tolist() == [0] * 5
+    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1]), stability_posterior(one_hot)).tolist() == [1, 2, 4, 3, 0]
+    assert right_or_wrong(one_hot, np.full(5, -1), stability_posterior(one_hot)).tolist() == [0] * 5
 
 
 def test_reliability_pools_the_bins_of_several_scenes() -> None:

@@ -21,13 +21,13 @@ from semstab.statistics import (
     Sampler,
     Views,
     alpha_between,
+    ceiling_share,
     describe,
     disagreement,
     krippendorff_alpha,
     psa,
-    reach_of,
 )
-from semstab.statistics.looks.loops import hash_row
+from semstab.statistics.loops.observations import hash_row
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
 
@@ -206,7 +206,7 @@ def test_a_coin_is_stable_at_no_voxel_size(patch):
 def test_the_ground_truths_ceiling_takes_the_place_of_the_maps_own():
     wrong, right = sampled(flight(flicker=0.4, patch=5)), sampled(flight())
     table = fused(flight(flicker=0.4, patch=5), 0.4).table()
-    own, against = reach_of(wrong, table), reach_of(wrong.against(right), table)
+    own, against = ceiling_share(wrong, table), ceiling_share(wrong.against(right), table)
     assert against.by == "the ground truth"
     assert against.ceiling.value == pytest.approx(alpha_between(right.seen.table()))
     assert own.alpha == against.alpha

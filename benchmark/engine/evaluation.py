@@ -9,7 +9,7 @@ from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
 from semstab.statistics import Analysis, BackboneComparison, CellObservations, MapSample, ObservationSample, analyse
-from semstab.statistics.versus.backbones import Regions, compare_regions
+from semstab.statistics.model_comparison import Regions, compare_regions
 from semstab.task import Task
 
 

@@ -26,7 +26,7 @@ from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import BackboneComparison, CellObservations, claimed_together
-from semstab.statistics.versus.backbones import Region, Regions
+from semstab.statistics.model_comparison import Region, Regions
 
 
 @dataclass

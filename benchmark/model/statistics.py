@@ -24,6 +24,11 @@ class Estimate:
     high: float
 
     @property
+    def ends(self) -> Estimate:
+        """The value with its interval alone."""
+        return Estimate(self.value, self.low, self.high)
+
+    @property
     def percent(self) -> Estimate:
         """Of a share, in percent."""
         return Estimate(100 * self.value, 100 * self.low, 100 * self.high)

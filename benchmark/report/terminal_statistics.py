@@ -21,7 +21,7 @@ from semstab.model.statistics import (
 )
 from semstab.statistics.agreement import ALPHA, KAPPA
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
-from semstab.statistics.versus.comparison import compared
+from semstab.statistics.model_comparison import compared
 
 Row = tuple[str, Estimate | float, str]
 Cell = str | float

@@ -18,10 +18,10 @@ from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, domi
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.accumulate import Cubes, CubeSums
 from semstab.statistics.agreement import STABLE, ratio_of
-from semstab.statistics.order.fusion_rules import Fused
-from semstab.statistics.sampling.places import Places, PlaceSums
-from semstab.statistics.steady import LIKELY, steady
+from semstab.statistics.fusion_rules import Fused
+from semstab.statistics.stability import LIKELY, stability_posterior
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
@@ -222,29 +222,29 @@ def strata_of(sums: Float64, edges: Sequence[int]) -> tuple[Correctness, ...]:
     return tuple(correctness_of(own, name) for own, name in zip(sums, names, strict=True))
 
 
-def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, places: Cubes, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
     A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
     places were seen. `places` are those of all of the table's voxels.
     """
-    return quadrants_of(quadrant_sums(table, truth, steady(table, stable=stable), places.edge))
+    return quadrants_of(quadrant_sums(table, truth, stability_posterior(table, stable=stable), places.edge))
 
 
 QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
 
 
-def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> PlaceSums:
+def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> CubeSums:
     """What `quadrants_of` is a function of, over cubes of that edge, by the probability (n,) that each is stable."""
     counted, likely, right = _masks(table, truth, stable)
-    places = Places.of(table, edge, where=counted)
+    places = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
     sums = places.means(dict(zip(QUADRANTS, parts, strict=True)))
     wrong, every = sums["stable_wrong"][:, 0], sums["stable_right"][:, 0] + sums["stable_wrong"][:, 0]
-    return PlaceSums(places.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
+    return CubeSums(places.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
 
 
-def quadrants_of(sums: PlaceSums) -> Quadrants:
+def quadrants_of(sums: CubeSums) -> Quadrants:
     """The shares, from `quadrant_sums`."""
     voxels = int(sums["stable_right"][1])
     if not voxels:
@@ -254,7 +254,7 @@ def quadrants_of(sums: PlaceSums) -> Quadrants:
 
 def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
     """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
-    return wrong_of_steady(table, truth, steady(table, stable=stable))
+    return wrong_of_steady(table, truth, stability_posterior(table, stable=stable))
 
 
 def wrong_of_steady(table: VoxelTable, truth: Truth, stable: Float64) -> Mask:

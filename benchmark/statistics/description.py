@@ -36,6 +36,8 @@ from semstab.model.statistics import (
     StratumStatistics,
 )
 from semstab.model.voxels import VoxelTable
+from semstab.statistics import fusion_rules
+from semstab.statistics.accumulate import Cubes, CubeSums, Mean, cluster_sums_of
 from semstab.statistics.agreement import (
     alpha_of,
     between_of,
@@ -47,6 +49,8 @@ from semstab.statistics.agreement import (
     psa,
     ratio_of,
 )
+from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, losses
+from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
     Truth,
@@ -61,16 +65,25 @@ from semstab.statistics.correctness import (
     strata_of,
     wrong_of_steady,
 )
+from semstab.statistics.correlogram import correlogram
+from semstab.statistics.drift import (
+    TESTABLE,
+    Flips,
+    VoxelDrift,
+    benjamini_hochberg,
+    expected_sbd,
+    flips,
+    rounded_up,
+    trend_columns,
+    voxel_drift,
+)
 from semstab.statistics.flipping import FlippingSums
-from semstab.statistics.looks import ObservationSample, correlogram, reach_by, reach_from
-from semstab.statistics.order import fusion_rules
-from semstab.statistics.order.drift import TESTABLE, Flips, VoxelDrift, expected_sbd, flips, trend_columns, voxel_drift
-from semstab.statistics.order.p_values import benjamini_hochberg, rounded_up
+from semstab.statistics.intervals import grouped_intervals, headline_specs
+from semstab.statistics.observations import ObservationSample
 from semstab.statistics.sample import MapSample
-from semstab.statistics.sampling import InfluenceSums, Mean, Places, PlaceSums, answered, influence_sums, judged_by
 from semstab.statistics.scene_drift import OrderTest, order_test
-from semstab.statistics.steady import Votes, steady
-from semstab.statistics.verdict import losses, verdict
+from semstab.statistics.stability import Votes, stability_posterior
+from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
 
@@ -94,7 +107,7 @@ class Analysis:
 
     summary: MapStatistics
     table: TableSummary
-    sums: InfluenceSums
+    sums: ClusterSums
     sample: MapSample
     shares: Float64
     drawn: Columns
@@ -113,7 +126,7 @@ class Analysis:
         null = expected_sbd(table)
         if "sbd_null" in spread:
             null[rows] = spread.pop("sbd_null")[rows]
-        stable = steady(table, self.shares)
+        stable = stability_posterior(table, self.shares)
         columns = row_columns(table, null) | spread
         if truth is not None:
             columns["true_label"] = join_truth(table, truth).label
@@ -173,13 +186,13 @@ def analyse(
     truth = None if sample.truth is None else join_truth(table, sample.truth)
     limit = sample.truth if limit is None else limit
     shares = Votes.of(table).shares()
-    stable = steady(table, shares)
+    stable = stability_posterior(table, shares)
     drift = None if events is None else voxel_drift(table, events, seed=seed)
     null = expected_sbd(table) if drift is None else drift.null
     columns = row_columns(table, null)
-    places = Places.of(table)
+    places = Cubes.of(table)
     of_places = place_sums(table, columns, places)
-    influence = influence_sums(
+    influence = cluster_sums_of(
         table,
         events,
         None if truth is None else truth.label,
@@ -192,17 +205,17 @@ def analyse(
     drawn, log = _of_log(table, sample, places, drift, seed)
     if truth is not None:
         drawn["true_label"] = truth.label
-    found, judged, (unsteady,), reached, of_flips = answered(
+    found, judged, (unsteady,), reached, of_flips = grouped_intervals(
         of_places.asked(MEANS),
-        judged_by(influence),
+        headline_specs(influence),
         flipping.asked(),
-        () if observations is None else reach_by(influence, table.K),
+        () if observations is None else ceiling_specs(influence, table.K),
         () if log is None else log.places.asked(OF_FLIPS),
     )
     means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
     if observations is not None:
-        reach = reach_from(observations.by, of_places["kappa"][2:], influence, reached, critical=critical)
+        reach = ceiling_share_from(observations.by, of_places["kappa"][2:], influence, reached, critical=critical)
     headline, count = Judged(*judged), len(places.cell)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
@@ -233,7 +246,7 @@ def analyse(
         correlogram=None if observations is None else correlogram(observations),
         drift=_drift(repeats, means, of_places, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
-        geometry=None if limit is None else losses(table, limit, seed=seed),
+        geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, stable, places, edges),
         fusion_rules=None if events is None else rule_outcomes(table, events, truth),
         strata=_strata(whole, table, columns, edges),
@@ -291,7 +304,7 @@ OF_CHANGES: Mapping[str, Mean] = {
 """Over fewer voxels."""
 
 
-def place_sums(table: VoxelTable, columns: Columns, places: Places) -> PlaceSums:
+def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
     """Return the sums over cubes of the voxels with OP >= 2 of which `MEANS` are functions."""
     T, op, agreement = table.op.astype(np.float64), table.op, columns["psa"]
     sums = places.means(
@@ -325,7 +338,7 @@ def place_sums(table: VoxelTable, columns: Columns, places: Places) -> PlaceSums
         "alpha": [agreeing, observations, own, by_observation],
         "each_place": [sums["psa"], own_of_one, by_voxel],
     }
-    return PlaceSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
+    return CubeSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
 
 
 # --- Sections ---------------------------------------------------------------------------------------------------------
@@ -335,7 +348,7 @@ def place_sums(table: VoxelTable, columns: Columns, places: Places) -> PlaceSums
 class _Log:
     """The sums and tests that need a log: sums over cubes, `trend_columns` summed (3,), and how many voxels trend."""
 
-    places: PlaceSums
+    places: CubeSums
     trend: Float64
     test: OrderTest
     tested: int
@@ -344,7 +357,7 @@ class _Log:
 
 
 def _of_log(
-    table: VoxelTable, sample: MapSample, places: Places, drift: VoxelDrift | None, seed: int
+    table: VoxelTable, sample: MapSample, places: Cubes, drift: VoxelDrift | None, seed: int
 ) -> tuple[Columns, _Log | None]:
     """The columns and sums that need a log; none without one."""
     if sample.events is None or drift is None:
@@ -364,7 +377,7 @@ def _of_log(
     drift_q = benjamini_hochberg(np.where(testable, drift.p_value, np.nan))
     trend_q = benjamini_hochberg(rounded_up(np.where(testable, drift.trend_p, np.nan)))
     log = _Log(
-        PlaceSums(places.cell, places.edge, sums),
+        CubeSums(places.cell, places.edge, sums),
         trends.sum(axis=0),
         order_test(table, sample.events, seed=seed),
         int(np.count_nonzero(~np.isnan(trend_q))),
@@ -390,7 +403,7 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
 
 
 def _drift(
-    repeats: int, means: Mapping[str, Interval], places: PlaceSums, log: _Log | None, of_flips: Sequence[Interval]
+    repeats: int, means: Mapping[str, Interval], places: CubeSums, log: _Log | None, of_flips: Sequence[Interval]
 ) -> DriftStatistics:
     """SBD against its null; without a log only for one-hot evidence, and without tests."""
     tests, rates, sampled = None, None, places["psa"][1]
@@ -422,12 +435,12 @@ def _drift(
 
 
 def _correctness(
-    table: VoxelTable, truth: Truth, stable: Float64, places: Places, edges: Sequence[int]
+    table: VoxelTable, truth: Truth, stable: Float64, places: Cubes, edges: Sequence[int]
 ) -> CorrectnessStatistics:
     judged = Predictions.of(table.evidence, truth.label)
     right = places.means({"right": np.where(truth.known, judged.right, np.nan)})
     return CorrectnessStatistics(
-        accuracy=PlaceSums(places.cell, places.edge, right).estimate("right", ratio_of),
+        accuracy=CubeSums(places.cell, places.edge, right).estimate("right", ratio_of),
         strata=strata_of(judged_strata(judged, table.op, truth.known, edges), edges),
         reliability=reliability_of(judged_where(judged, truth.known & (table.op >= 2))),
         quadrants=quadrants_of(quadrant_sums(table, truth, stable, places.edge)),

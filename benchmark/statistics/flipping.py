@@ -10,9 +10,8 @@ import numpy as np
 from semstab.core.types import Float64
 from semstab.model.statistics import Flipping, Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.sampling import Places, PlaceSums
-from semstab.statistics.sampling.intervals import Asked
-from semstab.statistics.sampling.places import Mean
+from semstab.statistics.accumulate import Cubes, CubeSums, Mean
+from semstab.statistics.intervals import EstimateSpec
 
 ENOUGH = 4
 """Observations from which on places that flip can be told from places that err now and then."""
@@ -30,24 +29,18 @@ class FlippingSums:
     together  (K, K), above the diagonal: how often two looks at one place are of two classes, where it is not stable
     """
 
-    share: PlaceSums
+    share: CubeSums
     often: int
     together: Float64
 
     @classmethod
-    def of(cls, table: VoxelTable, stable: Float64, places: Places) -> FlippingSums:
+    def of(cls, table: VoxelTable, stable: Float64, places: Cubes) -> FlippingSums:
         """Of a table, by the probability (n,) of `steady`, over the cubes of its voxels with OP >= 2."""
         unsteady = np.round((1 - stable) / UNIT) * UNIT
-        share = PlaceSums(places.cell, places.edge, places.means({"": unsteady}))
+        share = CubeSums(places.cell, places.edge, places.means({"": unsteady}))
         return cls(share, int(table.voxels.sum(where=table.op >= ENOUGH)), _together(table, table.voxels * unsteady))
 
-    @classmethod
-    def merged(cls, parts: Sequence[FlippingSums]) -> FlippingSums:
-        """Those of a map from its parts."""
-        share = PlaceSums.added([part.share for part in parts])
-        return cls(share, sum(part.often for part in parts), np.sum([part.together for part in parts], axis=0))
-
-    def asked(self) -> Iterator[Asked]:
+    def asked(self) -> Iterator[EstimateSpec]:
         """For `answers`: the share of the places that are not stable."""
         return self.share.asked({"": Mean("")})
 

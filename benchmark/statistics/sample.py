@@ -18,7 +18,7 @@ from semstab.metrics.agreement import require_same_grid, require_same_map, share
 from semstab.metrics.summary import STRATA, TableSums
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.order.drift import lowest, streams
+from semstab.statistics.drift import lowest, streams
 
 MOST_VOXELS = 500_000
 """More voxels add nothing to an interval: errors of neighbours are alike, so the number of independent ones decides."""

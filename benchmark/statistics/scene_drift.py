@@ -16,9 +16,9 @@ from semstab.model.events import Events
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.order.drift import VoxelDrift, streams, trend_columns, varying
-from semstab.statistics.sampling.arrangement import arranged
-from semstab.statistics.sampling.reach import Errors, longest
+from semstab.statistics.correlation import cluster_grids
+from semstab.statistics.drift import VoxelDrift, streams, trend_columns, varying
+from semstab.statistics.variance import Residuals, longest_correlation
 
 CERTAIN, MOST_SPANS = 0.95, 128
 """How certain it must be that errors last no longer, and by how many spans of time that is looked at."""
@@ -129,7 +129,8 @@ class _Sampled:
 
     def orders(self, seed: int, count: int) -> tuple[Int64, Float64, Float64]:
         """Voxels that many stretches see, and the sums over them of SBD and of trends (R,), in random orders."""
-        from semstab.statistics.loops import chunks, stretches
+        from semstab.core import compiled
+        from semstab.statistics.loops import orders as stretches
 
         first, T = self.events.starts, self.table.op.astype(np.int64)
         changes = np.diff(self.stretch, prepend=-1) != 0
@@ -141,11 +142,11 @@ class _Sampled:
         at = np.concatenate([[0], np.cumsum(T)])
         as_seen = np.tile(np.arange(self.stretches), (count, 1))
         orders = np.ascontiguousarray(np.random.default_rng(seed).permuted(as_seen, axis=1).T)
-        voxels = np.arange(chunks.CHUNKS + 1) * len(T) // chunks.CHUNKS
-        edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((chunks.CHUNKS, count, 2))
+        voxels = np.arange(compiled.CHUNKS + 1) * len(T) // compiled.CHUNKS
+        edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((compiled.CHUNKS, count, 2))
         log = self.events.evidence.entries
         entries = int((log[0][first + T] - log[0][first]).max(initial=0))
-        chunks.in_chunks(
+        compiled.in_chunks(
             stretches.permute_stretches, edges, first, T, log, self.table.K, entries, stretch, orders, sums
         )
         drifted, trended = sums.sum(axis=0).T
@@ -187,8 +188,8 @@ def _lasting(departures: Float64, frame: Int64, frames: int) -> float:
     starts = np.arange(0, frames, span)
     sums: Float64 = np.add.reduceat(series, starts)
     sizes: Float64 = np.add.reduceat(size, starts)
-    (cells,) = arranged([np.arange(len(starts))[:, None]])
-    return span * longest(Errors(cells, sums, sizes), CERTAIN)
+    (cells,) = cluster_grids([np.arange(len(starts))[:, None]])
+    return span * longest_correlation(Residuals(cells, sums, sizes), CERTAIN)
 
 
 def _total(values: Float64) -> float:

@@ -2,21 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
 
-import numpy as np
-import numpy.typing as npt
-
-from semstab.backends import FusionBackend
-from semstab.backends.shared.association import back_project, voxel_index
-from semstab.core.types import Float64, Int64
-from semstab.errors import DataError
-from semstab.metrics import dominant
-from semstab.metrics.agreement import shared_rows, voxel_keys
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.model.statistics import (
     NEXT_FLIGHT,
     ClassReach,
@@ -25,14 +12,10 @@ from semstab.model.statistics import (
     Interval,
     Judged,
     Level,
-    Losses,
     Reach,
     StabilityVerdict,
 )
-from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import BlockBootstrap, Blocks, Occupied, interval
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.intervals import LEAST_FRAMES
 
 RELIABLE = 0.8
 """Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""
@@ -164,130 +147,3 @@ def _level(judged: Judged, reach: Reach | None) -> Level:
 def _every_class_holds(reach: Reach) -> bool:
     """Whether each class that matters allows at least tentative conclusions."""
     return all(row.reached.low >= TENTATIVE for row in reach.classes if row.matters)
-
-
-# Geometry or semantics: what agreement would be left if the labels did not depend on the view at all.
-#
-# View-independent labels are fused under the same poses, depth and noise. What is lost there is geometry's: pixels that
-# fall into the wrong voxel, voxels that hold more than one thing. The rest of the loss is the model's.
-
-
-def ceiling(
-    frames: Iterable[Frame],
-    make_backend: Callable[[], FusionBackend],
-    *,
-    world: VoxelTable | None = None,
-    views: Iterable[Frame] | None = None,
-) -> VoxelTable:
-    """The map of view-independent labels: what the fusion of `frames` would be with a model that never errs.
-
-    frames        the frames as they were fused, noise included; one is held at a time
-    make_backend  makes a new, empty map of the same voxels: `lambda: create("numba", voxel_size=0.2, num_classes=7)`
-    world         a map whose dominant labels are rendered into the frames; where there is none, the frames' own labels
-                  count, which are to be the ground truth
-    views         the same frames free of the noise that was added to them: labels are seen from there
-
-    With `world` the map itself and no `views` nothing is lost, as each pixel sees the voxel that it falls into. Give
-    ground truth, a map of finer voxels, or the frames before noise was added.
-    Raises DataError where frames and views do not fit together.
-    """
-    backend = make_backend()
-    for frame in frames if world is None else rendered(frames, world, views):
-        backend.integrate(frame)
-    return backend.table()
-
-
-def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] | None = None) -> Iterator[Frame]:
-    """The frames with the labels that the map shows in them: each pixel has the dominant label of the voxel it sees.
-
-    A pixel that sees no voxel of the map is ignored. `views` (the frames themselves where not given) say where a pixel
-    sees. Raises DataError where a view is missing or differs in size from its frame.
-    """
-    labels = _Labels(world)
-    for frame, view in ((frame, frame) for frame in frames) if views is None else _paired(frames, views):
-        seen = np.full(view.shape, labels.ignore, dtype=labels.dtype)
-        seen[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
-        yield dataclasses.replace(frame, labels=seen, scores=None)
-
-
-def losses(table: VoxelTable, limit: VoxelTable, *, seed: int = 0) -> Losses:
-    """Split the disagreement in a model's map by the ceiling's map `limit` of the same voxels.
-
-    Raises DataError where the maps differ in K or voxel size.
-    """
-    edge = Occupied.of(table.index[repeated(table, limit)[0]]).edge()
-    return losses_of([loss_sums(table, limit, edge)], edge * table.voxel_size, seed=seed)
-
-
-def repeated(table: VoxelTable, limit: VoxelTable) -> list[Int64]:
-    """The rows of either map of the voxels that both saw twice or more."""
-    rows, limit_rows = shared_rows(table, limit)
-    both = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
-    return [rows[both], limit_rows[both]]
-
-
-def loss_sums(table: VoxelTable, limit: VoxelTable, edge: int) -> Float64:
-    """(B, 3 + 4) over blocks of an edge in voxels: which block, the loss, geometry's and the model's, and places."""
-    rows, limit_rows = repeated(table, limit)
-    total, geometry = 1 - psa(table)[rows], 1 - psa(limit)[limit_rows]
-    blocks, of = np.unique(table.index[rows] // edge, axis=0, return_inverse=True)
-    sums = [
-        np.bincount(of.ravel(), weights=values, minlength=len(blocks))
-        for values in (total, geometry, total - geometry, np.ones(len(rows)))
-    ]
-    return np.column_stack([blocks, *sums]).astype(np.float64)
-
-
-def losses_of(parts: Sequence[Float64], size: float, *, seed: int = 0) -> Losses:
-    """The split, from the `loss_sums` of the parts of a map over blocks of that size in metres."""
-    rows = np.concatenate(parts)
-    at, of = np.unique(rows[:, :3], axis=0, return_inverse=True)
-    blocks = Blocks(of.ravel(), len(at), size)
-    sums, weights = blocks.sums(rows[:, 3:]), BlockBootstrap(blocks, seed=seed).weights
-    total, geometry, model, places = range(4)
-
-    def mean(of: int, by: int, bounds: tuple[float, float] = (-1.0, 1.0)) -> Estimate:
-        return interval(sums[:, [of, by]], ratio_of, weights, bounds)
-
-    return Losses(
-        voxels=int(sums[:, places].sum()),
-        total=mean(total, places, (0.0, 1.0)),
-        geometry=mean(geometry, places, (0.0, 1.0)),
-        model=mean(model, places),
-        share=mean(geometry, total, (0.0, np.inf)),
-    )
-
-
-class _Labels:
-    """The dominant label of a map's voxel by its index; `ignore` where the map has no voxel."""
-
-    def __init__(self, world: VoxelTable) -> None:
-        if not len(world):
-            raise DataError("the map to render has no voxels")
-        few = world.K <= IGNORE_8BIT
-        self.dtype = np.uint8 if few else np.uint16
-        self.ignore = IGNORE_8BIT if few else IGNORE_16BIT
-        self._low = world.index.min(axis=0).astype(np.int64)
-        self._size = world.index.max(axis=0) - self._low + 1
-        (self._keys,) = voxel_keys(world.index)
-        self._labels = dominant(world).astype(self.dtype)
-
-    def at(self, index: Int64) -> npt.NDArray[np.integer]:
-        """Labels (n,) of voxel indices (3, n)."""
-        x, y, z = index - self._low[:, None]
-        inside = (
-            (np.minimum(np.minimum(x, y), z) >= 0) & (x < self._size[0]) & (y < self._size[1]) & (z < self._size[2])
-        )
-        key = (x * self._size[1] + y) * self._size[2] + z
-        row = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
-        return np.where(inside & (self._keys[row] == key), self._labels[row], self.dtype(self.ignore))
-
-
-def _paired(frames: Iterable[Frame], views: Iterable[Frame]) -> Iterator[tuple[Frame, Frame]]:
-    frames, views = iter(frames), iter(views)
-    for frame in frames:
-        view = next(views, None)
-        if view is None or view.shape != frame.shape:
-            what = "there is none" if view is None else f"it is {view.shape[1]}x{view.shape[0]}"
-            raise DataError(f"frame {frame.index}: needs a view of its size to see labels from; {what}")
-        yield frame, view

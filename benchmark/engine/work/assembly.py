@@ -32,7 +32,7 @@ from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitC
 from semstab.model.results import Agreement
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample
-from semstab.statistics.looks.sampler import merged
+from semstab.statistics.sampler import merged_observations
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
@@ -181,7 +181,7 @@ def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> CellOb
     """What was sampled of all frames, or of their ground truth; None where nothing was."""
     names = [name for each in stretches for name in each.about.files if name.startswith(f"{PORTIONS}/")]
     chosen = [name for name in names if name.endswith(TRUE_LOOKS) == true]
-    return merged([CellObservations.load(folder / name) for name in chosen]) if chosen else None
+    return merged_observations([CellObservations.load(folder / name) for name in chosen]) if chosen else None
 
 
 def _analysed(planned: PlannedUnit, portions: Sequence[str], folder: Path, sampled: Sampled) -> Analysis | None:

@@ -13,8 +13,8 @@ from semstab.model.statistics import UNDEFINED, DriftStatistics, DriftTests, Est
 from semstab.report.averages import by_backbone
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
-from semstab.statistics.order.drift import FLIP_RATE
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.drift import FLIP_RATE
+from semstab.statistics.intervals import LEAST_FRAMES
 from semstab.statistics.verdict import ADVICE
 
 SCENE = Column("scene", "Scene")

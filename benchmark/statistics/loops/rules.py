@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import compiled, serial
-from semstab.statistics.loops.chunks import CHUNKS
+from semstab.core.compiled import CHUNKS, compiled, serial
 from semstab.statistics.loops.logarithm import EIGHT, add_plogp, exp2_fast
 
 LANES = 64

@@ -85,7 +85,8 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
     NaN where OP < 2, where a frame's pixels in the voxel disagree, or where OP exceeds 256.
     """
-    from semstab.statistics.loops import chunks, one_hot
+    from semstab.core import compiled
+    from semstab.statistics.loops import orders as one_hot
 
     T, longest = table.op, one_hot.LONGEST_TABLE
     known = (T >= 2) & (longest >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
@@ -93,7 +94,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
     one_hot.seen_counts(table.evidence.entries, T, known, count)
     pairs, part = np.nonzero(count), count[count > 0]
     drifts = one_hot.one_hot_drifts(int(T.max(initial=2, where=known)))
-    chunks.in_chunks(one_hot.expected_one_hot, *pairs, _log_factorials(longest + 1), drifts, part)
+    compiled.in_chunks(one_hot.expected_one_hot, *pairs, _log_factorials(longest + 1), drifts, part)
     count[pairs], expected = part, np.full(len(table), np.nan)
     one_hot.add_expected(table.evidence.entries, T, known, count, expected)
     return expected
@@ -170,7 +171,7 @@ class _Orders:
     @property
     def many(self) -> Mask:
         """(n,) whether there are too many orders to go through all of them."""
-        from semstab.statistics.loops.few_looks import ENUMERATED
+        from semstab.statistics.loops.orders import ENUMERATED
 
         above: Mask = self.T > ENUMERATED
         return above
@@ -186,7 +187,9 @@ class _Orders:
 
     def measure(self, known: Mask, draws: int, most: int, enough: int) -> tuple[Float64, Float64, Float64]:
         """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
-        from semstab.statistics.loops import chunks, few_looks, orders
+        from semstab.core import compiled
+        from semstab.statistics.loops import orders
+        from semstab.statistics.loops import orders as few_looks
 
         n = len(self.T)
         found = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
@@ -195,18 +198,21 @@ class _Orders:
         for T, (begin, end) in enumerate(itertools.pairwise(bounds), 2):
             orders_of = few_looks.orders_and_steps(T)
             log, K, entries = shared[2:5]
-            chunks.in_chunks(few_looks.measure_few, rank[begin:end], self.first, T, log, K, entries, *orders_of, *found)
+            compiled.in_chunks(
+                few_looks.measure_few, rank[begin:end], self.first, T, log, K, entries, *orders_of, *found
+            )
         if bounds[-1] < n:
             rank = rank[bounds[-1] :]
-            chunks.in_chunks(orders.measure_voxels, rank, *shared, known, draws, most, enough, *found)
+            compiled.in_chunks(orders.measure_voxels, rank, *shared, known, draws, most, enough, *found)
         return found
 
     def test(self, which: Int64, most: int, enough: int) -> Float64:
         """P-values (r,) of the drifts of the voxels of these numbers."""
-        from semstab.statistics.loops import chunks, orders
+        from semstab.core import compiled
+        from semstab.statistics.loops import orders
 
         p, part = np.zeros(len(which)), self.part(which)
-        chunks.in_chunks(orders.test_drifts, *part._shared(), most, enough, p)
+        compiled.in_chunks(orders.test_drifts, *part._shared(), most, enough, p)
         return p
 
     def _shared(self) -> tuple[Any, ...]:
@@ -246,17 +252,18 @@ def flips(events: Events) -> Flips:
 
 def changes(events: Events) -> tuple[Float64, Float64, Int32]:
     """Of `flips` what does not hang on frames: rate and null (n,), and how many looks (n,) follow the last change."""
-    from semstab.statistics.loops import chunks, log_kernels
+    from semstab.core import compiled
+    from semstab.statistics.loops import rows as log_kernels
 
     (rate, null), since = np.empty((2, len(events.starts))), np.empty(len(events.starts), np.int32)
     log, rows = events.evidence, (events.starts, events.ends)
-    chunks.in_chunks(log_kernels.count_flips, *rows, log.entries, log.K, rate, null, since)
+    compiled.in_chunks(log_kernels.count_flips, *rows, log.entries, log.K, rate, null, since)
     return rate, null, since
 
 
 def flips_of(events: Events, rate: Float64, null: Float64, since: Int32) -> Flips:
     """Those of a log, from its `changes`."""
-    from semstab.statistics.loops import log_kernels
+    from semstab.statistics.loops import rows as log_kernels
 
     frames = np.empty(len(rate))
     log_kernels.count_frames(events.ends, events.frame, since, frames)
@@ -297,3 +304,35 @@ def _spread_out(values: Float64, where: Mask) -> Float64:
     out = np.full(len(where), np.nan)
     out[where] = values
     return out
+
+
+# P-values of many voxels at once.
+
+ROUNDED = 12
+"""Bits to which the p-values of trends are rounded up before they are adjusted."""
+
+
+def rounded_up(p: Float64) -> Float64:
+    """Return p-values (n,) rounded up to ROUNDED bits, so that few different ones are told apart."""
+    part, exponent = np.frexp(p)
+    rounded: Float64 = np.ldexp(np.ceil(np.ldexp(part, ROUNDED)), exponent - ROUNDED)
+    return rounded
+
+
+def benjamini_hochberg(p: Float64) -> Float64:
+    """Adjusted p-values of the same shape: rejecting those <= q keeps the false discovery rate at q (1995, JRSS B 57).
+
+    NaN is not a test. It holds for independent tests and for those that depend positively (Benjamini and Yekutieli
+    2001), as neighbouring voxels do.
+    """
+    adjusted, tested = np.full(p.shape, np.nan), ~np.isnan(p)
+    value, of, count = np.unique(p[tested], return_inverse=True, return_counts=True)
+    adjusted[tested] = _raised(value, count)[of]
+    return adjusted
+
+
+def _raised(value: Float64, count: Int64) -> Float64:
+    """Adjusted p-values of those (v,) that there are, ascending, and how often each is there."""
+    by_rank = value * count.sum() / np.cumsum(count)
+    lowest: Float64 = np.minimum.accumulate(by_rank[::-1])[::-1]
+    return np.minimum(lowest, 1.0)

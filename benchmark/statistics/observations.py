@@ -24,9 +24,62 @@ from semstab.metrics.agreement import shared_observations
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import index_columns
-from semstab.statistics.looks.keys import CELLS, DIGITS, Voxel, alike, cells_of, keys_of
-from semstab.statistics.looks.views import Views
+from semstab.statistics.observation_keys import CELLS, DIGITS, Voxel, alike, cells_of, keys_of
 from semstab.statistics.ranks import ranked
+
+# Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
+
+# Where the frames of a sample of observations were taken.
+
+VIEW = 5
+"""Numbers of a view: frame, centre, time stamp."""
+
+AT_ONCE = 4096
+"""Views that are made text together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Indices (V,) of frames, camera centres (V, 3) in metres, and time stamps (V,) in seconds or NaN."""
+
+    frame: Int64
+    centre: Float64
+    timestamp: Float64
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[float]] | Float64) -> Views:
+        """Of rows (V, 5). Raises ValueError where they are of another shape, or an index is not a finite number."""
+        table = np.asarray(rows, np.float64).reshape(len(rows), VIEW)
+        if not np.isfinite(table[:, 0]).all():
+            raise ValueError("a frame without an index")
+        return cls(table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4].copy())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Views]) -> Views:
+        """One after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+    def rows(self) -> Float64:
+        """(V, 5) what `of` takes."""
+        return np.concatenate([self.frame[:, None], self.centre, self.timestamp[:, None]], axis=1)
+
+    def text(self) -> str:
+        """Its rows as JSON, made some at a time: as Python's numbers all of them would take ten times the memory."""
+        rows = self.rows()
+        return f"[{', '.join(json.dumps(rows[k : k + AT_ONCE].tolist())[1:-1] for k in range(0, len(rows), AT_ONCE))}]"
+
+    def take(self, rows: Int64) -> Views:
+        """Some of them."""
+        return Views(self.frame[rows], self.centre[rows], self.timestamp[rows])
+
+    def rank(self, frame: npt.NDArray[np.integer]) -> Int64:
+        """Which of these, in their order, the frames (m,) of these indices are."""
+        order = np.argsort(self.frame)
+        return np.asarray(order[np.searchsorted(self.frame, frame, sorter=order)], np.int64)
+
 
 LEAST_FRAMES = 2
 """What a cell shows counts where so many frames saw it: its label is to be more than one frame's own."""
@@ -102,7 +155,7 @@ class CellObservations:
 
     def sample(self) -> ObservationSample:
         """Observations of the voxels, and those of labels that do not depend on the view."""
-        from semstab.statistics.looks.observing import settle
+        from semstab.statistics.loops.observations import settle
 
         key, view, label, weight = self._in_order()
         kept, shown = np.empty(len(key), np.bool_), np.empty(len(key), np.uint16)
@@ -138,7 +191,7 @@ class CellObservations:
 
     def _in_order(self) -> Entries:
         """Keys, views, labels and weights by voxel and frame, entries of one as they come."""
-        from semstab.statistics.looks.observing import extent, gather, places
+        from semstab.statistics.loops.observations import extent, gather, places
 
         low, high, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(len(self), np.int64)
         extent(self.key, low, high)
@@ -161,7 +214,7 @@ class CellObservations:
         kept: Mask,
     ) -> Events:
         """The log of the kept ones of entries that are in order."""
-        from semstab.statistics.looks.observing import look
+        from semstab.statistics.loops.observations import look
 
         n = len(self)
         first, of, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)

@@ -106,7 +106,7 @@ def _votes(op: Int32, share: Float64, voxels: Float64) -> tuple[Votes, Int64]:
     return Votes(*np.divmod(pairs, longest), count), of
 
 
-def steady(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:
+def stability_posterior(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:
     """(n,) the probability that a place is stable, given its frames and what all places are like; NaN where OP < 2.
 
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its

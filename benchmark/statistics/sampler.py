@@ -19,9 +19,8 @@ from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.statistics.looks.entries import CellObservations, ObservationSample
-from semstab.statistics.looks.keys import SPAN, Voxel
-from semstab.statistics.looks.views import VIEW, Views
+from semstab.statistics.observation_keys import SPAN, Voxel
+from semstab.statistics.observations import VIEW, CellObservations, ObservationSample, Views
 from semstab.statistics.ranks import numbered
 
 BUDGET = 1 << 19
@@ -56,7 +55,7 @@ class Pixels:
 
         Which they are is said only where it is asked for.
         """
-        from semstab.statistics.looks.loops import grouped
+        from semstab.statistics.loops.observations import grouped
 
         of, pixels = np.empty(len(self.cell) if numbered else 0, np.int64), np.empty(len(self.cell))
         return grouped(self.cell, self.label, self.drawn, of, pixels), of, pixels
@@ -98,7 +97,7 @@ class Sampler:
 
     def _drawn(self, frame: Frame) -> Pixels:
         """The frame's valid pixels in sampled voxels; the label of soft ones is the same for all."""
-        from semstab.statistics.looks.loops import draw
+        from semstab.statistics.loops.observations import draw
 
         (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
         ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
@@ -118,7 +117,7 @@ class Sampler:
 
         A part of the view that came before may have lowered the share.
         """
-        from semstab.statistics.looks.loops import append, keep
+        from semstab.statistics.loops.observations import append, keep
 
         drawn = entries[-1]
         while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
@@ -154,7 +153,7 @@ class Sampler:
 
     def _scores(self, frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, sum of scores, hash) of a frame's scores, of a few cells at a time."""
-        from semstab.statistics.looks.loops import add_rows
+        from semstab.statistics.loops.observations import add_rows
 
         assert frame.scores is not None
         _, of, _ = pixels.grouped(numbered=True)
@@ -179,7 +178,7 @@ def _pieces(of: Int64, most: int) -> list[Int64]:
     return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
 
 
-def merged(stretches: Sequence[CellObservations], budget: int = BUDGET) -> CellObservations:
+def merged_observations(stretches: Sequence[CellObservations], budget: int = BUDGET) -> CellObservations:
     """What one sampler would have of the stretches of a sequence, in order: voxels go by their hash alone."""
     share = min(looks.share for looks in stretches)
     while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:

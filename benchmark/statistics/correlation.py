@@ -34,10 +34,10 @@ KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class ClusterGrid:
     """Some cells as the first ones of an arrangement, and which of them each of these is (n,)."""
 
-    of: Arrangement
+    of: CorrelationModel
     order: Int64
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ class Moments:
         return (once * self.total).sum(axis=0), (once * self.expected).sum(axis=0), (twice * self.square).sum(axis=0)
 
 
-class Arrangement:
+class CorrelationModel:
     """Cells of a grid, at (G, D) whole numbers: cubes of space, or groups of frames in their order.
 
     The first cells alone are an arrangement too, of which the first rows and columns of all matrices hold: so numbers
@@ -188,7 +188,7 @@ class Arrangement:
 # --- Cells of several numbers -----------------------------------------------------------------------------------------
 
 
-def arranged(sets: Sequence[npt.NDArray[np.integer]]) -> list[Cells]:
+def cluster_grids(sets: Sequence[npt.NDArray[np.integer]]) -> list[ClusterGrid]:
     """Sets of cells, each (n, D), none of them twice: those that hold others share an arrangement with them.
 
     What was asked for lately is at hand. The order of an arrangement's cells, and with it how sums round, depends on
@@ -200,7 +200,7 @@ def arranged(sets: Sequence[npt.NDArray[np.integer]]) -> list[Cells]:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _made(keys: tuple[bytes, ...]) -> dict[bytes, Cells]:
+def _made(keys: tuple[bytes, ...]) -> dict[bytes, ClusterGrid]:
     nests = _nests({key: np.frombuffer(key[1:], np.int64).reshape(-1, key[0]) for key in keys})
     return {key: own for nest in nests for key, own in _nested(nest).items()}
 
@@ -228,11 +228,11 @@ def _nests(sets: Mapping[bytes, npt.NDArray[np.integer]]) -> list[_Nest]:
     return nests
 
 
-def _nested(nest: _Nest) -> dict[bytes, Cells]:
+def _nested(nest: _Nest) -> dict[bytes, ClusterGrid]:
     """Sets of cells, each of which holds the next one, as the first cells of an arrangement."""
     place: dict[tuple[int, ...], int] = {}
     for _, cells in reversed(nest):
         for cell in cells:
             place.setdefault(cell, len(place))
-    of = Arrangement(np.array(list(place)))
-    return {key: Cells(of, np.argsort([place[cell] for cell in cells])) for key, cells in nest}
+    of = CorrelationModel(np.array(list(place)))
+    return {key: ClusterGrid(of, np.argsort([place[cell] for cell in cells])) for key, cells in nest}

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -20,12 +21,124 @@ import numpy.typing as npt
 from semstab.core import arrays as arrow
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
-from semstab.core.types import Float64, Int32, Int64
+from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.errors import DataError, one_line
+from semstab.metrics.agreement import voxel_keys
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
-from semstab.statistics.ranks import distinct_rows
-from semstab.statistics.sampling.layout import OF_PLACES, ece_of, iou_of, layout, miou_of, width
-from semstab.statistics.sampling.where import Where
+from semstab.statistics.ranks import distinct_rows, numbered
+
+# What the columns of influence sums are, and what was right in them.
+
+MOST_CLASSES = 64
+"""Sums by class are kept up to so many classes."""
+
+BINS = 15
+"""Of the reliability diagram: voxels whose largest belief lies in (b / BINS, (b + 1) / BINS]."""
+
+PLAIN = (
+    "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
+)  # fmt: skip
+DRIFT = ("sbd_excess", "sbd_known")
+WITH_TRUTH = ("known", "right", "looks", "looks_right", "stable", "stable_wrong")
+BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
+OF_PLACES = (*DRIFT, "judged", "gap")
+"""Sums that belong to no frame: they stand in rows whose frame is -1."""
+
+
+@functools.lru_cache(maxsize=16)
+def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
+    """Which columns of the sums each name stands for; those by class have K columns, `gap` one for each bin."""
+    by_class = K <= MOST_CLASSES
+    widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
+    widths += [(name, K) for name in ("class_apart", "class_own")] if by_class else []
+    widths += [(name, 1) for name in DRIFT]
+    if truth:
+        widths += [(name, 1) for name in WITH_TRUTH]
+        widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
+        widths += [("judged", 1), ("gap", BINS)]
+    ends = np.cumsum([width for _, width in widths])
+    found = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+    return MappingProxyType(found)
+
+
+def width(K: int, *, truth: bool) -> int:
+    """How many columns there are."""
+    return max(int(part.stop) for part in layout(K, truth=truth).values())
+
+
+# --- Numbers of right and wrong ---------------------------------------------------------------------------------------
+
+
+def iou_of(sums: Float64) -> Float64:
+    """Intersection over union (...,) of a class from how often it is right, a count, the true and the predicted."""
+    right, _, true, predicted = np.moveaxis(sums, -1, 0)
+    union = true + predicted - right
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio: Float64 = np.where(union.real > 0, right / union, np.nan)
+    return ratio
+
+
+def miou_of(sums: Float64) -> Float64:
+    """Its mean (...,) over the classes that are true or predicted anywhere; a count twice, then the same three."""
+    right, true, predicted = np.split(sums[..., 2:], 3, axis=-1)
+    union = true + predicted - right
+    there = union.real > 0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean: Float64 = np.where(there, right / np.where(there, union, 1), 0).sum(axis=-1) / there.sum(axis=-1)
+    return mean
+
+
+def ece_of(sums: Float64) -> Float64:
+    """Expected calibration error (...,) from a count twice, and from right less confidence, summed in each bin."""
+    gap = sums[..., 2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error: Float64 = (np.sign(gap.real) * gap).sum(axis=-1) / sums[..., 1]
+    return error
+
+
+# Which cube of space, and which group of frames, each row of some sums is of.
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterIndex:
+    """Of rows (m,), some of which belong to no frame.
+
+    places  (G, 3) the cubes, sorted, of an edge in metres; row (m,) which of them
+    frames  (F,) the groups of `step` frames, sorted; known (r,) the rows that belong to one, column (r,) which of them
+    """
+
+    places: Int64
+    row: Int64
+    frames: Int64
+    known: Int64
+    column: Int64
+    edge: float
+    step: int
+
+    @classmethod
+    def of(
+        cls, cell: npt.NDArray[np.integer], frame: npt.NDArray[np.integer] | None, edge: float, step: int = 0
+    ) -> ClusterIndex:
+        """By cube (m, 3) and group of frames (m,), -1 where that is not known; without frames all are of one."""
+        places, row = distinct_rows(cell)
+        if frame is None:
+            return cls(places, row, np.array([-1]), np.arange(len(row)), np.zeros(len(row), np.int64), edge, 0)
+        known = np.flatnonzero((frame >= 0) | (step == 0))
+        frames, column = numbered(frame[known].astype(np.int64))
+        return cls(places, row, frames, known, column, edge, step)
+
+    def by_place(self, values: Float64) -> Float64:
+        """(G,) the sums of values (m,)."""
+        sums: Float64 = np.bincount(self.row, weights=values, minlength=len(self.places)).astype(np.float64)
+        return sums
+
+    def by_both(self, values: Float64) -> Float64:
+        """(G, F) the sums of values (m,)."""
+        shape = len(self.places), len(self.frames)
+        cell = self.row[self.known] * shape[1] + self.column
+        sums = np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1])
+        return np.asarray(sums.reshape(shape), np.float64)
+
 
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
@@ -51,7 +164,7 @@ def most_groups(K: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class InfluenceSums:
+class ClusterSums:
     """Sums over the observations in voxels with OP >= 2, a row for each cube of space and group of frames.
 
     cell     (m, 3) int32 which cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the same
@@ -75,8 +188,8 @@ class InfluenceSums:
     K: int
     classes: tuple[str, ...] = ()
     truth: bool = False
-    seen: InfluenceSums | None = None
-    limit: InfluenceSums | None = None
+    seen: ClusterSums | None = None
+    limit: ClusterSums | None = None
 
     def __getitem__(self, name: str) -> Float64:
         """Sums (m, 1), or (m, K) by class, of that name."""
@@ -87,9 +200,9 @@ class InfluenceSums:
         return np.concatenate([self[name] for name in names], axis=1)
 
     @functools.cached_property
-    def where(self) -> Where:
+    def where(self) -> ClusterIndex:
         """Which cube and which group of frames each row is of."""
-        return Where.of(self.cell, self.frame, self.edge, self.step)
+        return ClusterIndex.of(self.cell, self.frame, self.edge, self.step)
 
     @property
     def frames(self) -> int:
@@ -101,7 +214,7 @@ class InfluenceSums:
         """How many cubes hold a voxel that was seen twice."""
         return len(self.where.places)
 
-    def coarsened(self, edge: float, step: int) -> InfluenceSums:
+    def coarsened(self, edge: float, step: int) -> ClusterSums:
         """With larger cubes, or groups of frames; step 0 forgets the frames."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
@@ -121,12 +234,12 @@ class InfluenceSums:
             limit=None if self.limit is None else self.limit.coarsened(edge, step),
         )
 
-    def without_truth(self) -> InfluenceSums:
+    def without_truth(self) -> ClusterSums:
         """Without what is right and wrong."""
         columns = self.columns[:, : width(self.K, truth=False)]
         return dataclasses.replace(self, columns=columns, truth=False)
 
-    def bounded(self) -> InfluenceSums:
+    def bounded(self) -> ClusterSums:
         """With at most MOST_CELLS cubes and `most_groups`."""
         edge, step = self.edge, self.step
         while len(np.unique(_joined(self.cell, edge / self.edge), axis=0)) > MOST_CELLS:
@@ -160,7 +273,7 @@ class InfluenceSums:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
 
     @classmethod
-    def load(cls, path: str | Path) -> InfluenceSums:
+    def load(cls, path: str | Path) -> ClusterSums:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -171,14 +284,14 @@ class InfluenceSums:
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
                 raise DataError("of another kind or version")
-            about = dataclasses.asdict(from_json(About, about, path))
+            about = dataclasses.asdict(from_json(SumsMeta, about, path))
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
             columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
             if np.any(np.abs(columns) > LARGEST_SUM):
                 raise DataError("a sum is larger than a map can have it")
-            found: list[InfluenceSums | None] = []
+            found: list[ClusterSums | None] = []
             for number in range(3):
                 own = part == number
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
@@ -200,7 +313,7 @@ KEYS = ("part", "ix", "iy", "iz", "frame")
 
 
 @dataclass(frozen=True)
-class About:
+class SumsMeta:
     """What the file says of its sums; see `InfluenceSums`."""
 
     edge: float
@@ -232,11 +345,11 @@ def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
     return values
 
 
-def _same_rows(one: InfluenceSums, other: InfluenceSums) -> bool:
+def _same_rows(one: ClusterSums, other: ClusterSums) -> bool:
     return np.array_equal(one.cell, other.cell) and np.array_equal(one.frame, other.frame)
 
 
-def merged(*parts: InfluenceSums) -> InfluenceSums:
+def merged_sums(*parts: ClusterSums) -> ClusterSums:
     """The sums of a map from those of its parts. Raises DataError where they differ in classes or voxel size."""
     parts = aligned(*parts)
     together = dataclasses.replace(
@@ -250,7 +363,7 @@ def merged(*parts: InfluenceSums) -> InfluenceSums:
     return _known(together.coarsened(together.edge, together.step).bounded())
 
 
-def _known(sums: InfluenceSums) -> InfluenceSums:
+def _known(sums: ClusterSums) -> ClusterSums:
     """Where one part does not tell what frames have to do with a class, all of them do not."""
     by_class = [own for name, own in layout(sums.K, truth=sums.truth).items() if name in ("class_own", "class_apart")]
     if not any(np.isnan(sums.columns[:, own]).any() for own in by_class):
@@ -261,12 +374,12 @@ def _known(sums: InfluenceSums) -> InfluenceSums:
     return dataclasses.replace(sums, columns=columns)
 
 
-def _merged(parts: Sequence[InfluenceSums | None]) -> InfluenceSums | None:
+def _merged(parts: Sequence[ClusterSums | None]) -> ClusterSums | None:
     there = [part for part in parts if part is not None]
-    return merged(*there) if len(there) == len(parts) else None
+    return merged_sums(*there) if len(there) == len(parts) else None
 
 
-def aligned(*parts: InfluenceSums) -> tuple[InfluenceSums, ...]:
+def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     """The sums at the finest cubes and groups of frames that all of them have.
 
     Raises DataError where they differ in what their columns are.
@@ -319,7 +432,7 @@ def class_between_of(sums: Float64) -> Float64:
     return class_of(np.stack([apart - 2 * (total - squares), n, squares, total], axis=-1))
 
 
-def reached_of(of: Statistic) -> Statistic:
+def ceiling_share_of(of: Statistic) -> Statistic:
     """The share of its ceiling that a number reaches; NaN where that is no better than chance."""
 
     def ratio(sums: Float64) -> Float64:
@@ -339,7 +452,7 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, pairs=True),
     "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
     "alpha_between": Functional(ALPHA_SUMS, between_of, -1.0, 1.0, "agreement", pairs=True),
-    "reached": Functional(ALPHA_SUMS, reached_of(between_of), -math.inf, math.inf, "plain", sampled=True),
+    "reached": Functional(ALPHA_SUMS, ceiling_share_of(between_of), -math.inf, math.inf, "plain", sampled=True),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
@@ -357,7 +470,7 @@ calibration error at OP >= 2."""
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
     "alpha_between": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement"),
-    "reached": Functional(CLASS_SUMS, reached_of(class_between_of), -math.inf, math.inf, "plain", sampled=True),
+    "reached": Functional(CLASS_SUMS, ceiling_share_of(class_between_of), -math.inf, math.inf, "plain", sampled=True),
     "accuracy": Functional(("class_right", "class_known"), ratio_of),
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
     "iou": Functional(("class_right", "known", "class_known", "class_predicted"), iou_of),
@@ -366,7 +479,7 @@ BY_CLASS: Mapping[str, Functional] = {
 (precision), and intersection over union."""
 
 
-def of_places_alone(key: str, k: int | None = None) -> bool:
+def of_space_alone(key: str, k: int | None = None) -> bool:
     """Whether a number says nothing of frames, so that its intervals are for this map."""
     return set(functional(key, k).names) <= set(OF_PLACES)
 
@@ -376,7 +489,7 @@ def functional(key: str, k: int | None = None) -> Functional:
     return FUNCTIONALS[key] if k is None else BY_CLASS[key]
 
 
-def parts_of(sums: InfluenceSums, number: Functional) -> tuple[InfluenceSums, ...]:
+def parts_of(sums: ClusterSums, number: Functional) -> tuple[ClusterSums, ...]:
     """The sums that a number is of: the map's, or those of the sample and its limit; none where they are not there."""
     parts = (sums.seen, sums.limit) if number.sampled else (sums,)
     there = tuple(part for part in parts if part is not None)
@@ -384,7 +497,7 @@ def parts_of(sums: InfluenceSums, number: Functional) -> tuple[InfluenceSums, ..
     return there if known and len(there) == len(parts) else ()
 
 
-def columns_of(sums: InfluenceSums, key: str, k: int | None = None) -> Float64:
+def sums_for(sums: ClusterSums, key: str, k: int | None = None) -> Float64:
     """The sums (m, C) that a number is of; (0, 0) where they are not there."""
     number = functional(key, k)
     own = [part[name] for part in parts_of(sums, number) for name in number.names]
@@ -395,7 +508,37 @@ def columns_of(sums: InfluenceSums, key: str, k: int | None = None) -> Float64:
     return np.concatenate(own, axis=1)
 
 
-def value(sums: InfluenceSums, key: str, k: int | None = None) -> float:
+def value(sums: ClusterSums, key: str, k: int | None = None) -> float:
     """The number; NaN where undefined."""
-    columns = columns_of(sums, key, k)
+    columns = sums_for(sums, key, k)
     return float(functional(key, k).of(columns.sum(axis=0))) if columns.size else math.nan
+
+
+# Cubes of space: how large they are, which of them hold voxels, and which one each voxel is in.
+
+FEW_RUNS = 1 << 12
+"""Voxels that follow each other in a map are mostly in one cube: there is room for so many runs at first."""
+
+
+def cubes_of(
+    index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, some: Mask | None = None
+) -> tuple[Int32, Int32, float]:
+    """The cubes (G, 3) that hold voxels of index columns (n,), which of them each is in (n,), and their edge.
+
+    A cube is floor(voxel centre / edge). Only `some` (n,) of the voxels count, the others are in -1. The edge, unless
+    it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.
+    """
+    from semstab.statistics.loops import rows as loops
+
+    some = np.ones(len(index[0]), np.bool_) if some is None else some
+    if edge is None:
+        smallest = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
+        edge = float(smallest * 2.0 ** loops.occupied(*index, some, voxel_size / smallest, MOST_CELLS))
+    cells, of, scale = np.empty((FEW_RUNS, 3), np.int64), np.empty(len(some), np.int32), voxel_size / edge
+    if (count := loops.runs(*index, some, scale, cells, of)) > len(cells):
+        cells = np.empty((count, 3), np.int64)
+        loops.runs(*index, some, scale, cells, of)
+    (key,) = voxel_keys(cells[:count])
+    _, first, number = np.unique(key, return_index=True, return_inverse=True)
+    loops.renumber(of, number)
+    return cells[first].astype(np.int32), of, edge

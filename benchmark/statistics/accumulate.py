@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,16 +16,178 @@ from semstab.model.events import Events
 from semstab.model.information import by_group
 from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
+from semstab.model.statistics import Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import one_hot_where, psa
+from semstab.statistics.agreement import one_hot_where, psa, ratio_of
+from semstab.statistics.cluster_sums import (
+    BINS,
+    MOST_CELLS,
+    MOST_CLASSES,
+    OF_PLACES,
+    ClusterIndex,
+    ClusterSums,
+    Scale,
+    Statistic,
+    cubes_of,
+    layout,
+    most_groups,
+    width,
+)
+from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
 from semstab.statistics.ranks import SPARSE, distinct, ranked
-from semstab.statistics.sampling.influence import InfluenceSums, most_groups
-from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
-from semstab.statistics.sampling.places import Places
-from semstab.statistics.steady import steady
+from semstab.statistics.stability import stability_posterior
+
+# Cubes of space over any set of voxels, and intervals for this map of any statistic of their sums.
 
 
-def influence_sums(
+@dataclass(frozen=True, eq=False)
+class Cubes:
+    """The cubes of voxels, and sums over those in each.
+
+    cell  (G, 3) int32 the cubes, sorted
+    at    (n,) int32 which of them each voxel is in, -1 for those that are left out
+    edge  metres, a power of 2
+    voxels  (n,) how many voxels each stands for, None for one each
+    """
+
+    cell: Int32
+    at: Int32
+    edge: float
+    voxels: Float64 | None = None
+
+    @classmethod
+    def of(cls, table: VoxelTable, edge: float | None = None, *, where: Mask | None = None) -> Cubes:
+        """Of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
+
+        There are at most MOST_CELLS cubes, unless their edge is given, in metres.
+        """
+        some = table.op >= 2 if where is None else where
+        return cls(*cubes_of((table.ix, table.iy, table.iz), table.voxel_size, edge, some), table.copies)
+
+    @classmethod
+    def of_log(cls, events: Events, edge: float) -> Cubes:
+        """The same of the voxels of a log."""
+        again = np.diff(events.bounds) >= 2
+        return cls(*cubes_of((events.ix, events.iy, events.iz), events.voxel_size, edge, again))
+
+    def rows(self, rows: Any) -> Cubes:
+        """The same cubes, for some of the voxels."""
+        return replace(self, at=self.at[rows], voxels=None if self.voxels is None else self.voxels[rows])
+
+    @property
+    def count(self) -> int:
+        """How many cubes there are."""
+        return len(self.cell)
+
+    def sums(self, columns: Float64) -> Float64:
+        """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
+        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count, self.voxels)[0]
+
+    def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
+        """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
+        both = by_group(self.at, [*values.values()], self.count, self.voxels)
+        return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
+
+    def sums_by_class(self, table: VoxelTable) -> tuple[Float64, Float64]:
+        """(G, K) over the voxels of each cube, which are a table's, of their evidence, and of that / OP."""
+        from semstab.statistics.loops.rows import add_classes
+
+        by_look, by_place = (np.zeros((self.count, table.K)) for _ in range(2))
+        add_classes(self.at, table.evidence.entries, table.op, table.voxels, by_look, by_place)
+        return by_look, by_place
+
+    def estimate(
+        self,
+        columns: Float64,
+        statistic: Statistic,
+        bounds: tuple[float, float] = (0.0, 1.0),
+        scale: Scale | None = None,
+    ) -> Interval:
+        """The statistic of the sums of the voxels' columns (n, C), the second of which counts, with its interval.
+
+        Where no scale is given, what goes from 0 to 1 is a share.
+        """
+        return CubeSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A statistic of sums (..., C) by name, the second of which counts: a mean, or any other.
+
+    Where no scale is given, what goes from 0 to 1 is a share.
+    """
+
+    sums: str
+    of: Statistic = ratio_of
+    bounds: tuple[float, float] = (0.0, 1.0)
+    scale: Scale | None = None
+
+    @property
+    def kind(self) -> Scale:
+        """The scale of its interval."""
+        return self.scale or ("share" if self.bounds == (0.0, 1.0) else "plain")
+
+
+@dataclass(frozen=True, eq=False)
+class CubeSums:
+    """Sums by name over the voxels of cubes; those of a map in parts follow from the parts'.
+
+    cell  (G, 3) int32 the cubes, of an edge in metres, a power of 2
+    sums  (G, C) of each name
+    """
+
+    cell: Int32
+    edge: float
+    sums: Mapping[str, Float64]
+
+    def __getitem__(self, name: str) -> Float64:
+        """Sums (C,) over all cubes."""
+        total: Float64 = self.sums[name].sum(axis=0)
+        return total
+
+    def __or__(self, further: Mapping[str, Float64]) -> CubeSums:
+        return CubeSums(self.cell, self.edge, {**self.sums, **further})
+
+    def estimate(
+        self,
+        name: str,
+        statistic: Statistic,
+        bounds: tuple[float, float] = (0.0, 1.0),
+        scale: Scale | None = None,
+    ) -> Interval:
+        """The statistic of sums (..., C), the second of which counts, with its interval; see `Mean`."""
+        return self.estimates({name: Mean(name, statistic, bounds, scale)})[name]
+
+    def estimates(self, means: Mapping[str, Mean]) -> dict[str, Interval]:
+        """Several of them, together."""
+        return dict(zip(means, confidence_intervals(self.asked(means)), strict=True))
+
+    def asked(self, means: Mapping[str, Mean]) -> Iterator[EstimateSpec]:
+        """For `answers`."""
+        return (self._asked(own) for own in means.values())
+
+    def _asked(self, mean: Mean) -> EstimateSpec:
+        return spec_of_cubes(self._where, self.sums[mean.sums], mean.of, mean.kind, mean.bounds)
+
+    @functools.cached_property
+    def _where(self) -> ClusterIndex:
+        return ClusterIndex.of(self.cell, None, self.edge)
+
+    @classmethod
+    def merged(cls, parts: Sequence[CubeSums]) -> CubeSums:
+        """The sums of a map from those of its parts, by the cubes of the whole map."""
+        edge = max(part.edge for part in parts)
+        cells = np.concatenate([part.cell // round(edge / part.edge) for part in parts])
+        while len(np.unique(cells, axis=0)) > MOST_CELLS:
+            cells, edge = cells // 2, 2 * edge
+        distinct, of = np.unique(cells, axis=0, return_inverse=True)
+        sums = {name: np.zeros((len(distinct), own.shape[1])) for name, own in parts[0].sums.items()}
+        for name, total in sums.items():
+            np.add.at(total, of.ravel(), np.concatenate([part.sums[name] for part in parts]))
+        return cls(distinct.astype(np.int32), edge, sums)
+
+
+def cluster_sums_of(
     table: VoxelTable,
     events: Events | None = None,
     true_label: Int64 | None = None,
@@ -31,9 +195,9 @@ def influence_sums(
     sample: tuple[Events, Events] | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
-    places: Places | None = None,
+    places: Cubes | None = None,
     stable: Float64 | None = None,
-) -> InfluenceSums:
+) -> ClusterSums:
     """The sums of a map.
 
     events      its log; without it, but with a sample, what frames have to do with it is known of the sampled voxels
@@ -46,26 +210,26 @@ def influence_sums(
                 leaves at most MOST_CELLS
     places, stable  the cubes, and (n,) the probability of `steady`, where they are known already
     """
-    places = Places.of(table, edge) if places is None else places
-    likely = None if true_label is None else np.nan_to_num(steady(table) if stable is None else stable)
+    places = Cubes.of(table, edge) if places is None else places
+    likely = None if true_label is None else np.nan_to_num(stability_posterior(table) if stable is None else stable)
     about = (places, true_label, likely)
-    whole = of_table(table, *about) if events is None else of_log(events, *about)
-    whole = with_places(whole, table, places, true_label, sbd_excess)
+    whole = sums_of_table(table, *about) if events is None else sums_of_log(events, *about)
+    whole = with_frameless_sums(whole, table, places, true_label, sbd_excess)
     return whole if sample is None else with_sample(whole, sample, logged=events is not None)
 
 
-def with_sample(whole: InfluenceSums, sample: tuple[Events, Events], *, logged: bool = False) -> InfluenceSums:
+def with_sample(whole: ClusterSums, sample: tuple[Events, Events], *, logged: bool = False) -> ClusterSums:
     """The sums of a map with those of a sample of its voxels, see `influence_sums`; logged: its frames are known."""
     seen, limit = (
-        dataclasses.replace(of_log(log, Places.of_log(log, whole.edge)), classes=whole.classes) for log in sample
+        dataclasses.replace(sums_of_log(log, Cubes.of_log(log, whole.edge)), classes=whole.classes) for log in sample
     )
     whole = whole if logged else _with_frames(whole, seen)
     return dataclasses.replace(whole, seen=seen, limit=limit)
 
 
-def of_table(
-    table: VoxelTable, places: Places, true_label: Int64 | None = None, likely: Float64 | None = None
-) -> InfluenceSums:
+def sums_of_table(
+    table: VoxelTable, places: Cubes, true_label: Int64 | None = None, likely: Float64 | None = None
+) -> ClusterSums:
     """The sums of a table, whose places with OP >= 2 these are: each place counts as a whole, frames are not known.
 
     likely (n,) is how likely places are stable, where true classes (n,) are known; None leaves that open.
@@ -73,23 +237,23 @@ def of_table(
     columns = _sums_of_table(table, places, true_label, np.zeros(len(table)) if likely is None else likely)
     unknown = np.full(places.count, -1, dtype=np.int32)
     truth = true_label is not None
-    return InfluenceSums(places.cell, unknown, columns, places.edge, 0, table.voxel_size, table.K, table.classes, truth)
+    return ClusterSums(places.cell, unknown, columns, places.edge, 0, table.voxel_size, table.K, table.classes, truth)
 
 
-def of_log(
+def sums_of_log(
     events: Events,
-    places: Places,
+    places: Cubes,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
     *,
     groups: FrameGroups | None = None,
-) -> InfluenceSums:
+) -> ClusterSums:
     """The same by the frames of a log, whose groups are found if they are not given."""
     K = events.K
     groups = FrameGroups.of_log(events) if groups is None else groups
     sums = _sums_of_log(events, places, groups, true_label, likely)
     cell, frame = np.nonzero(sums[:, :, layout(K, truth=False)["observations"].start])
-    return InfluenceSums(
+    return ClusterSums(
         places.cell[cell],
         groups.groups[frame].astype(np.int32),
         sums[cell, frame],
@@ -102,7 +266,7 @@ def of_log(
     )
 
 
-def _with_frames(whole: InfluenceSums, seen: InfluenceSums) -> InfluenceSums:
+def _with_frames(whole: ClusterSums, seen: ClusterSums) -> ClusterSums:
     """The sums of a whole map, with the share that each frame has in a cube as in a sample of its voxels.
 
     What the sample does not account for stands in rows of its own, whose frame is -1.
@@ -126,13 +290,13 @@ def _with_frames(whole: InfluenceSums, seen: InfluenceSums) -> InfluenceSums:
     )
 
 
-def with_places(
-    sums: InfluenceSums,
+def with_frameless_sums(
+    sums: ClusterSums,
     table: VoxelTable,
-    places: Places,
+    places: Cubes,
     true_label: Int64 | None = None,
     sbd_excess: Float64 | None = None,
-) -> InfluenceSums:
+) -> ClusterSums:
     """With rows for the sums that belong to no frame: SBD less that in random order, and how far beliefs are right."""
     at, of = places.cell, places.at
     columns, own = np.zeros((len(at), sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
@@ -186,14 +350,14 @@ class FrameGroups:
 
 def _sums_of_log(
     events: Events,
-    places: Places,
+    places: Cubes,
     groups: FrameGroups,
     true_label: Int64 | None,
     likely: Float64 | None,
 ) -> Float64:
     """(cells, groups, C) by the compiled pass."""
-    from semstab.statistics.loops.chunks import in_chunks
-    from semstab.statistics.sampling import loops
+    from semstab.core.compiled import in_chunks
+    from semstab.statistics.loops import clusters
 
     K, cells, again = events.K, places.count, np.flatnonzero(places.at >= 0)
     count = len(groups.groups)
@@ -203,7 +367,7 @@ def _sums_of_log(
     bounds = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=cells))])
     options = (K <= MOST_CLASSES, true_label is not None)
     in_chunks(
-        loops.add_influences,
+        clusters.add_influences,
         order,
         bounds,
         np.zeros(0) if places.voxels is None else places.voxels,
@@ -221,7 +385,7 @@ def _sums_of_log(
     return sums
 
 
-def _sums_of_table(table: VoxelTable, places: Places, true_label: Int64 | None, likely: Float64) -> Float64:
+def _sums_of_table(table: VoxelTable, places: Cubes, true_label: Int64 | None, likely: Float64) -> Float64:
     """(cells, C) from the rows of the voxels that are in one of (n,); by class NaN for evidence that is not one-hot."""
     from semstab.statistics.loops.rows import add_apart
 
@@ -254,7 +418,7 @@ def _unknown(shares: Float64) -> dict[str, Float64]:
 
 
 def _with_truth(
-    table: VoxelTable, places: Places, label: Int64, likely: Float64
+    table: VoxelTable, places: Cubes, label: Int64, likely: Float64
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Float64]]:
     """What of `_sums_of_table` needs the true classes (n,): of each voxel (n,), and sums by class (cells, K)."""
     from semstab.statistics.loops.rows import weight_of

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
-from semstab.statistics.loops.chunks import CHUNKS
+from semstab.core.compiled import CHUNKS, serial
 
 (VOXELS, PSA, OBSERVATIONS, AGREEING, OWN, TWICE, TWICE_AGREEING, RECURRENT, VSS, ENTROPY) = range(10)
 """The columns that every map has, before those by class."""

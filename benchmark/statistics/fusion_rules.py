@@ -95,7 +95,7 @@ def fuse_all(
     evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
     rows      (n,) which voxels of the log these are, where they are not all
     """
-    from semstab.statistics.loops import chunks
+    from semstab.core import compiled
     from semstab.statistics.loops import rules as loops
 
     K, log = events.evidence.K, events.evidence.entries
@@ -106,7 +106,7 @@ def fuse_all(
     most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
     seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
     rank = ranked(op * (most + 1) + count)
-    chunks.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, *sums)
+    compiled.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, *sums)
     return [
         Fused(Belief.with_bits(first, label, own, K, rest, bits), op.astype(np.int32), drift_sum)
         for own, rest, drift_sum, bits in zip(belief, *sums, strict=True)
@@ -115,15 +115,15 @@ def fuse_all(
 
 def classes_seen(events: Events) -> tuple[Int64, UInt16]:
     """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
-    from semstab.statistics.loops import chunks
+    from semstab.core import compiled
     from semstab.statistics.loops import rules as loops
 
     bounds, log = (events.starts, events.ends), events.evidence.entries
     count = np.zeros(len(events.starts) + 1, np.int64)
-    chunks.in_chunks(loops.count_classes, *bounds, log, events.evidence.K, count)
+    compiled.in_chunks(loops.count_classes, *bounds, log, events.evidence.K, count)
     first: Int64 = np.cumsum(count)
     label = np.zeros(first[-1], np.uint16)
-    chunks.in_chunks(loops.list_classes, *bounds, log, events.evidence.K, first, label)
+    compiled.in_chunks(loops.list_classes, *bounds, log, events.evidence.K, first, label)
     return first, label
 
 

@@ -18,11 +18,10 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import between_of
-from semstab.statistics.looks.entries import ObservationSample
+from semstab.statistics.cluster_sums import MOST_GROUPS, cubes_of
+from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_observations
+from semstab.statistics.observations import ObservationSample
 from semstab.statistics.ranks import numbered
-from semstab.statistics.sampling.cubes import cubes
-from semstab.statistics.sampling.influence import MOST_GROUPS
-from semstab.statistics.sampling.intervals import Asked, answers, asked_of_looks
 
 STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
@@ -48,7 +47,7 @@ class _Looks:
 
     def products(self, first: Int64, lag: int) -> Float64:
         """s . s' of each of these and the look that is `lag` later."""
-        from semstab.statistics.looks.pairing import products
+        from semstab.statistics.loops.observations import products
 
         found = np.empty(len(first))
         products(*self.entries, first, lag, found)
@@ -88,9 +87,9 @@ class _Cells:
     @classmethod
     def over(cls, seen: Events) -> _Cells:
         index = seen.ix, seen.iy, seen.iz
-        at, cube_of, edge = cubes(index, seen.voxel_size)
+        at, cube_of, edge = cubes_of(index, seen.voxel_size)
         while len(at) > MOST_CUBES:
-            at, cube_of, edge = cubes(index, seen.voxel_size, 2 * edge)
+            at, cube_of, edge = cubes_of(index, seen.voxel_size, 2 * edge)
         step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(at), 1) * (3 + seen.K))))
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2
@@ -124,7 +123,7 @@ def correlogram(sample: ObservationSample) -> Correlogram:
     for pairs in _pairs(sample, seen, looks, still):
         sums.add(pairs, looks, still)
     there = list(sums.found())
-    alphas = answers(asked for _, _, asked in there)
+    alphas = confidence_intervals(asked for _, _, asked in there)
     found: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for (axis, own, _), alpha in zip(there, alphas, strict=True):
         found[axis] += (dataclasses.replace(own, alpha=alpha),)
@@ -141,7 +140,7 @@ def _of_seen_classes(*logs: Events) -> Iterator[Events]:
 
 def _pairs(sample: ObservationSample, seen: Events, looks: _Looks, still: _Looks) -> Iterator[_Pairs]:
     """The pairs of looks that are 1, 2, 4, ... looks apart, one lag after the other."""
-    from semstab.statistics.looks.pairing import distances
+    from semstab.statistics.loops.observations import distances
 
     rank = sample.views.rank(seen.frame)
     centre = sample.views.centre
@@ -173,7 +172,7 @@ class _Sums:
 
     def add(self, pairs: _Pairs, looks: _Looks, still: _Looks) -> None:
         """Pairs (m,)."""
-        from semstab.statistics.looks.pairing import add_pairs
+        from semstab.statistics.loops.observations import add_pairs
 
         apart = np.stack([*pairs.apart, pairs.apart[1]], axis=1)  # the standard baseline is one of angles
         bins, before = np.empty(apart.shape, np.int64), 0
@@ -186,7 +185,7 @@ class _Sums:
             (*still.entries, still.squares, pairs.limit), self._looks, self._limit, self._pairs, self._apart,
         )  # fmt: skip
 
-    def found(self) -> Iterator[tuple[str, LagBin, Asked]]:
+    def found(self) -> Iterator[tuple[str, LagBin, EstimateSpec]]:
         """The bins in which there is enough, each with its axis, and what is asked of it."""
         for k in np.flatnonzero(self._pairs[:-1] >= LEAST_PAIRS):
             cells, there = self._cells, np.flatnonzero(self._looks[k, :, 1])
@@ -198,4 +197,4 @@ class _Sums:
             axis, low, high = self._bins[k]
             ceiling = float(between_of(self._limit[k]))
             own = LagBin(low, high, float(self._apart[k] / pairs), int(pairs), UNKNOWN, ceiling)
-            yield axis, own, asked_of_looks(*where, looks, whole, between_of)
+            yield axis, own, spec_of_observations(*where, looks, whole, between_of)

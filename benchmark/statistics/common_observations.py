@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from semstab.core.types import Float64, Int64
 from semstab.errors import DataError
+from semstab.model.contrast import CommonLooks, Ignored
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.statistics.looks.entries import CellObservations
-from semstab.statistics.looks.views import Views
+from semstab.model.measures import Quantity, mean
+from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, alpha_between, psa
+from semstab.statistics.observations import CellObservations, Views
 
 
 @dataclass(frozen=True, eq=False)
-class Common:
+class CommonObservations:
     """Maps of one scene, observed alike.
 
     logs      of each map: the looks at cells that all made, each with as many pixels as the map with fewest has there
@@ -31,7 +34,7 @@ class Common:
     missing: tuple[float, ...]
 
 
-def common(maps: Sequence[CellObservations]) -> Common:
+def common_observations(maps: Sequence[CellObservations]) -> CommonObservations:
     """What samples of the same frames have in common. Raises DataError where they differ in K or voxel size."""
     if len({(looks.K, looks.voxel_size) for looks in maps}) > 1:
         raise DataError("samples of other classes or voxel sizes cannot be compared; fuse both alike")
@@ -47,7 +50,7 @@ def common(maps: Sequence[CellObservations]) -> Common:
         ignoring.append(_filled(looks, places, most - seen).observations())
     total = most.sum()
     missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
-    return Common(tuple(logs), tuple(ignoring), missing)
+    return CommonObservations(tuple(logs), tuple(ignoring), missing)
 
 
 def _of_the_same_voxels(maps: Sequence[CellObservations]) -> list[CellObservations]:
@@ -109,3 +112,53 @@ def psa_bounds(log: Events) -> tuple[float, float]:
     low = pairs(said)
     high = low + 1 - pairs(known[:, None])
     return float(low.mean()), float(high.mean())
+
+
+# What the order of backbones owes to the looks that some of them left out.
+
+
+@dataclass(frozen=True, eq=False)
+class SharedObservations:
+    """The logs of backbones on common looks, the same before any was reduced, what is compared first, what is said."""
+
+    logs: Mapping[str, Events]
+    whole: Mapping[str, Events]
+    primary: Quantity
+    found: CommonLooks
+
+
+def compared_observations(looks: Mapping[str, CellObservations]) -> SharedObservations:
+    """The looks that all backbones made; where labels are compared with scores, each as its largest class.
+
+    Two frames that both give a class 0.6 agree by 0.52 in expectation, and entirely by alpha between frames; labels
+    know no such looks. So that neither gains, both are compared by what they decide.
+    """
+    names = list(looks)
+    both = common_observations([looks[name] for name in names])
+    mixed = len({own.soft for own in looks.values()}) > 1
+    reduce = decided if mixed else (lambda log: log)
+    logs = dict(zip(names, map(reduce, both.logs), strict=True))
+    ignoring = dict(zip(names, map(reduce, both.ignoring), strict=True))
+    value = {name: alpha_between(log.table()) for name, log in logs.items()}
+    ignored = tuple(
+        Ignored(name, missing, *psa_bounds(ignoring[name]), alpha_between(ignoring[name].table()))
+        for name, missing in zip(names, both.missing, strict=True)
+    )
+    order = tuple(sorted(names, key=lambda name: -value[name]))
+    first = next(iter(logs.values()))
+    bounds = {row.backbone: (row.psa_low, row.psa_high) for row in ignored}
+    by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))
+    return SharedObservations(
+        logs,
+        dict(zip(names, both.logs, strict=True)),
+        ALPHA if mixed else ALPHA_BETWEEN,
+        CommonLooks(
+            voxels=len(first.ix),
+            observations=len(first),
+            decided=mixed,
+            ignored=ignored,
+            order=order,
+            order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
+            bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
+        ),
+    )
