@@ -47,13 +47,11 @@ class Cubes:
     cell  (G, 3) int32 the cubes, sorted
     at    (n,) int32 which of them each voxel is in, -1 for those that are left out
     edge  metres, a power of 2
-    voxels  (n,) how many voxels each stands for, None for one each
     """
 
     cell: Int32
     at: Int32
     edge: float
-    voxels: Float64 | None = None
 
     @classmethod
     def of(cls, table: VoxelTable, edge: float | None = None, *, where: Mask | None = None) -> Cubes:
@@ -62,7 +60,7 @@ class Cubes:
         There are at most MOST_CELLS cubes, unless their edge is given, in metres.
         """
         some = table.op >= 2 if where is None else where
-        return cls(*cubes_of((table.ix, table.iy, table.iz), table.voxel_size, edge, some), table.copies)
+        return cls(*cubes_of((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
 
     @classmethod
     def of_log(cls, events: Events, edge: float) -> Cubes:
@@ -72,7 +70,7 @@ class Cubes:
 
     def rows(self, rows: Any) -> Cubes:
         """The same cubes, for some of the voxels."""
-        return replace(self, at=self.at[rows], voxels=None if self.voxels is None else self.voxels[rows])
+        return replace(self, at=self.at[rows])
 
     @property
     def count(self) -> int:
@@ -81,11 +79,11 @@ class Cubes:
 
     def sums(self, columns: Float64) -> Float64:
         """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
-        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count, self.voxels)[0]
+        return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
         """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
-        both = by_group(self.at, [*values.values()], self.count, self.voxels)
+        both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
     def sums_by_class(self, table: VoxelTable) -> tuple[Float64, Float64]:
@@ -93,7 +91,7 @@ class Cubes:
         from semstab.statistics.loops.rows import add_classes
 
         by_look, by_place = (np.zeros((self.count, table.K)) for _ in range(2))
-        add_classes(self.at, table.evidence.entries, table.op, table.voxels, by_look, by_place)
+        add_classes(self.at, table.evidence.entries, table.op, by_look, by_place)
         return by_look, by_place
 
     def estimate(
@@ -301,13 +299,13 @@ def with_frameless_sums(
     at, of = places.cell, places.at
     columns, own = np.zeros((len(at), sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
     if sbd_excess is not None:
-        for name, values in zip(OF_PLACES[:2], by_group(of, [sbd_excess], len(at), places.voxels), strict=True):
+        for name, values in zip(OF_PLACES[:2], by_group(of, [sbd_excess], len(at)), strict=True):
             columns[:, own[name]] = values
     if true_label is not None:
         confidence, right = vss(table), dominant(table) == true_label
         bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
         judged = np.where((of >= 0) & (true_label >= 0), of * BINS + bins, -1)
-        gap, known = by_group(judged, [right - confidence], len(at) * BINS, places.voxels)
+        gap, known = by_group(judged, [right - confidence], len(at) * BINS)
         columns[:, own["gap"]] = gap.reshape(-1, BINS)
         columns[:, own["judged"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
     some = columns.any(axis=1)
@@ -370,7 +368,6 @@ def _sums_of_log(
         clusters.add_influences,
         order,
         bounds,
-        np.zeros(0) if places.voxels is None else places.voxels,
         (events.starts, events.ends),
         int((events.ends - events.starts).max(initial=0)),
         events.evidence.entries,
@@ -397,7 +394,7 @@ def _sums_of_table(table: VoxelTable, places: Cubes, true_label: Int64 | None, l
         "vss": recurrent * vss(table), "entropy": entropy(table),
     }  # fmt: skip
     shares, apart = np.zeros((cells, K)), np.zeros((cells, K))
-    add_apart(of, table.evidence.entries, table.op, table.voxels, shares, apart)
+    add_apart(of, table.evidence.entries, table.op, shares, apart)
     by_class = {"evidence": shares}
     if K <= MOST_CLASSES:
         one_hot = one_hot_where(table, of >= 0)
@@ -406,7 +403,7 @@ def _sums_of_table(table: VoxelTable, places: Cubes, true_label: Int64 | None, l
         plain, further = _with_truth(table, places, true_label, likely * recurrent)
         values, by_class = values | plain, by_class | further
     sums, own = np.zeros((cells, width(K, truth=true_label is not None))), layout(K, truth=true_label is not None)
-    for name, column in zip(values, by_group(of, [*values.values()], cells, places.voxels)[0].T, strict=True):
+    for name, column in zip(values, by_group(of, [*values.values()], cells)[0].T, strict=True):
         sums[:, own[name].start] = column
     for name, columns in by_class.items():
         sums[:, own[name]] = columns
@@ -434,8 +431,7 @@ def _with_truth(
 
     def by_class(which: Int64, where: Mask) -> Float64:
         group = places.at[where] * table.K + which[where]
-        count = np.zeros(places.count * table.K)
-        np.add.at(count, group, table.voxels[where])
+        count = np.bincount(group, minlength=places.count * table.K).astype(np.float64)
         return count.reshape(places.count, table.K)
 
     if table.K > MOST_CLASSES:

@@ -71,7 +71,6 @@ class Predictions:
     label, predicted  the true and the most likely class
     confidence        belief in the latter
     error             squared distance of the belief from certainty of the true class, for Brier's score
-    voxels            how many each stands for
     K                 number of classes
     """
 
@@ -79,22 +78,17 @@ class Predictions:
     predicted: Int64
     confidence: Float64
     error: Float64
-    voxels: Float64
     K: int
 
     @classmethod
-    def of(cls, evidence: Float64 | Evidence, label: Int64, voxels: Float64 | None = None) -> Predictions:
-        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing.
-
-        Each is of so many voxels (n,), of one where that is not given.
-        """
+    def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
+        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
         from semstab.statistics.loops.rows import square_errors
 
         kept = Evidence.of(evidence)
         found, error, rest = kept.concentration, np.empty(len(kept)), kept.unseen
         square_errors(kept.entries, np.zeros(0) if rest is None else rest, kept.K, label, error)
-        many = np.ones(len(kept)) if voxels is None else voxels
-        return cls(label, found.label.astype(np.int64), found.largest, error, many, kept.K)
+        return cls(label, found.label.astype(np.int64), found.largest, error, kept.K)
 
     @property
     def right(self) -> Mask:
@@ -133,7 +127,7 @@ def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
 
     def of(some: slice) -> Float64:
         sums = np.zeros((groups, 3 + 3 * BINS + 3 * judged.K))
-        own = (judged.label, judged.predicted, judged.confidence, judged.error, judged.voxels)
+        own = (judged.label, judged.predicted, judged.confidence, judged.error)
         add_judged(group[some], *(values[some] for values in own), BINS, sums)
         return sums
 
@@ -165,23 +159,22 @@ def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
 
 def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
-    return rule_means_of(rule_sums(fused, where.astype(np.float64), truth))
+    return rule_means_of(rule_sums(fused, where, truth))
 
 
-def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None = None) -> Float64:
+def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None = None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
 
-    Each of what was fused stands for so many voxels (n,), 0 leaves it out.
+    Over the voxels for which `where` (n,) holds.
     """
     evidence = Evidence.of(fused.evidence).measured()
     fused = Voxels(fused.op, evidence, fused.drift_sum)
-    all_of_it = np.zeros(len(voxels), np.int64)
-    total, defined = by_group(all_of_it, [measure.of(fused) for measure in measures()], 1, voxels)
-    often = [voxels.sum(where=fused.op >= measure.lowest_op) for measure in measures()]
+    total, defined = by_group(where - np.int64(1), [measure.of(fused) for measure in measures()], 1)
+    often = [np.count_nonzero(where & (fused.op >= measure.lowest_op)) for measure in measures()]
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
         return rows
-    return np.concatenate([rows, judged_where(Predictions.of(evidence, truth.label, voxels), truth.known)])
+    return np.concatenate([rows, judged_where(Predictions.of(evidence, truth.label), truth.known & where)])
 
 
 def rule_means_of(sums: Float64) -> RuleMeans:
@@ -206,7 +199,7 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
 
 def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
     """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
-    return judged_strata(Predictions.of(table.evidence, truth.label, table.voxels), table.op, truth.known, edges)
+    return judged_strata(Predictions.of(table.evidence, truth.label), table.op, truth.known, edges)
 
 
 def judged_strata(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:

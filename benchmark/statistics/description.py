@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.model.events import Events
-from semstab.model.evidence import stretches
 from semstab.model.information import by_group
-from semstab.model.measures import SBD, Beliefs, sbd, vss
+from semstab.model.measures import SBD
 from semstab.model.results import TableSummary
 from semstab.model.statistics import (
     BeyondCoin,
@@ -32,23 +29,11 @@ from semstab.model.statistics import (
     Judged,
     MapStatistics,
     Repeated,
-    RuleOutcome,
     StratumStatistics,
 )
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import fusion_rules
-from semstab.statistics.accumulate import Cubes, CubeSums, Mean, cluster_sums_of
-from semstab.statistics.agreement import (
-    alpha_of,
-    between_of,
-    class_agreement_of,
-    class_sums,
-    decompose,
-    disagreement,
-    kappa_of,
-    psa,
-    ratio_of,
-)
+from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
+from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of
 from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, losses
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
@@ -60,37 +45,30 @@ from semstab.statistics.correctness import (
     quadrant_sums,
     quadrants_of,
     reliability_of,
-    rule_means_of,
-    rule_sums,
     strata_of,
     wrong_of_steady,
 )
 from semstab.statistics.correlogram import correlogram
-from semstab.statistics.drift import (
-    TESTABLE,
-    Flips,
-    VoxelDrift,
-    benjamini_hochberg,
-    expected_sbd,
-    flips,
-    rounded_up,
-    trend_columns,
-    voxel_drift,
-)
-from semstab.statistics.flipping import FlippingSums
+from semstab.statistics.drift import expected_sbd, voxel_drift
 from semstab.statistics.intervals import grouped_intervals, headline_specs
 from semstab.statistics.observations import ObservationSample
 from semstab.statistics.sample import MapSample
-from semstab.statistics.scene_drift import OrderTest, order_test
-from semstab.statistics.stability import Votes, stability_posterior
+from semstab.statistics.sections import (
+    MEANS,
+    OF_CHANGES,
+    OF_FLIPS,
+    Columns,
+    FlippingSums,
+    LogSums,
+    log_sums,
+    place_sums,
+    row_columns,
+    rule_outcomes,
+)
+from semstab.statistics.stability import shares_of, stability_posterior
 from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
-
-FALSE_DISCOVERIES = 0.05
-"""Rate at which single voxels are reported as trending, or as drifting unusually."""
-
-Columns = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +163,7 @@ def analyse(
     table, events = sample.table.measured(), sample.events
     truth = None if sample.truth is None else join_truth(table, sample.truth)
     limit = sample.truth if limit is None else limit
-    shares = Votes.of(table).shares()
+    shares = shares_of(table)
     stable = stability_posterior(table, shares)
     drift = None if events is None else voxel_drift(table, events, seed=seed)
     null = expected_sbd(table) if drift is None else drift.null
@@ -202,7 +180,7 @@ def analyse(
         stable=stable,
     )
     flipping = FlippingSums.of(table, stable, places)
-    drawn, log = _of_log(table, sample, places, drift, seed)
+    drawn, log = log_sums(table, sample, places, drift, seed)
     if truth is not None:
         drawn["true_label"] = truth.label
     found, judged, (unsteady,), reached, of_flips = grouped_intervals(
@@ -255,146 +233,7 @@ def analyse(
     return Analysis(summary, whole, influence, sample, shares, drawn)
 
 
-# --- Columns and means ------------------------------------------------------------------------------------------------
-
-
-def row_columns(table: VoxelTable, null: Float64) -> Columns:
-    """Return the columns (n,) that follow from the row of each voxel and its SBD in random order, `null` (n,)."""
-    within, between = disagreement(table)
-    parts = decompose(table)
-    return {
-        "psa": psa(table),
-        "disagreement_within": within,
-        "disagreement_between": between,
-        "sbd_null": null,
-        "sbd_excess": sbd(table) - null,
-        "entropy_within": parts.within,
-        "entropy_between": parts.between,
-    }
-
-
-def _less(sums: Float64) -> Float64:
-    """A ratio less another, (...,) from sums (..., 4)."""
-    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
-
-
-SIGNED = (-1.0, 1.0)
-MEANS: Mapping[str, Mean] = {
-    **{name: Mean(name) for name in ("psa", "vss", "within", "between", "sbd", "null")},
-    **{name: Mean(name) for name in ("entropy", "entropy_within", "entropy_between")},
-    **{name: Mean(name, bounds=SIGNED) for name in ("excess", "steadier")},
-    "coin": Mean("coin", _less, SIGNED),
-    "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
-    "alpha": Mean("alpha", alpha_of, SIGNED, "agreement"),
-    "alpha_between": Mean("alpha", between_of, SIGNED, "agreement"),
-    "each_place": Mean("each_place", between_of, SIGNED, "agreement"),
-}
-"""Over the voxels with OP >= 2, of values where they are defined, and agreement beyond chance."""
-
-OF_FLIPS: Mapping[str, Mean] = {
-    **{name: Mean(name) for name in ("flip_rate", "flip_null")},
-    "flip_excess": Mean("flip_excess", bounds=SIGNED),
-}
-"""Over the same voxels as the first of `MEANS`, so that those are the same to the last bit without a log."""
-
-OF_CHANGES: Mapping[str, Mean] = {
-    "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
-    "trend_excess": Mean("trend_excess", bounds=SIGNED),
-}
-"""Over fewer voxels."""
-
-
-def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
-    """Return the sums over cubes of the voxels with OP >= 2 of which `MEANS` are functions."""
-    T, op, agreement = table.op.astype(np.float64), table.op, columns["psa"]
-    sums = places.means(
-        {
-            "psa": agreement,
-            "vss": vss(table),
-            "sbd": columns["sbd_excess"] + columns["sbd_null"],
-            "null": columns["sbd_null"],
-            "excess": columns["sbd_excess"],
-            "steadier": np.where(op > 2, -columns["sbd_excess"], np.nan),
-            "entropy": columns["entropy_within"] + columns["entropy_between"],
-            "entropy_within": columns["entropy_within"],
-            "entropy_between": columns["entropy_between"],
-            "of two": np.where(op == 2, agreement, np.nan),
-            "of more": np.where(op > 2, agreement, np.nan),
-            "observations": T,
-            "agreeing": T * agreement,
-            "own": table.self_sum,
-            "own of an observation": table.self_sum / T,
-            **{name: T * columns[f"disagreement_{name}"] for name in ("within", "between")},
-        }
-    )
-    observations, agreeing, own, own_of_one = (
-        sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own", "own of an observation")
-    )
-    by_observation, by_voxel = places.sums_by_class(table)
-    further = {
-        **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
-        "coin": [sums.pop("of two"), sums.pop("of more")],
-        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns` twice
-        "alpha": [agreeing, observations, own, by_observation],
-        "each_place": [sums["psa"], own_of_one, by_voxel],
-    }
-    return CubeSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
-
-
 # --- Sections ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Log:
-    """The sums and tests that need a log: sums over cubes, `trend_columns` summed (3,), and how many voxels trend."""
-
-    places: CubeSums
-    trend: Float64
-    test: OrderTest
-    tested: int
-    unusual: int
-    trending: int
-
-
-def _of_log(
-    table: VoxelTable, sample: MapSample, places: Cubes, drift: VoxelDrift | None, seed: int
-) -> tuple[Columns, _Log | None]:
-    """The columns and sums that need a log; none without one."""
-    if sample.events is None or drift is None:
-        return {}, None
-    changes: Flips = flips(sample.events)
-    tell, trend = trend_columns(table, drift)
-    trends = places.rows(tell).sums(trend)
-    means = {
-        "flip_rate": changes.rate,
-        "flip_null": changes.null,
-        "flip_excess": changes.rate - changes.null,
-        "frames_since": changes.since,
-    }
-    sums = places.means(means)
-    sums["trend_excess"] = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
-    testable = table.op >= TESTABLE
-    drift_q = benjamini_hochberg(np.where(testable, drift.p_value, np.nan))
-    trend_q = benjamini_hochberg(rounded_up(np.where(testable, drift.trend_p, np.nan)))
-    log = _Log(
-        CubeSums(places.cell, places.edge, sums),
-        trends.sum(axis=0),
-        order_test(table, sample.events, seed=seed),
-        int(np.count_nonzero(~np.isnan(trend_q))),
-        int(np.count_nonzero(drift_q <= FALSE_DISCOVERIES)),
-        int(np.count_nonzero(trend_q <= FALSE_DISCOVERIES)),
-    )
-    columns: Columns = {
-        "sbd_null": drift.null,
-        "drift_p": drift.p_value,
-        "trend": drift.trend,
-        "trend_p": drift.trend_p,
-        "flip_rate": changes.rate,
-        "frames_since_flip": changes.since,
-        "drift_q": drift_q,
-        "trend_q": trend_q,
-    }
-    return columns, log
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
@@ -403,7 +242,7 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
 
 
 def _drift(
-    repeats: int, means: Mapping[str, Interval], places: CubeSums, log: _Log | None, of_flips: Sequence[Interval]
+    repeats: int, means: Mapping[str, Interval], places: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
 ) -> DriftStatistics:
     """SBD against its null; without a log only for one-hot evidence, and without tests."""
     tests, rates, sampled = None, None, places["psa"][1]
@@ -444,37 +283,6 @@ def _correctness(
         strata=strata_of(judged_strata(judged, table.op, truth.known, edges), edges),
         reliability=reliability_of(judged_where(judged, truth.known & (table.op >= 2))),
         quadrants=quadrants_of(quadrant_sums(table, truth, stable, places.edge)),
-    )
-
-
-TOGETHER = 1 << 16
-"""Voxels whose beliefs under all rules are in memory at once."""
-
-
-def rule_outcomes(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
-    """Return the means over the voxels with OP >= 2 under each rule of fusion."""
-    again = np.flatnonzero(table.op >= 2)
-    parts = [_rule_sums(table, events, truth, again[some]) for some in stretches(len(again), TOGETHER)]
-    total = np.sum(parts, axis=0)
-    return tuple(
-        RuleOutcome(rule, rule_means_of(own[2:]), float(ratio_of(own[:2])))
-        for rule, own in zip(fusion_rules.RULES, total, strict=True)
-    )
-
-
-def _rule_sums(table: VoxelTable, events: Events, truth: Truth | None, rows: Int64) -> Float64:
-    """(R, 2 + C) for each rule how many voxels it relabels, of how many, and `rule_sums`."""
-    _, *others = fusion_rules.RULES  # the first one is the map's own
-    some, own = table.rows(rows), None if truth is None else Truth(truth.known[rows], truth.label[rows])
-    fused: list[Beliefs] = [some, *fusion_rules.fuse_all(events, others, evidence=some.evidence, rows=rows)]
-    usual, *labels = (fusion_rules.labels(belief.evidence) for belief in fused)
-    relabelled = [0, *(np.count_nonzero(label != usual) for label in labels)]
-    weights = np.ones(len(rows))
-    return np.stack(
-        [
-            np.concatenate([[count, len(rows)], rule_sums(belief, weights, own)])
-            for count, belief in zip(relabelled, fused, strict=True)
-        ]
     )
 
 

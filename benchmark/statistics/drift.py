@@ -18,7 +18,7 @@ from semstab.model.events import Events
 from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.ranks import ranked
+from semstab.statistics.ranks import numbered, ranked
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
@@ -85,19 +85,19 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
     NaN where OP < 2, where a frame's pixels in the voxel disagree, or where OP exceeds 256.
     """
-    from semstab.core import compiled
-    from semstab.statistics.loops import orders as one_hot
+    from semstab.core.compiled import in_chunks
+    from semstab.statistics.loops.orders import LONGEST_TABLE, expected_one_hot, one_hot_drifts
 
-    T, longest = table.op, one_hot.LONGEST_TABLE
-    known = (T >= 2) & (longest >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
-    count = np.zeros((longest + 1, longest + 1))
-    one_hot.seen_counts(table.evidence.entries, T, known, count)
-    pairs, part = np.nonzero(count), count[count > 0]
-    drifts = one_hot.one_hot_drifts(int(T.max(initial=2, where=known)))
-    compiled.in_chunks(one_hot.expected_one_hot, *pairs, _log_factorials(longest + 1), drifts, part)
-    count[pairs], expected = part, np.full(len(table), np.nan)
-    one_hot.add_expected(table.evidence.entries, T, known, count, expected)
-    return expected
+    T, evidence = table.op, table.evidence
+    known = (T >= 2) & (LONGEST_TABLE >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
+    entries = np.flatnonzero(np.repeat(known, np.diff(evidence.starts)))
+    of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))[entries]
+    times = np.rint(evidence.weight[entries]).astype(np.int64)
+    pairs, which = numbered(times * (LONGEST_TABLE + 1) + T[of])
+    part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=known)))
+    in_chunks(expected_one_hot, *np.divmod(pairs, LONGEST_TABLE + 1), _log_factorials(LONGEST_TABLE + 1), drifts, part)
+    total = np.bincount(of, weights=part[which], minlength=len(table))
+    return np.where(known, total / np.maximum(T - 1, 1), np.nan)
 
 
 def voxel_drift(
@@ -168,51 +168,43 @@ class _Orders:
         base = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
         return cls(vary, spread, events.starts[vary], T, events.evidence.entries, table.K, own, base)
 
-    @property
-    def many(self) -> Mask:
-        """(n,) whether there are too many orders to go through all of them."""
-        from semstab.statistics.loops.orders import ENUMERATED
-
-        above: Mask = self.T > ENUMERATED
-        return above
-
     def part(self, which: Int64) -> _Orders:
         """The voxels of these numbers."""
         return replace(self, first=self.first[which], T=self.T[which], streams=self.streams[which])
 
     def sampled(self, count: int) -> Int64:
         """Numbers of so many voxels with many orders, by chance."""
-        many = np.flatnonzero(self.many)
+        from semstab.statistics.loops.orders import ENUMERATED
+
+        many = np.flatnonzero(self.T > ENUMERATED)
         return many[lowest(self.streams[many], count)]
 
     def measure(self, known: Mask, draws: int, most: int, enough: int) -> tuple[Float64, Float64, Float64]:
         """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
-        from semstab.core import compiled
+        from semstab.core.compiled import in_chunks
         from semstab.statistics.loops import orders
-        from semstab.statistics.loops import orders as few_looks
 
         n = len(self.T)
         found = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
         rank, *shared = self._shared()
-        bounds = np.searchsorted(self.T, np.arange(2, few_looks.ENUMERATED + 2), sorter=rank)
+        log, K, entries = shared[2:5]
+        bounds = np.searchsorted(self.T, np.arange(2, orders.ENUMERATED + 2), sorter=rank)
         for T, (begin, end) in enumerate(itertools.pairwise(bounds), 2):
-            orders_of = few_looks.orders_and_steps(T)
-            log, K, entries = shared[2:5]
-            compiled.in_chunks(
-                few_looks.measure_few, rank[begin:end], self.first, T, log, K, entries, *orders_of, *found
-            )
+            order = np.array(list(itertools.permutations(range(T)))).T
+            age = np.argsort(order, axis=0) - 0.5 * (T - 1)
+            own = np.ascontiguousarray(order), np.ascontiguousarray(age)
+            in_chunks(orders.measure_all_orders, rank[begin:end], self.first, T, log, K, entries, *own, *found)
         if bounds[-1] < n:
-            rank = rank[bounds[-1] :]
-            compiled.in_chunks(orders.measure_voxels, rank, *shared, known, draws, most, enough, *found)
+            in_chunks(orders.measure_voxels, rank[bounds[-1] :], *shared, known, draws, most, enough, *found)
         return found
 
     def test(self, which: Int64, most: int, enough: int) -> Float64:
         """P-values (r,) of the drifts of the voxels of these numbers."""
-        from semstab.core import compiled
+        from semstab.core.compiled import in_chunks
         from semstab.statistics.loops import orders
 
         p, part = np.zeros(len(which)), self.part(which)
-        compiled.in_chunks(orders.test_drifts, *part._shared(), most, enough, p)
+        in_chunks(orders.test_drifts, *part._shared(), most, enough, p)
         return p
 
     def _shared(self) -> tuple[Any, ...]:

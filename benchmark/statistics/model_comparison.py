@@ -297,8 +297,8 @@ def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:
             log = decided(region.events[name]) if mixed else region.events[name]
             require_same_map(table, log)
             truth = None if region.truth is None else join_truth(table, region.truth)
-            where = np.zeros(len(table))
-            where[own] = 1.0
+            where = np.zeros(len(table), np.bool_)
+            where[own] = True
             for rule, found in sums.items():
                 found[name] = found.get(name, 0.0) + rule_sums(fusion_rules.fuse(log, rule), where, truth)
     values = {rule: {name: rule_means_of(own) for name, own in found.items()} for rule, found in sums.items()}

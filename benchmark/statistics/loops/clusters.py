@@ -76,8 +76,8 @@ def _label_without(total, x, look, A):
 
 
 @serial
-def _add_truth(sums, base, x, first, T, many, frames, truth, likely, total, active, A, label, without, mean, column, K):
-    """What is right of so many voxels: of the fused label by leaving a frame out, of each look by itself.
+def _add_truth(sums, base, x, first, T, frames, truth, likely, total, active, A, label, without, mean, column, K):
+    """What is right of a voxel: of the fused label by leaving a frame out, of each look by itself.
 
     mean (A,) is room.
     """
@@ -93,7 +93,7 @@ def _add_truth(sums, base, x, first, T, many, frames, truth, likely, total, acti
         for t in range(T):
             without[t] = _label_without(total, x, t * A, A)
             mean[without[t]] += part
-    share, (group, frame) = part * many, frames
+    share, (group, frame) = part, frames
     for t in range(T):
         r = base + group[frame[first + t]]
         own = right * share
@@ -101,9 +101,9 @@ def _add_truth(sums, base, x, first, T, many, frames, truth, likely, total, acti
             own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
         sums[r, column + KNOWN] += share
         sums[r, column + RIGHT] += own
-        sums[r, column + LOOKS] += many
+        sums[r, column + LOOKS] += 1.0
         if true >= 0:
-            sums[r, column + LOOKS_RIGHT] += x[t * A + true] * many
+            sums[r, column + LOOKS_RIGHT] += x[t * A + true]
         if T > 2:
             sums[r, column + STABLE] += likely * share
             sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * share
@@ -134,67 +134,16 @@ def _agreement(total, squares, T, A, certain, surprise, apart):
 
 
 @serial
-def _one_class(log, first, T):
-    """The class that all of a voxel's observations are of, and of nothing else; -1 where there is none."""
-    at, label, weight = log
-    k = np.int64(label[at[first]])
-    if at[first + T] - at[first] != T:
-        return -1
-    for e in range(at[first], at[first + T]):
-        if label[e] != k or weight[e] != 1.0:
-            return -1
-    return k
-
-
-@serial
-def _add_agreed(sums, base, k, first, T, many, frames, truth, likely, column, K, by_class):
-    """Add so many voxels whose observations are all of class k: they agree, and leaving one out changes none.
-
-    column is the first with ground truth, where that is known; K classes.
-    """
-    share, right, (group, frame) = many / T, 1.0 if k == truth else 0.0, frames
-    for t in range(first, first + T):
-        r = base + group[frame[t]]
-        sums[r, VOXELS] += share
-        sums[r, PSA] += share
-        sums[r, OBSERVATIONS] += many
-        sums[r, AGREEING] += many
-        sums[r, OWN] += many
-        sums[r, ENTROPY + 1 + k] += many
-        if by_class:
-            sums[r, ENTROPY + 1 + 2 * K + k] += many
-        if T == 2:
-            sums[r, TWICE] += many
-            sums[r, TWICE_AGREEING] += many
-        else:
-            sums[r, RECURRENT] += share
-            sums[r, VSS] += share
-        if truth >= 0:
-            sums[r, column + KNOWN] += share
-            sums[r, column + RIGHT] += share * right
-            sums[r, column + LOOKS] += many
-            sums[r, column + LOOKS_RIGHT] += right * many
-            if T > 2:
-                sums[r, column + STABLE] += likely * share
-                sums[r, column + STABLE_WRONG] += likely * share * (1.0 - right)
-            if by_class:
-                sums[r, column + 6 + truth] += share
-                sums[r, column + 6 + K + truth] += share * right
-                sums[r, column + 6 + 2 * K + k] += share
-
-
-@serial
 def add_influences(
-    chunk, order, bounds, voxels, rows, longest, log, K, frames, truth, likely, by_class, with_truth, groups, sums
+    chunk, order, bounds, rows, longest, log, K, frames, truth, likely, by_class, with_truth, groups, sums
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
-    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; each stands for voxels (n,), for one
-    where that is empty. rows (starts (n,) and ends) bound a voxel's rows of the log, `longest` at most, and of frames:
-    see `FrameGroups`. truth (n,) is its true class or -1, likely (n,) how likely it is stable, which is left open where
-    that is empty. The pairwise agreement P of a place is shared out as P + 2 (T - 1) / (T - 2) (a_t - P), a_t
-    being frame t's mean agreement with the others: what is left of a frame is then its own quality, free of that of the
-    frames it was held against, and the shares add up to T P.
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
+    voxel's rows of the log, `longest` at most; frames: see `FrameGroups`. truth (n,) is its true class or -1, likely
+    (n,) how likely it is stable. The pairwise agreement P of a location is shared out as P + 2 (T - 1) / (T - 2)
+    (a_t - P), a_t being frame t's mean agreement with the others: what is left of a frame is then its own quality, free
+    of that of the frames it was held against, and the shares add up to T P.
     """
     starts, ends = rows
     x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
@@ -206,58 +155,38 @@ def add_influences(
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
             first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
-            k, many = _one_class(log, first, T), voxels[i] if voxels.shape[0] else 1.0
-            if k >= 0:
-                known = truth[i] if with_truth else -1
-                _add_agreed(sums, cell * groups, k, first, T, many, frames, known, steady, first_truth, K, by_class)
-                continue
             A = _looks(log, first, T, number, active, x, total, squares, own)
             agreed, label = _agreement(total, squares, T, A, certain, surprise, apart), _label(total, A)
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
-            part, of_others = many / T, 1.0 / (T - 1.0)
+            part, of_others = 1.0 / T, 1.0 / (T - 1.0)
             for t in range(T):
                 r = cell * groups + group[frame[first + t]]
                 with_others = surprised = 0.0
                 for j in range(A):
                     k, s = active[j], x[t * A + j]
                     with_others += s * total[j]
-                    sums[r, ENTROPY + 1 + k] += s * many
+                    sums[r, ENTROPY + 1 + k] += s
                     surprised += s * surprise[j]
                     if by_class:
                         others = (total[j] - s) * of_others
                         differs = s + others - 2.0 * s * others
-                        sums[r, ENTROPY + 1 + K + k] += (apart[j] + spread * (differs - apart[j])) * many
-                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2 * many
+                        sums[r, ENTROPY + 1 + K + k] += apart[j] + spread * (differs - apart[j])
+                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2
                 share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
                 sums[r, VOXELS] += part
                 sums[r, PSA] += share * part
-                sums[r, OBSERVATIONS] += many
-                sums[r, AGREEING] += share * many
-                sums[r, OWN] += own[t] * many
-                sums[r, ENTROPY] += surprised * many
+                sums[r, OBSERVATIONS] += 1.0
+                sums[r, AGREEING] += share
+                sums[r, OWN] += own[t]
+                sums[r, ENTROPY] += surprised
                 if T == 2:
-                    sums[r, TWICE] += many
-                    sums[r, TWICE_AGREEING] += agreed * many
+                    sums[r, TWICE] += 1.0
+                    sums[r, TWICE_AGREEING] += agreed
                 else:
                     sums[r, RECURRENT] += part
                     sums[r, VSS] += x[t * A + label] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, x, first, T, many, frames, truth[i], steady, total, active, A, label, without,
+                    sums, cell * groups, x, first, T, frames, truth[i], steady, total, active, A, label, without,
                     mean, first_truth, K if by_class else 0,
                 )  # fmt: skip
-
-
-@serial
-def add_kinds(kind, voxels, first, rows, frames, groups, total):
-    """Add 1 / T for each of the T looks at voxels of kinds (n,) that there is room for, from the first on.
-
-    At (kind - first) * groups + group; each stands for voxels (n,); rows and frames as in `add_influences`.
-    """
-    last, (starts, ends), (group, frame) = first + total.shape[0] // groups, rows, frames
-    for i in range(kind.shape[0]):
-        if first <= kind[i] < last:
-            many, at = voxels[i] if voxels.shape[0] else 1.0, (kind[i] - first) * groups
-            share = many / (ends[i] - starts[i])
-            for row in range(starts[i], ends[i]):
-                total[at + group[frame[row]]] += share

@@ -8,23 +8,20 @@ from semstab.core.compiled import CHUNKS, serial
 
 
 @serial
-def add_classes(of, evidence, op, voxels, by_look, by_place):
-    """Add the evidence (starts, label, weight) of voxels to (G, K) by their cube of (n,), -1 is none; and that / OP.
-
-    Each row stands for so many voxels (n,), here and below.
-    """
+def add_classes(of, evidence, op, by_look, by_place):
+    """Add the evidence (starts, label, weight) of voxels to (G, K) by their cube of (n,), -1 is none; and that / OP."""
     starts, label, weight = evidence
     for i in range(of.shape[0]):
         if of[i] >= 0:
             share = 1.0 / op[i]
             for e in range(starts[i], starts[i + 1]):
-                own = voxels[i] * weight[e]
+                own = weight[e]
                 by_look[of[i], label[e]] += own
                 by_place[of[i], label[e]] += share * own
 
 
 @serial
-def add_class_sums(evidence, op, voxels, exact, first, last, log, sums):
+def add_class_sums(evidence, op, exact, first, last, log, sums):
     """Add to sums (5, K), over voxels with OP >= 2: evidence, that / OP, disagreement, that * OP, squares.
 
     Where exact (n,) holds the evidence is the sum of its squares too, else the log tells, in which a voxel has the rows
@@ -33,7 +30,7 @@ def add_class_sums(evidence, op, voxels, exact, first, last, log, sums):
     starts, label, weight = evidence
     squares = np.zeros(sums.shape[1])
     for i in range(op.shape[0]):
-        T, many = np.float64(op[i]), voxels[i]
+        T = np.float64(op[i])
         if T < 2.0:
             continue
         if not exact[i]:
@@ -43,11 +40,11 @@ def add_class_sums(evidence, op, voxels, exact, first, last, log, sums):
             k, own = label[entry], weight[entry]
             square = own if exact[i] else squares[k]
             apart = 2.0 * ((T - 1.0) * own - own * own + square) / (T * (T - 1.0))
-            sums[0, k] += many * own
-            sums[1, k] += many * own / T
-            sums[2, k] += many * apart
-            sums[3, k] += many * T * apart
-            sums[4, k] += many * square
+            sums[0, k] += own
+            sums[1, k] += own / T
+            sums[2, k] += apart
+            sums[3, k] += T * apart
+            sums[4, k] += square
             squares[k] = 0.0
 
 
@@ -85,26 +82,25 @@ def square_errors(evidence, rest, K, truth, errors):
 
 
 @serial
-def add_judged(group, label, predicted, confidence, error, voxels, bins, sums):
+def add_judged(group, label, predicted, confidence, error, bins, sums):
     """Add to the row of sums (G, 3 + 3 bins + 3 K) of each voxel's group (n,), -1 is none: see `judged_sums`."""
     K = (sums.shape[1] - 3 - 3 * bins) // 3
     for i in range(group.shape[0]):
         g = group[i]
         if g < 0:
             continue
-        many = voxels[i]
-        right = many if predicted[i] == label[i] else 0.0
+        right = 1.0 if predicted[i] == label[i] else 0.0
         at = 3 + min(max(np.int64(np.ceil(confidence[i] * bins - 1e-9)) - 1, 0), bins - 1)
         kind = 3 + 3 * bins
-        sums[g, 0] += many
+        sums[g, 0] += 1.0
         sums[g, 1] += right
-        sums[g, 2] += many * error[i]
-        sums[g, at] += many
-        sums[g, at + bins] += many * confidence[i]
+        sums[g, 2] += error[i]
+        sums[g, at] += 1.0
+        sums[g, at + bins] += confidence[i]
         sums[g, at + 2 * bins] += right
         sums[g, kind + label[i]] += right
-        sums[g, kind + K + label[i]] += many
-        sums[g, kind + 2 * K + predicted[i]] += many
+        sums[g, kind + K + label[i]] += 1.0
+        sums[g, kind + 2 * K + predicted[i]] += 1.0
 
 
 @serial
@@ -140,7 +136,7 @@ def label_near(evidence, rest, K, near, found):
 
 
 @serial
-def add_apart(of, evidence, op, voxels, shares, apart):
+def add_apart(of, evidence, op, shares, apart):
     """Add to (G, K) by the voxels' cubes (n,), -1 is none: one-hot evidence, and how far apart looks are in a class.
 
     The latter counts for each look: 2 ((T - 1) e - e^2 + squares) / (T - 1).
@@ -149,9 +145,9 @@ def add_apart(of, evidence, op, voxels, shares, apart):
     for i in range(of.shape[0]):
         if of[i] >= 0:
             for e in range(starts[i], starts[i + 1]):
-                own, others, many = weight[e], op[i] - 1.0, voxels[i]
-                shares[of[i], label[e]] += many * own
-                apart[of[i], label[e]] += many * 2.0 * (others * own - own * own + own) / others
+                own, others = weight[e], op[i] - 1.0
+                shares[of[i], label[e]] += own
+                apart[of[i], label[e]] += 2.0 * (others * own - own * own + own) / others
 
 
 @serial

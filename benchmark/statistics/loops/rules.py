@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.core.compiled import CHUNKS, compiled, serial
-from semstab.statistics.loops.logarithm import EIGHT, add_plogp, exp2_fast
+from semstab.statistics.loops.logarithm import EIGHT, add_plogp
 
 LANES = 64
 """Voxels of the same OP that go side by side, at most."""
+
+LOWEST = -1000.0
+"""Powers of two below are none."""
 
 AVERAGING, MAJORITY, PRODUCT, GEOMETRIC = range(4)
 
@@ -66,7 +69,7 @@ def _beliefs(total, lanes, of, scale, pooled, after, logs, norm):
     for a in range(total.shape[0]):
         for lane in range(lanes):
             z = (total[a, lane] - top[lane]) * scale
-            power = exp2_fast(z)
+            power = np.exp2(max(z, LOWEST))
             after[a, lane] = power
             norm[lane] += of[a, lane] * power
             logs[lane] += of[a, lane] * power * z
