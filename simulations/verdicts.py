@@ -14,7 +14,7 @@ from collections import Counter
 import numpy as np
 from flights import Flight, fly, sample_of, table_of, world
 
-from semstab.model.statistics import Judged
+from semstab.model.statistics import HeadlineStatistics
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.ceiling import ceiling_share
 from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for, value
@@ -53,9 +53,9 @@ def levels(flight: Flight, count: int, seed: int) -> tuple[float, Counter[str]]:
         table = table_of(sample.seen)
         sums = cluster_sums_of(table, sample=sample.shared())
         reach = ceiling_share(sample, table, sums)
-        assert np.isclose(reach.reached.value, value(sums, "reached"))
-        judged = Judged(*confidence_intervals(headline_specs(sums)))
-        said = verdict("net", judged=judged, reach=reach, voxels=len(table), share=1.0, blocks=sums.cells)
+        assert np.isclose(reach.share.value, value(sums, "reached"))
+        judged = HeadlineStatistics(*confidence_intervals(headline_specs(sums)))
+        said = verdict("net", headline=judged, ceiling=reach, voxels=len(table), share=1.0, blocks=sums.cells)
         found[said.level] += 1
         total = total + sums_for(sums, "reached").sum(axis=0)
     return float(FUNCTIONALS["reached"].of(np.asarray(total))), found

@@ -16,7 +16,15 @@ from semstab.core.json_form import from_json, to_json
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.contrast import BackboneComparison
-from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, ClassReach, Interval, Judged, MapStatistics, Reach
+from semstab.model.statistics import (
+    NEXT_FLIGHT,
+    UNKNOWN,
+    CeilingShare,
+    ClassCeilingShare,
+    HeadlineStatistics,
+    Interval,
+    MapStatistics,
+)
 from semstab.model.voxels import VoxelTable
 from semstab.report.terminal_statistics import comparison_lines, lines
 from semstab.statistics import (
@@ -173,15 +181,17 @@ def between(low, high):
 def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, classes=()):
     """By alpha between frames as it is, or where there is a ceiling by the share of it that is reached."""
     middle = between(low, high)
-    numbers = Judged(*[middle] * 5, wrong_of_stable=wrong)
+    numbers = HeadlineStatistics(*[middle] * 5, wrong_of_stable=wrong)
     reach = (
-        None if ceiling is None else Reach("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
+        None
+        if ceiling is None
+        else CeilingShare("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
     )
-    return verdict("net", judged=numbers, reach=reach, voxels=voxels, share=0.5, blocks=blocks)
+    return verdict("net", headline=numbers, ceiling=reach, voxels=voxels, share=0.5, blocks=blocks)
 
 
 def of_class(name, low, high, *, matters=True):
-    return ClassReach(name, 200.0, matters, 0.5, 0.9, between(low, high))
+    return ClassCeilingShare(name, 200.0, matters, 0.5, 0.9, between(low, high))
 
 
 @pytest.mark.parametrize(
@@ -228,7 +238,9 @@ def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames
     assert "intervals are for these 8 frames: fly 30 or more to tell of the next flight" in few
     assert "these frames: keep a log" in describe(events.table()).verdict.line
     alike = Interval(0.9, 0.85, 0.95, undecided="errors reach as far as the scene: fly more of it")
-    found = verdict("net", judged=Judged(*[alike] * 5, UNKNOWN), reach=None, voxels=5000, share=0.5, blocks=40)
+    found = verdict(
+        "net", headline=HeadlineStatistics(*[alike] * 5, UNKNOWN), ceiling=None, voxels=5000, share=0.5, blocks=40
+    )
     assert found.level == "undecided"
     assert "fly more of it" in found.line
 

@@ -80,7 +80,7 @@ def test_weights_that_are_fixed_make_flights_comparable_that_linger_elsewhere():
                  (np.where(left, 20, 3), np.where(left, 3, 20))]  # fmt: skip
     easy, hard = by_flight[1], by_flight[0]
     assert easy.alpha_between.value - hard.alpha_between.value > 0.2
-    assert easy.each_place.value == pytest.approx(hard.each_place.value, abs=0.03)
+    assert easy.voxel_weighted.value == pytest.approx(hard.voxel_weighted.value, abs=0.03)
 
 
 # --- The sample -------------------------------------------------------------------------------------------------------
@@ -193,14 +193,14 @@ def test_the_truth_reaches_its_ceiling_at_every_voxel_size_while_alpha_falls():
     found = [verdict_at(size) for size in SIZES]
     assert found[0].agreement.alpha.value - found[-1].agreement.alpha.value > 0.1
     assert {summary.verdict.level for summary in found} == {"stable"}
-    assert min(summary.reach.reached.value for summary in found) > 0.93
+    assert min(summary.ceiling_share.share.value for summary in found) > 0.93
 
 
 @pytest.mark.parametrize("patch", [None, 10])
 def test_a_coin_is_stable_at_no_voxel_size(patch):
     found = [verdict_at(size, coin=True, patch=patch) for size in SIZES]
     assert {"stable", "usable", "partly stable"}.isdisjoint(summary.verdict.level for summary in found)
-    assert max(summary.reach.reached.value for summary in found) < 0.2
+    assert max(summary.ceiling_share.share.value for summary in found) < 0.2
 
 
 def test_the_ground_truths_ceiling_takes_the_place_of_the_maps_own():
@@ -210,7 +210,7 @@ def test_the_ground_truths_ceiling_takes_the_place_of_the_maps_own():
     assert against.by == "the ground truth"
     assert against.ceiling.value == pytest.approx(alpha_between(right.seen.table()))
     assert own.alpha == against.alpha
-    assert own.reached.value == pytest.approx(against.reached.value, abs=0.1)
+    assert own.share.value == pytest.approx(against.share.value, abs=0.1)
 
 
 def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
@@ -227,8 +227,8 @@ def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
     found = describe(log.table(), observations=sample)
     assert found.agreement.alpha.value > 0.95
     assert found.verdict.level == "partly stable"
-    assert found.reach.worst.name in ("2", "3")
-    assert found.reach.worst.reached.high < 0.6
+    assert found.ceiling_share.worst.name in ("2", "3")
+    assert found.ceiling_share.worst.share.high < 0.6
     assert describe(log.table(), observations=sample, critical=["0"]).verdict.level == "stable"
 
 

@@ -163,7 +163,10 @@ def _question(key: str, k: int | None, *sums: ClusterSums) -> Question:
 def _same_ceiling(base: Entry, other: Entry) -> bool:
     """Whether both judge against the same labels: those of the truth, or their own in finer cells."""
     found = [entry.summary.statistics for entry in (base, other)]
-    return len({own.reach.by if own is not None and own.reach is not None else "" for own in found} - {""}) == 1
+    return (
+        len({own.ceiling_share.by if own is not None and own.ceiling_share is not None else "" for own in found} - {""})
+        == 1
+    )
 
 
 def _coverage(base: ClusterSums, other: ClusterSums) -> Contrast:

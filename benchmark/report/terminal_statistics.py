@@ -11,12 +11,12 @@ from semstab.model.contrast import BackboneComparison, CommonLooks, PairedDiffer
 from semstab.model.measures import SBD, measures
 from semstab.model.statistics import (
     NEXT_FLIGHT,
+    CeilingShare,
     DriftTests,
     Estimate,
     Flipping,
     LagBin,
     MapStatistics,
-    Reach,
     RuleOutcome,
 )
 from semstab.statistics.agreement import ALPHA, KAPPA
@@ -110,8 +110,8 @@ def _agreement(found: MapStatistics) -> list[Row]:
         ("two looks differ within a frame", found.agreement.within, ""),
         ("  and between frames", found.agreement.between, ""),
         ("alpha between frames", found.agreement.alpha_between, ""),
-        ("  each place counting once", found.agreement.each_place, ""),
-        *([] if found.reach is None else _reach(found.reach)),
+        ("  each place counting once", found.agreement.voxel_weighted, ""),
+        *([] if found.ceiling_share is None else _reach(found.ceiling_share)),
         *([] if found.correlogram is None else _standard(found.correlogram.standard)),
     ]
 
@@ -122,7 +122,7 @@ def _between(flips: Flipping) -> str:
 
 def _judged(found: MapStatistics) -> list[Row]:
     """What may be said of the next flight, if anything."""
-    judged = found.judged
+    judged = found.headline
     rows = {
         "PSA": judged.psa,
         "alpha": judged.alpha,
@@ -134,12 +134,16 @@ def _judged(found: MapStatistics) -> list[Row]:
     return [(name, own, "the next flight") for name, own in rows.items() if own.question == NEXT_FLIGHT]
 
 
-def _reach(reach: Reach) -> list[Row]:
+def _reach(reach: CeilingShare) -> list[Row]:
     return [
         ("alpha b.f., sampled voxels", reach.alpha, ""),
         ("  its ceiling", reach.ceiling, f"of {reach.by}"),
-        ("  share reached", reach.reached, ""),
-        *((f"  {row.name}"[:34], row.reached, f"{row.places:.0f} places") for row in reach.classes if row.matters),
+        ("  share reached", reach.share, ""),
+        *(
+            (f"  {row.name}"[:34], row.share, f"{row.locations:.0f} places")
+            for row in reach.classes
+            if row.counts_for_verdict
+        ),
     ]
 
 

@@ -21,7 +21,7 @@ from semstab.metrics import dominant
 from semstab.metrics.agreement import shared_rows, voxel_keys
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
-from semstab.model.statistics import ClassReach, Interval, Losses, Reach
+from semstab.model.statistics import CeilingShare, ClassCeilingShare, Interval, Losses
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import psa, ratio_of
@@ -40,7 +40,7 @@ def ceiling_share(
     *,
     critical: Sequence[str] = (),
     least: float = SUPPORT,
-) -> Reach:
+) -> CeilingShare:
     """Alpha between frames in the sampled voxels beside that of the sample's limit, of all classes and of each.
 
     table     the whole map: how many places a class has
@@ -74,7 +74,7 @@ def ceiling_share_from(
     *,
     critical: Sequence[str] = (),
     least: float = SUPPORT,
-) -> Reach:
+) -> CeilingShare:
     """The same from the sums of a map with a sample, whose limit has labels `by` whom; places (K,) of each class.
 
     found  the answers to `ceiling_specs`
@@ -84,14 +84,14 @@ def ceiling_share_from(
     names = sums.classes or tuple(str(k) for k in range(len(places)))
     named = set(critical) & set(names)
     alpha, ceiling, reached, *of_classes = found
-    return Reach(
+    return CeilingShare(
         by=by,
         voxels=round(float(sums.seen["voxels"].sum())),
         alpha=alpha,
         ceiling=ceiling,
-        reached=reached,
+        share=reached,
         classes=tuple(
-            ClassReach(
+            ClassCeilingShare(
                 name,
                 float(places[k]),
                 name in named if named else bool(places[k] >= least),

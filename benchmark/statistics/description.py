@@ -16,17 +16,17 @@ from semstab.model.information import by_group
 from semstab.model.measures import SBD
 from semstab.model.results import TableSummary
 from semstab.model.statistics import (
-    BeyondCoin,
     BlockCut,
     ClassAgreement,
     CorrectnessStatistics,
     DriftStatistics,
     DriftTests,
     EntropyParts,
+    ExcessOverChance,
     FlipRates,
     FrameAgreement,
+    HeadlineStatistics,
     Interval,
-    Judged,
     MapStatistics,
     Repeated,
     StratumStatistics,
@@ -194,7 +194,7 @@ def analyse(
     reach = None
     if observations is not None:
         reach = ceiling_share_from(observations.by, of_places["kappa"][2:], influence, reached, critical=critical)
-    headline, count = Judged(*judged), len(places.cell)
+    headline, count = HeadlineStatistics(*judged), len(places.cell)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
     flips_of_map = flipping.flipping(unsteady, table.classes)
@@ -210,8 +210,8 @@ def analyse(
         blocks=BlockCut(count, headline.alpha.block_size),
         verdict=verdict(
             name or "backbone",
-            judged=headline,
-            reach=reach,
+            headline=headline,
+            ceiling=reach,
             flips=flips_of_map,
             voxels=repeated.voxels,
             share=repeated.share,
@@ -219,8 +219,8 @@ def analyse(
         ),
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips_of_map,
-        judged=headline,
-        reach=reach,
+        headline=headline,
+        ceiling_share=reach,
         correlogram=None if observations is None else correlogram(observations),
         drift=_drift(repeats, means, of_places, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
@@ -228,7 +228,7 @@ def analyse(
         correctness=None if truth is None else _correctness(table, truth, stable, places, edges),
         fusion_rules=None if events is None else rule_outcomes(table, events, truth),
         strata=_strata(whole, table, columns, edges),
-        beyond_coin=BeyondCoin(means["coin"], means["steadier"]),
+        excess_over_chance=ExcessOverChance(means["coin"], means["steadier"]),
     )
     return Analysis(summary, whole, influence, sample, shares, drawn)
 
@@ -237,7 +237,7 @@ def analyse(
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
-    names = ("psa", "kappa", "alpha", "vss", "within", "between", "alpha_between", "each_place")
+    names = ("psa", "kappa", "alpha", "vss", "within", "between", "alpha_between", "voxel_weighted")
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 

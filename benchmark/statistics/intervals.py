@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Judged, Question
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, HeadlineStatistics, Interval, Question
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -227,9 +227,9 @@ def question_of(sums: ClusterSums) -> Question:
 
 
 def headline_specs(sums: ClusterSums) -> Iterator[EstimateSpec]:
-    """For `answers`: the numbers that a verdict on a map rests on, in the order of `Judged`."""
+    """For `answers`: the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
     question = question_of(sums)
-    return (spec_of(sums, field.name, question=question) for field in dataclasses.fields(Judged))
+    return (spec_of(sums, field.name, question=question) for field in dataclasses.fields(HeadlineStatistics))
 
 
 def _nowhere(found: float) -> Interval:

@@ -63,7 +63,7 @@ MEANS: Mapping[str, Mean] = {
     "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
     "alpha": Mean("alpha", alpha_of, SIGNED, "agreement"),
     "alpha_between": Mean("alpha", between_of, SIGNED, "agreement"),
-    "each_place": Mean("each_place", between_of, SIGNED, "agreement"),
+    "voxel_weighted": Mean("voxel_weighted", between_of, SIGNED, "agreement"),
 }
 """Over the voxels with OP >= 2, of values where they are defined, and agreement beyond chance."""
 
@@ -112,7 +112,7 @@ def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
         "coin": [sums.pop("of two"), sums.pop("of more")],
         "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns` twice
         "alpha": [agreeing, observations, own, by_observation],
-        "each_place": [sums["psa"], own_of_one, by_voxel],
+        "voxel_weighted": [sums["psa"], own_of_one, by_voxel],
     }
     return CubeSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
 

@@ -6,13 +6,13 @@ import math
 
 from semstab.model.statistics import (
     NEXT_FLIGHT,
-    ClassReach,
+    CeilingShare,
+    ClassCeilingShare,
     Estimate,
     Flipping,
+    HeadlineStatistics,
     Interval,
-    Judged,
     Level,
-    Reach,
     StabilityVerdict,
 )
 from semstab.statistics.intervals import LEAST_FRAMES
@@ -53,8 +53,8 @@ ONE_CLASS = "hardly more than one class was predicted, so that agreement says no
 def verdict(
     backbone: str,
     *,
-    judged: Judged,
-    reach: Reach | None,
+    headline: HeadlineStatistics,
+    ceiling: CeilingShare | None,
     flips: Flipping | None = None,
     voxels: int,
     share: float,
@@ -62,32 +62,32 @@ def verdict(
 ) -> StabilityVerdict:
     """Judge by the intervals, never by values alone, from voxels with OP >= 2 only.
 
-    judged         of these voxels
-    reach          the same beside its ceiling; where it is not known, alpha between frames is judged as it is
-    flips          of them, the places about which frames do not agree: few of them hide in any mean
+    headline       numbers of these voxels
+    ceiling        alpha between frames and its ceiling; where that is not known, alpha is judged as it is
+    flips          the locations about which frames do not agree: few of them hide in any mean
     voxels, share  how many they are, and of all voxels
     blocks         in how many cubes of space they lie
     """
     enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
-    level = _level(judged, reach) if enough else "no verdict"
+    level = _level(headline, ceiling) if enough else "no verdict"
     support = f"{voxels} places seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
         return StabilityVerdict(level, f"{backbone}: no verdict, {ONE_CLASS if enough else ADVICE[level]}; {support}")
-    psa, wrong = judged.psa, judged.wrong_of_stable
+    psa, wrong = headline.psa, headline.wrong_of_stable
     found = [f"two frames agree on {psa.value:.0%} of the places ({psa.low:.0%} to {psa.high:.0%})"]
-    found += [_alpha(judged.alpha_between)] if reach is None else _reached(reach)
+    found += [_alpha(headline.alpha_between)] if ceiling is None else _reached(ceiling)
     if not math.isnan(wrong.low):
         found.append(f"{wrong.value:.0%} of the stable places are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     if flips is not None and level in ACTED_ON:
         found += _flips(flips)
-    basis = _basis(judged, reach)
+    basis = _basis(headline, ceiling)
     reason = basis.undecided if level == "undecided" and basis.undecided else ADVICE[level]
     return StabilityVerdict(level, f"{backbone}: {level}, {reason}: {', '.join(found)}; {support}; {_holds(basis)}")
 
 
-def _basis(judged: Judged, reach: Reach | None) -> Interval:
+def _basis(headline: HeadlineStatistics, ceiling: CeilingShare | None) -> Interval:
     """The interval that decides."""
-    return judged.alpha_between if reach is None else reach.reached
+    return headline.alpha_between if ceiling is None else ceiling.share
 
 
 def _holds(basis: Interval) -> str:
@@ -112,38 +112,38 @@ def _flips(flips: Flipping) -> list[str]:
     return [f"not to act on: {far}{part}"]
 
 
-def _reached(reach: Reach) -> list[str]:
-    share = reach.reached
-    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {reach.ceiling.value:.2f} by {reach.by}"
+def _reached(ceiling: CeilingShare) -> list[str]:
+    share = ceiling.share
+    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {ceiling.ceiling.value:.2f} by {ceiling.by}"
     chance = ", no better than chance," if share.value < 0 else ""
-    said = [f"alpha between frames {reach.alpha.value:.2f}{chance} is {share.value:.0%} {far}"]
-    if (worst := reach.worst) is not None:
+    said = [f"alpha between frames {ceiling.alpha.value:.2f}{chance} is {share.value:.0%} {far}"]
+    if (worst := ceiling.worst) is not None:
         said.append(f"worst class {worst.name} {_class_share(worst)}")
     return said
 
 
-def _class_share(row: ClassReach) -> str:
-    if math.isnan(row.reached.value):
+def _class_share(row: ClassCeilingShare) -> str:
+    if math.isnan(row.share.value):
         return "not known"
-    chance = "no better than chance, " if row.reached.value < 0 else ""
-    return f"{chance}{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
+    chance = "no better than chance, " if row.share.value < 0 else ""
+    return f"{chance}{row.share.value:.0%} ({row.share.low:.0%} to {row.share.high:.0%})"
 
 
-def _level(judged: Judged, reach: Reach | None) -> Level:
-    basis = _basis(judged, reach)
+def _level(headline: HeadlineStatistics, ceiling: CeilingShare | None) -> Level:
+    basis = _basis(headline, ceiling)
     if math.isnan(basis.low):
         return "no verdict"
-    if judged.wrong_of_stable.low > DANGEROUS:
+    if headline.wrong_of_stable.low > DANGEROUS:
         return "misleading"
     if basis.low < TENTATIVE or not basis.decided:
         return "unstable" if basis.decided and basis.high < TENTATIVE else "undecided"
-    if reach is not None and not reach.ceiling.value >= LEAST_CEILING:
+    if ceiling is not None and not ceiling.ceiling.value >= LEAST_CEILING:
         return "too coarse"
     if basis.low < RELIABLE:
         return "usable"
-    return "stable" if reach is None or _every_class_holds(reach) else "partly stable"
+    return "stable" if ceiling is None or _every_class_holds(ceiling) else "partly stable"
 
 
-def _every_class_holds(reach: Reach) -> bool:
+def _every_class_holds(ceiling: CeilingShare) -> bool:
     """Whether each class that matters allows at least tentative conclusions."""
-    return all(row.reached.low >= TENTATIVE for row in reach.classes if row.matters)
+    return all(row.share.low >= TENTATIVE for row in ceiling.classes if row.counts_for_verdict)
