@@ -18,8 +18,7 @@ from flights import Flight, World, fly, sums_of, world
 
 from semstab.comparison.gate import Frames, change, negative, parse, verdict
 from semstab.model.statistics import Interval
-from semstab.statistics.sampling import InfluenceSums
-from semstab.statistics.sampling.influence import FUNCTIONALS
+from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums
 
 EASES = (1.0, 1.0, 0.8)
 """How easy a scene is to the baseline and to two new models: as easy, harder."""
@@ -39,7 +38,7 @@ def conditions() -> Iterator[tuple[str, Flight, bool]]:
         yield f"{frames} frames, 32 x 32, uneven, same places hard", flight, True
 
 
-def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[InfluenceSums]:
+def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[ClusterSums]:
     """The sums of the baseline and of each new model."""
     over = world(flight, rng)
     found = []

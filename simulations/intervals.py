@@ -20,9 +20,10 @@ import numpy as np
 from flights import Flight, fly, sample_of, sums_of, world
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
-from semstab.statistics.looks import Views, correlogram
-from semstab.statistics.sampling import difference, estimate
-from semstab.statistics.sampling.influence import FUNCTIONALS
+from semstab.statistics.cluster_sums import FUNCTIONALS
+from semstab.statistics.correlogram import correlogram
+from semstab.statistics.intervals import difference, estimate
+from semstab.statistics.observations import Views
 
 KEYS = ("alpha", "psa", "accuracy")
 

@@ -14,10 +14,11 @@ from collections import Counter
 import numpy as np
 from flights import Flight, fly, sample_of, table_of, world
 
-from semstab.model.statistics import Judged
-from semstab.statistics.looks import reach_of
-from semstab.statistics.sampling import answers, influence_sums, judged_by, value
-from semstab.statistics.sampling.influence import FUNCTIONALS, columns_of
+from semstab.model.statistics import HeadlineStatistics
+from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics.ceiling import ceiling_share
+from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for, value
+from semstab.statistics.intervals import confidence_intervals, headline_specs
 from semstab.statistics.verdict import verdict
 
 BETTER = {"stable": ("stable", "partly stable"), "usable": ("stable", "partly stable", "usable")}
@@ -50,13 +51,13 @@ def levels(flight: Flight, count: int, seed: int) -> tuple[float, Counter[str]]:
         over = world(flight, rng)
         sample = sample_of(fly(flight, over, rng), over, flight, rng)
         table = table_of(sample.seen)
-        sums = influence_sums(table, sample=sample.shared())
-        reach = reach_of(sample, table, sums)
-        assert np.isclose(reach.reached.value, value(sums, "reached"))
-        judged = Judged(*answers(judged_by(sums)))
-        said = verdict("net", judged=judged, reach=reach, voxels=len(table), share=1.0, blocks=sums.cells)
+        sums = cluster_sums_of(table, sample=sample.shared())
+        reach = ceiling_share(sample, table, sums)
+        assert np.isclose(reach.share.value, value(sums, "reached"))
+        judged = HeadlineStatistics(*confidence_intervals(headline_specs(sums)))
+        said = verdict("net", headline=judged, ceiling=reach, voxels=len(table), share=1.0, blocks=sums.cells)
         found[said.level] += 1
-        total = total + columns_of(sums, "reached").sum(axis=0)
+        total = total + sums_for(sums, "reached").sum(axis=0)
     return float(FUNCTIONALS["reached"].of(np.asarray(total))), found
 
 

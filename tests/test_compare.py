@@ -98,11 +98,11 @@ def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault)
 def test_the_numbers_are_those_of_the_runs_where_all_looks_are_common(runs, fault):
     record = semstab.load_result(runs / "old").record(backbone="net")
     found = rows(fault.overall[0])
-    judged, right = record.statistics.judged, record.statistics.correctness
+    judged, right = record.statistics.headline, record.statistics.correctness
     assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
     assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
     assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
-    assert found["reached"].base == pytest.approx(record.statistics.reach.reached.value, abs=1e-9)
+    assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
     assert found["flicker_percent"].base == pytest.approx(record.image_space.flicker_percent)
     assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
     assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()

@@ -21,7 +21,7 @@ import semstab
 from semstab.comparison.baseline import LARGEST
 from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
 from semstab.errors import ConfigError, DataError
-from semstab.statistics.sampling import value
+from semstab.statistics.cluster_sums import value
 
 
 @pytest.fixture(scope="module")

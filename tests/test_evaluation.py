@@ -31,9 +31,9 @@ from semstab.report.figures.statistics import DriftByOP, draw_intervals, draw_re
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
-from semstab.statistics import Estimate, Looks, Reliability, Sample, analyse, describe
+from semstab.statistics import CellObservations, Estimate, MapSample, ObservationSample, Reliability, analyse, describe
 from semstab.statistics.correctness import ACCURACY
-from semstab.statistics.steady import steady
+from semstab.statistics.stability import stability_posterior
 
 BACKBONES = ("a", "b", "gt")
 
@@ -54,9 +54,9 @@ def ran(tmp_path_factory):
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
-def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, Sample]:
+def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, ObservationSample]:
     name = f"wall__{backbone}__numpy.parquet"
-    looks = Looks.load(run / "looks" / name).sample()
+    looks = CellObservations.load(run / "looks" / name).sample()
     return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), looks
 
 
@@ -67,10 +67,10 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
         name = entry["backbone"]
         table, events, sample = saved(run, name)
         true, sample = (None, sample) if name == "gt" else (truth, sample.against(of_truth))
-        expected = analyse(table, events, true, limit=true, sample=sample, name=name, edges=(1, 3))
+        expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), sample, name=name, edges=(1, 3))
         assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
-        for column, values in expected.maps.items():
+        for column, values in expected.columns(table).items():
             np.testing.assert_array_equal(columns.column(column).to_numpy(), values)
     by_name = {entry["backbone"]: entry["statistics"] for entry in summary["runs"]}
     assert by_name["gt"]["agreement"]["psa"]["value"] == 1.0
@@ -104,8 +104,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    sample = Looks.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
-    assert to_json(entry.statistics) == to_json(describe(table, sample=sample, name="a"))
+    sample = CellObservations.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
+    assert to_json(entry.statistics) == to_json(describe(table, observations=sample, name="a"))
     assert entry.statistics.drift.tests is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
@@ -319,8 +319,8 @@ def test_what_is_right_and_stable_by_voxel() -> None:
     """Five observations of two classes: 5 to 0 is stable, 3 to 2 is not; OP = 2 does not count."""
     table = voxels((1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 2, [2, 0, 0]))
     one_hot = dataclasses.replace(table, self_sum=table.op.astype(float))
-    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1]), steady(one_hot)).tolist() == [1, 2, 4, 3, 0]
-    assert right_or_wrong(one_hot, np.full(5, -1), steady(one_hot)).tolist() == [0] * 5
+    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1]), stability_posterior(one_hot)).tolist() == [1, 2, 4, 3, 0]
+    assert right_or_wrong(one_hot, np.full(5, -1), stability_posterior(one_hot)).tolist() == [0] * 5
 
 
 def test_reliability_pools_the_bins_of_several_scenes() -> None:

@@ -11,7 +11,7 @@ from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.measures import Rows, margin
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import RULES, describe, fuse
-from semstab.statistics.order.fusion_rules import fuse_all
+from semstab.statistics.fusion_rules import fuse_all
 
 RNG = np.random.default_rng(0)
 DENSE = RNG.random((50, 6)) * (RNG.random((50, 6)) < 0.4)

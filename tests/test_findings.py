@@ -12,7 +12,7 @@ from simulated_events import log_of
 from wall_study import BACKBONES, wall_study
 
 from semstab.metrics import op, vss
-from semstab.model.statistics import BeyondCoin, Estimate, Interval
+from semstab.model.statistics import Estimate, ExcessOverChance, Interval
 from semstab.report.averages import ENOUGH, Level, describe, pooled
 from semstab.report.findings import (
     HARDLY,
@@ -30,8 +30,8 @@ SURE, SPLIT, CALM = [1, 0, 0], [3, 1, 0], [3.6, 0.4, 0]
 N = ENOUGH
 
 UNKNOWN = Interval(np.nan, np.nan, np.nan)
-FALLS = BeyondCoin(Interval(0.1, 0.05, 0.15), Interval(0.01, 0.005, 0.015))
-COIN = BeyondCoin(Interval(0.0, -0.05, 0.05), Interval(0.0, -0.005, 0.005))
+FALLS = ExcessOverChance(Interval(0.1, 0.05, 0.15), Interval(0.01, 0.005, 0.015))
+COIN = ExcessOverChance(Interval(0.0, -0.05, 0.05), Interval(0.0, -0.005, 0.005))
 STATISTICS = describe_map(log_of([[0, 1], [0, 0]]).table())
 
 
@@ -39,7 +39,7 @@ def record(table, *what, beyond=FALLS, **more):
     """A record whose statistics say so much of a coin."""
     made = records.record(table, *what, **more)
     agreement = dataclasses.replace(STATISTICS.agreement, vss=UNKNOWN)
-    said = dataclasses.replace(STATISTICS, beyond_coin=beyond, agreement=agreement)
+    said = dataclasses.replace(STATISTICS, excess_over_chance=beyond, agreement=agreement)
     return dataclasses.replace(made, summary=dataclasses.replace(made.summary, statistics=said))
 
 
@@ -88,9 +88,9 @@ def test_a_tossed_coin_is_told_from_findings():
     seen_by = rng.integers(1, 11, 4000)
     labels = np.where(np.arange(10) < seen_by[:, None], rng.random((4000, 10)) < 0.1, -1)
     events = log_of(labels, K=2)
-    found = describe_map(events.table(), events).beyond_coin
+    found = describe_map(events.table(), events).excess_over_chance
     assert found.disagreement.low <= 0 <= found.disagreement.high
-    assert found.settling.low <= 0 <= found.settling.high
+    assert found.drift_below_null.low <= 0 <= found.drift_below_null.high
 
 
 def test_recurrent_voxels_that_agree_as_well_as_all():
@@ -144,10 +144,10 @@ def test_sbd_that_falls_from_stratum_to_stratum():
 
 def test_numbers_below_zero_are_said_the_other_way_round():
     below = Estimate(-0.01, -0.015, -0.005)
-    against = dataclasses.replace(drifting((N, 2, 0.05), (N, 4, 0.02)), settling=below, disagreement=below)
+    against = dataclasses.replace(drifting((N, 2, 0.05), (N, 4, 0.02)), drift_below_null=below, disagreement=below)
     assert "; higher by 0.0100 (0.0050 to 0.0150) than in random order" in falling_drift(against).numbers
     assert more_disagreement(against).numbers.endswith("From OP=2 to OP>=3 PSA rises by 0.0100 (0.0050 to 0.0150).")
-    nothing = dataclasses.replace(against, settling=Estimate(-1e-6, -2e-5, 1e-4))
+    nothing = dataclasses.replace(against, drift_below_null=Estimate(-1e-6, -2e-5, 1e-4))
     assert "; neither lower nor higher (0.0000 to 0.0001) than in random order" in falling_drift(nothing).numbers
 
 

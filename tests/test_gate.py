@@ -26,7 +26,9 @@ from semstab.comparison import gate_report
 from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
 from semstab.errors import ConfigError, DataError
 from semstab.model.statistics import Interval
-from semstab.statistics.sampling import difference, influence_sums, value
+from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics.cluster_sums import value
+from semstab.statistics.intervals import difference
 
 # --- Rules ------------------------------------------------------------------------------------------------------------
 
@@ -120,7 +122,7 @@ def models(frames=20, side=16, seed=0):
 
 def sums(labels, truth, side=16):
     log = log_of(labels, K=2, index=grid(side))
-    return influence_sums(log.table(), log, truth)
+    return cluster_sums_of(log.table(), log, truth)
 
 
 def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
@@ -160,7 +162,9 @@ def test_a_rule_of_each_class_shares_the_level(run):
 def test_a_class_that_is_nowhere_has_no_value():
     labels, truth = models()
     log = log_of(labels, K=3, index=grid(16))
-    found = judging.rule_value(influence_sums(log.table(), log, truth), parse("class c: recall > 0.5").measure, 2, 0.05)
+    found = judging.rule_value(
+        cluster_sums_of(log.table(), log, truth), parse("class c: recall > 0.5").measure, 2, 0.05
+    )
     assert "nothing that it is of was seen" in found.undecided
     assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
 

@@ -41,7 +41,7 @@ from semstab.model.parquet import Tile
 from semstab.model.voxels import Extent, VoxelTable
 from semstab.recording.observer import Recording
 from semstab.recording.target import Target
-from semstab.statistics.sampling import InfluenceSums
+from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
 
@@ -242,7 +242,7 @@ def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
     logs = one.events(), other.events()
     for name in ("ix", "iy", "iz", "voxel", "frame", "pixels", "evidence"):
         np.testing.assert_array_equal(*(np.asarray(getattr(log, name)) for log in logs))
-    sums = [InfluenceSums.load(run.result.records[0].influence_file) for run in (one, other)]
+    sums = [ClusterSums.load(run.result.records[0].influence_file) for run in (one, other)]
     ordered = [
         own.columns[np.lexsort((own.frame, *own.cell.T))] for own in (own.coarsened(own.edge, own.step) for own in sums)
     ]

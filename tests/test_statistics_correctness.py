@@ -12,9 +12,9 @@ from sklearn.metrics import accuracy_score, jaccard_score
 from semstab.errors import DataError
 from semstab.model.information import normalise
 from semstab.statistics import correctness, join_truth, quadrants, reliability, stable_wrong
+from semstab.statistics.accumulate import Cubes
 from semstab.statistics.correctness import by_stratum
-from semstab.statistics.sampling import Places
-from semstab.statistics.steady import steady
+from semstab.statistics.stability import stability_posterior
 
 
 def random_beliefs(n=400, K=4, seed=0):
@@ -110,7 +110,7 @@ def test_quadrants_by_hand():
     labels[4, :2], labels[5] = 2, 2
     table = log_of(labels).table()
     truth = join_truth(table, log_of([[0], [0], [0], [1], [0]]).table())
-    found = quadrants(table, truth, Places.of(table, where=table.op > 0))
+    found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
     assert found.voxels == 4
     shares = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
@@ -130,7 +130,7 @@ def test_the_share_of_stable_places_does_not_depend_on_how_often_they_were_seen(
     rng = np.random.default_rng(7)
     T = np.repeat([3, 5, 10, 30], 400)
     wrong = (rng.random((len(T), 30)) > q).astype(int)
-    likely = steady(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
+    likely = stability_posterior(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
     shares = [likely[t == T].mean() for t in (3, 5, 10, 30)]
     assert max(abs(share - (q > 0.9)) for share in shares) < 0.05
 
@@ -140,7 +140,7 @@ def test_half_of_the_places_are_stable_at_any_op():
     T = np.repeat([3, 5, 10, 30], 600)
     right = np.where(rng.random(len(T)) < 0.5, 0.98, 0.75)[:, None]
     wrong = (rng.random((len(T), 30)) > right).astype(int)
-    likely = steady(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
+    likely = stability_posterior(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
     assert [likely[t == T].mean() for t in (3, 5, 10, 30)] == pytest.approx([0.5] * 4, abs=0.06)
 
 
@@ -154,14 +154,14 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     labels = np.where(flicker, rng.integers(0, 3, size=flicker.shape), (true + place) % 3)
     table = log_of(labels, index=grid(side)).table()
     truth = join_truth(table, log_of(true, index=grid(side)).table())
-    found = quadrants(table, truth, Places.of(table, where=table.op > 0))
+    found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
     assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
     assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
 
 
 def test_without_a_voxel_that_counts_quadrants_are_undefined():
     table = log_of([[0, 0]]).table()
-    found = quadrants(table, join_truth(table, table), Places.of(table, where=table.op > 0))
+    found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
     assert found.voxels == 0
     assert math.isnan(found.stable_wrong.value)
     assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)

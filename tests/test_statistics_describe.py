@@ -16,9 +16,25 @@ from semstab.core.json_form import from_json, to_json
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.contrast import BackboneComparison
-from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, ClassReach, Interval, Judged, MapStatistics, Reach
+from semstab.model.statistics import (
+    NEXT_FLIGHT,
+    UNKNOWN,
+    CeilingShare,
+    ClassCeilingShare,
+    HeadlineStatistics,
+    Interval,
+    MapStatistics,
+)
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
+from semstab.statistics import (
+    MapSample,
+    analyse,
+    compare_backbones,
+    describe,
+    expected_sbd,
+    krippendorff_alpha,
+    verdict,
+)
 from semstab.statistics.agreement import PSA
 
 SIDE, F = 24, 8
@@ -42,7 +58,7 @@ def ground_truth():
 @pytest.fixture(scope="module")
 def described():
     events = backbone(0.2, 0, place=0.2)
-    return analyse(events.table(), events, ground_truth(), limit=ground_truth(), name="sim")
+    return analyse(MapSample.draw(events.table(), events, ground_truth()), name="sim")
 
 
 # --- One map ----------------------------------------------------------------------------------------------------------
@@ -62,9 +78,9 @@ def test_how_many_voxels_are_summed_at_a_time_does_not_matter(monkeypatch, soft)
     """All numbers to 1e-12, also the ends of intervals, and which sums by class are known."""
     table = backbone(0.2, 0, place=0.2).table()
     table = replace(table, self_sum=np.where(np.arange(len(table)) == 7, 0.9, 1.0) * table.self_sum) if soft else table
-    whole = analyse(table)
+    whole = analyse(MapSample.draw(table))
     monkeypatch.setattr("semstab.model.evidence.STRETCH", 50)
-    parts = analyse(table)
+    parts = analyse(MapSample.draw(table))
     assert differences(to_json(whole.summary), to_json(parts.summary), tolerance=1e-12) == []
     for name in ("class_own", "sbd_excess"):
         np.testing.assert_allclose(whole.sums[name].sum(axis=0), parts.sums[name].sum(axis=0), rtol=1e-12)
@@ -90,10 +106,11 @@ def test_a_description_holds_what_the_functions_say(described):
     assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 
-def test_every_map_has_a_value_for_every_voxel(described):
-    assert {len(values) for values in described.maps.values()} == {SIDE**2}
-    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(described.maps)
-    assert 0 <= np.nanmin(described.maps["stable"]) < np.nanmax(described.maps["stable"]) <= 1
+def test_every_column_has_a_value_for_every_voxel(described):
+    columns = described.columns(backbone(0.2, 0, place=0.2).table())
+    assert {len(values) for values in columns.values()} == {SIDE**2}
+    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(columns)
+    assert 0 <= np.nanmin(columns["stable"]) < np.nanmax(columns["stable"]) <= 1
 
 
 def test_the_same_seed_gives_the_same_description():
@@ -162,15 +179,17 @@ def between(low, high):
 def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, classes=()):
     """By alpha between frames as it is, or where there is a ceiling by the share of it that is reached."""
     middle = between(low, high)
-    numbers = Judged(*[middle] * 5, wrong_of_stable=wrong)
+    numbers = HeadlineStatistics(*[middle] * 5, wrong_of_stable=wrong)
     reach = (
-        None if ceiling is None else Reach("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
+        None
+        if ceiling is None
+        else CeilingShare("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
     )
-    return verdict("net", judged=numbers, reach=reach, voxels=voxels, share=0.5, blocks=blocks)
+    return verdict("net", headline=numbers, ceiling=reach, voxels=voxels, share=0.5, blocks=blocks)
 
 
 def of_class(name, low, high, *, matters=True):
-    return ClassReach(name, 200.0, matters, 0.5, 0.9, between(low, high))
+    return ClassCeilingShare(name, 200.0, matters, 0.5, 0.9, between(low, high))
 
 
 @pytest.mark.parametrize(
@@ -217,7 +236,9 @@ def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames
     assert "intervals are for these 8 frames: fly 30 or more to tell of the next flight" in few
     assert "these frames: keep a log" in describe(events.table()).verdict.line
     alike = Interval(0.9, 0.85, 0.95, undecided="errors reach as far as the scene: fly more of it")
-    found = verdict("net", judged=Judged(*[alike] * 5, UNKNOWN), reach=None, voxels=5000, share=0.5, blocks=40)
+    found = verdict(
+        "net", headline=HeadlineStatistics(*[alike] * 5, UNKNOWN), ceiling=None, voxels=5000, share=0.5, blocks=40
+    )
     assert found.level == "undecided"
     assert "fly more of it" in found.line
 

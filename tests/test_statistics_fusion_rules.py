@@ -10,7 +10,7 @@ from semstab.errors import ConfigError
 from semstab.metrics import entropy, sbd, vss
 from semstab.model.information import js_divergence, normalise
 from semstab.statistics import RULES, fuse
-from semstab.statistics.order.fusion_rules import labels
+from semstab.statistics.fusion_rules import labels
 
 
 def step_by_step(evidence, rule, floor=0.01):

@@ -13,9 +13,9 @@ from striped_floor import K, flight, sampler_of
 from semstab import backends
 from semstab.errors import DataError
 from semstab.model.contrast import CommonLooks
-from semstab.statistics import Looks, compare_backbones, psa
-from semstab.statistics.looks.common import common, psa_bounds
-from semstab.statistics.versus.standard import Observed
+from semstab.statistics import CellObservations, compare_backbones, psa
+from semstab.statistics.common_observations import common_observations, psa_bounds
+from semstab.statistics.paired_differences import stratum_counts, thin_share
 
 SIZE = 0.2
 
@@ -112,30 +112,30 @@ def test_strata_of_op_that_hardly_overlap_are_said():
     found = compare_backbones({"a": tables["often"], "b": few})
     assert found.standardised.thin == 1
     same = {"a": tables["often"], "b": tables["often"]}
-    assert Observed.of(same).thin(np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
+    assert thin_share(stratum_counts(same), np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
 
 
 def test_looks_come_back_from_their_file(tmp_path):
     looks = sampler_of(flight(4, flicker=0.2), 0.4).looks(("a", "b", "c"))
     looks.save(tmp_path / "looks.parquet")
-    back = Looks.load(tmp_path / "looks.parquet")
-    (a, b) = common([looks, back]).logs
+    back = CellObservations.load(tmp_path / "looks.parquet")
+    (a, b) = common_observations([looks, back]).logs
     np.testing.assert_array_equal(a.evidence, b.evidence)
     np.testing.assert_array_equal(looks.observations().frame, back.observations().frame)
     assert back.classes == ("a", "b", "c")
     np.testing.assert_array_equal(back.views.rows(), looks.views.rows())
     (tmp_path / "other.parquet").write_bytes(b"no")
     with pytest.raises(DataError, match="not a file of sampled looks"):
-        Looks.load(tmp_path / "other.parquet")
+        CellObservations.load(tmp_path / "other.parquet")
 
 
 def test_samples_of_other_voxels_are_refused_and_less_dense_ones_are_met():
     looks = sampler_of(flight(4), 0.4).looks()
     with pytest.raises(DataError, match="fuse both alike"):
-        common([looks, sampler_of(flight(4), 0.2).looks()])
+        common_observations([looks, sampler_of(flight(4), 0.2).looks()])
     thinned = sampler_of(flight(4), 0.4, budget=1500).looks()
     assert thinned.share < looks.share
-    both = common([looks, thinned])
+    both = common_observations([looks, thinned])
     assert both.missing == (0, 0)
     assert len(both.logs[0]) == len(both.logs[1]) == len(thinned.observations())
 
@@ -144,13 +144,13 @@ def test_samples_that_began_elsewhere_meet_on_the_same_cells():
     frames = list(flight(6, flicker=0.2, step=0.5))
     looks, back = sampler_of(frames, 0.1).looks(), sampler_of(frames[::-1], 0.1).looks()
     assert looks.low != back.low
-    both = common([looks, back])
+    both = common_observations([looks, back])
     assert both.missing == (0, 0)
     np.testing.assert_array_equal(both.logs[0].evidence, both.logs[1].evidence)
     np.testing.assert_array_equal(both.logs[0].evidence, looks.observations().evidence)
     far = dataclasses.replace(back, low=(back.low[0], back.low[1] - (1 << 19), back.low[2]))
     with pytest.raises(DataError, match="larger voxels"):
-        common([looks, far])
+        common_observations([looks, far])
 
 
 def test_looks_stay_as_they_were_when_more_frames_come():

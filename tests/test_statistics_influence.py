@@ -9,10 +9,12 @@ from simulated_events import grid, log_of, log_of_evidence, soft
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
+from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
+from semstab.statistics.cluster_sums import ClusterSums, aligned, merged_sums, value
 from semstab.statistics.correctness import correctness
-from semstab.statistics.order.drift import expected_sbd
-from semstab.statistics.sampling import (
+from semstab.statistics.drift import expected_sbd
+from semstab.statistics.intervals import (
     coverage,
     difference,
     difference_over_frames,
@@ -20,9 +22,7 @@ from semstab.statistics.sampling import (
     mean_over_frames,
     same_flight,
 )
-from semstab.statistics.sampling.collect import influence_sums
-from semstab.statistics.sampling.influence import InfluenceSums, aligned, merged, value
-from semstab.statistics.steady import steady
+from semstab.statistics.stability import stability_posterior
 
 
 def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
@@ -43,7 +43,7 @@ def test_the_sums_give_every_number_back(soft_evidence):
     table, log, truth = flight(soft_evidence=soft_evidence)
     again, often = table.op >= 2, table.op >= 3
     right = dominant(table) == truth
-    stable = np.where(often, steady(table), 0.0)
+    stable = np.where(often, stability_posterior(table), 0.0)
     excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
         "psa": psa(table)[again].mean(),
@@ -58,9 +58,9 @@ def test_the_sums_give_every_number_back(soft_evidence):
         "sbd_excess": np.nan if soft_evidence else np.nanmean(excess[again]),
     }
     for given in (log, None):
-        sums = influence_sums(table, given, truth, sbd_excess=excess)
+        sums = cluster_sums_of(table, given, truth, sbd_excess=excess)
         assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)
-    sums = influence_sums(table, log, truth)
+    sums = cluster_sums_of(table, log, truth)
     by_class = [row.alpha for row in class_agreement(table, log)]
     assert [value(sums, "alpha", k) for k in range(3)] == pytest.approx(by_class)
     true_one = again & (truth == 1)
@@ -72,21 +72,21 @@ def test_the_sums_give_every_number_back(soft_evidence):
 
 def test_parts_of_a_map_add_up_and_a_file_holds_them(tmp_path):
     table, log, truth = flight(side=16)
-    whole = influence_sums(table, log, truth)
+    whole = cluster_sums_of(table, log, truth)
     coarse = whole.coarsened(4 * whole.edge, 2)
     assert (coarse.edge, coarse.step, coarse.frames) == (4 * whole.edge, 2, 5)
     assert coarse.cells < whole.cells
     assert value(coarse, "alpha") == pytest.approx(value(whole, "alpha"))
     parts = [flight(side=16, seed=seed) for seed in (0, 1)]
-    together = merged(*(influence_sums(*part) for part in parts))
+    together = merged_sums(*(cluster_sums_of(*part) for part in parts))
     assert together["observations"].sum() == sum(p[0].op[p[0].op >= 2].sum() for p in parts)
     whole.save(tmp_path / "sums.parquet")
-    again = InfluenceSums.load(tmp_path / "sums.parquet")
+    again = ClusterSums.load(tmp_path / "sums.parquet")
     assert np.array_equal(again.columns, whole.columns)
     assert (again.edge, again.step, again.truth) == (whole.edge, 1, True)
     assert aligned(again, coarse)[0].cells == coarse.cells
     with pytest.raises(DataError, match="not a file of influence sums"):
-        InfluenceSums.load(__file__)
+        ClusterSums.load(__file__)
 
 
 def test_a_share_is_the_frames_own_quality():
@@ -94,7 +94,7 @@ def test_a_share_is_the_frames_own_quality():
     labels = np.zeros((50, 5), dtype=int)
     labels[:25, 2] = 1
     table = (log := log_of(labels, index=grid(8)[:50])).table()
-    sums = influence_sums(table, log)
+    sums = cluster_sums_of(table, log)
     share = np.bincount(sums.frame, weights=sums["agreeing"][:, 0]) / 50
     assert share.sum() == pytest.approx((table.op * psa(table)).mean())
     lost = share - share[0]
@@ -110,13 +110,13 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert "too few frames" in mean_over_frames(np.arange(12), np.append(values[:11], np.nan)).undecided
     table, log, truth = flight(side=16)
     kept = table.index[:, 0] < 12
-    whole = influence_sums(table, log, truth)
-    part = influence_sums(rows_of(table, np.flatnonzero(kept)))
+    whole = cluster_sums_of(table, log, truth)
+    part = cluster_sums_of(rows_of(table, np.flatnonzero(kept)))
     assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean() - 1)
     assert (coverage(whole, whole).low, coverage(whole, whole).high) == (0.0, 0.0)
     assert same_flight(whole, whole)
     assert not same_flight(whole, part)
-    other = influence_sums(table, log, 1 - truth)
+    other = cluster_sums_of(table, log, 1 - truth)
     assert identical(whole, other, "alpha")
     assert not identical(whole, other, "accuracy")
     nothing = difference(whole, other, "alpha")
@@ -129,14 +129,14 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
 def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers():
     table = (log := log_of(np.zeros((9, 1), dtype=int), index=grid(3))).table()
     for given in (log, None):
-        sums = influence_sums(table, given, np.zeros(9, dtype=np.int64), sbd_excess=np.full(9, np.nan))
+        sums = cluster_sums_of(table, given, np.zeros(9, dtype=np.int64), sbd_excess=np.full(9, np.nan))
         assert np.isnan([value(sums, key) for key in ("alpha", "miou", "ece", "sbd_excess")]).all()
 
 
 def test_at_most_so_many_cubes_and_groups_of_frames():
     labels = np.zeros((40 * 40, 150), dtype=int)
     log = log_of(labels, index=grid(40))
-    sums = influence_sums(log.table(), log)
+    sums = cluster_sums_of(log.table(), log)
     assert (sums.cells, sums.edge) == (256, 0.5)
     assert (sums.frames, sums.step) == (38, 4)
-    assert merged(sums, sums).cells == sums.cells
+    assert merged_sums(sums, sums).cells == sums.cells

@@ -13,27 +13,25 @@ from scipy import stats
 from simulated_events import grid, log_of
 
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval
+from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import ratio_of
-from semstab.statistics.sampling import (
-    Places,
-    answers,
-    asked_of,
+from semstab.statistics.cluster_sums import merged_sums, value
+from semstab.statistics.correlation import cluster_grids
+from semstab.statistics.intervals import (
+    NO_PLACES,
+    confidence_intervals,
     difference,
     estimate,
-    influence_sums,
     mean_of,
-    merged,
+    spec_of,
     standard_error,
     unpaired,
-    value,
 )
-from semstab.statistics.sampling.arrangement import arranged
-from semstab.statistics.sampling.intervals import NO_PLACES
 
 
 def sums_from(labels, side, voxel_size=0.125):
     log = log_of(labels, K=2, index=grid(side)[: len(labels)], voxel_size=voxel_size)
-    return influence_sums(log.table(), log)
+    return cluster_sums_of(log.table(), log)
 
 
 def simulated(seed=0, **settings):
@@ -74,7 +72,7 @@ def test_no_error_seen_is_not_no_error():
 def test_what_weighs_next_to_nothing_is_nowhere():
     """Of 150 classes so few voxels may be stable that the square of their number is none any more."""
     rng = np.random.default_rng(0)
-    places = Places.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
+    places = Cubes.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
     columns = np.stack([rng.random(32 * 32) < 0.3, np.ones(32 * 32)], axis=1)
     assert places.estimate(columns, ratio_of).decided
     assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_PLACES
@@ -152,10 +150,10 @@ def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
     labels[: 24 * 16] = 0
     labels[: 24 * 8, 2:] = -1  # seen twice
     log = log_of(labels, K=2, index=grid(24), voxel_size=0.125)
-    sums = influence_sums(log.table(), log)
+    sums = cluster_sums_of(log.table(), log)
     elsewhere = dataclasses.replace(sums, cell=sums.cell + np.array([5, -3, 2], np.int32))
     numbers = [("psa", None), ("alpha", None), ("vss", None), ("alpha", 1)]
-    together = answers(asked_of(sums, key, k) for key, k in numbers)
+    together = confidence_intervals(spec_of(sums, key, k) for key, k in numbers)
     assert len({found.places for found in together}) > 1
     for (key, k), found in zip(numbers, together, strict=True):
         alone = estimate(elsewhere, key, k)
@@ -169,10 +167,10 @@ def test_the_order_of_cells_does_not_depend_on_what_was_asked_before():
     large = np.random.default_rng(0).permutation(np.stack(np.divmod(np.arange(30), 6), axis=1))
     small = large[:20]
     for far in range(20):  # whatever is at hand from before is gone
-        arranged([large + far])
-    (alone,) = arranged([small])
-    with_more = arranged([large, small[::2], small])[2]
-    (again,) = arranged([small])
+        cluster_grids([large + far])
+    (alone,) = cluster_grids([small])
+    with_more = cluster_grids([large, small[::2], small])[2]
+    (again,) = cluster_grids([small])
     assert not np.array_equal(with_more.of.at, alone.of.at)
     np.testing.assert_array_equal(again.of.at, alone.of.at)
     np.testing.assert_array_equal(again.order, alone.order)
@@ -212,7 +210,7 @@ def test_parts_of_a_map_have_its_interval():
     left = sums.cell[:, 0] < 10
     parts = [dataclasses.replace(sums, cell=sums.cell[on], frame=sums.frame[on], columns=sums.columns[on])
              for on in (left, ~left)]  # fmt: skip
-    assert estimate(merged(*parts), "alpha") == estimate(sums, "alpha")
+    assert estimate(merged_sums(*parts), "alpha") == estimate(sums, "alpha")
 
 
 # --- Coverage, a small part of simulations -----------------------------------------------------------------------

@@ -17,17 +17,17 @@ from semstab import backends
 from semstab.datasets import open_dataset
 from semstab.metrics.agreement import shared_observations
 from semstab.statistics import (
-    Sample,
+    ObservationSample,
     Sampler,
     Views,
     alpha_between,
+    ceiling_share,
     describe,
     disagreement,
     krippendorff_alpha,
     psa,
-    reach_of,
 )
-from semstab.statistics.looks.loops import hash_row
+from semstab.statistics.loops.observations import hash_row
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
 
@@ -80,7 +80,7 @@ def test_weights_that_are_fixed_make_flights_comparable_that_linger_elsewhere():
                  (np.where(left, 20, 3), np.where(left, 3, 20))]  # fmt: skip
     easy, hard = by_flight[1], by_flight[0]
     assert easy.alpha_between.value - hard.alpha_between.value > 0.2
-    assert easy.each_place.value == pytest.approx(hard.each_place.value, abs=0.03)
+    assert easy.voxel_weighted.value == pytest.approx(hard.voxel_weighted.value, abs=0.03)
 
 
 # --- The sample -------------------------------------------------------------------------------------------------------
@@ -186,31 +186,31 @@ SIZES = (0.15, 0.3, 0.6)
 def verdict_at(voxel_size, **options):
     frames = list(flight(16, step=0.35, **options))
     table = fused(frames, voxel_size).table()
-    return describe(table, sample=sampled(frames, voxel_size))
+    return describe(table, observations=sampled(frames, voxel_size))
 
 
 def test_the_truth_reaches_its_ceiling_at_every_voxel_size_while_alpha_falls():
     found = [verdict_at(size) for size in SIZES]
     assert found[0].agreement.alpha.value - found[-1].agreement.alpha.value > 0.1
     assert {summary.verdict.level for summary in found} == {"stable"}
-    assert min(summary.reach.reached.value for summary in found) > 0.93
+    assert min(summary.ceiling_share.share.value for summary in found) > 0.93
 
 
 @pytest.mark.parametrize("patch", [None, 10])
 def test_a_coin_is_stable_at_no_voxel_size(patch):
     found = [verdict_at(size, coin=True, patch=patch) for size in SIZES]
     assert {"stable", "usable", "partly stable"}.isdisjoint(summary.verdict.level for summary in found)
-    assert max(summary.reach.reached.value for summary in found) < 0.2
+    assert max(summary.ceiling_share.share.value for summary in found) < 0.2
 
 
 def test_the_ground_truths_ceiling_takes_the_place_of_the_maps_own():
     wrong, right = sampled(flight(flicker=0.4, patch=5)), sampled(flight())
     table = fused(flight(flicker=0.4, patch=5), 0.4).table()
-    own, against = reach_of(wrong, table), reach_of(wrong.against(right), table)
+    own, against = ceiling_share(wrong, table), ceiling_share(wrong.against(right), table)
     assert against.by == "the ground truth"
     assert against.ceiling.value == pytest.approx(alpha_between(right.seen.table()))
     assert own.alpha == against.alpha
-    assert own.reached.value == pytest.approx(against.reached.value, abs=0.1)
+    assert own.share.value == pytest.approx(against.share.value, abs=0.1)
 
 
 def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
@@ -223,13 +223,13 @@ def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
     steady = np.where(rare, rng.integers(2, 4, size=(n, 1)), own)
     perfect = log_of(np.repeat(steady, 4, axis=1), K=4, index=grid(102))
     views = Views(np.arange(4), np.tile([3.0, 3.0, 9.0], (4, 1)), np.arange(4.0))
-    sample = Sample(log, perfect, views, soft=False)
-    found = describe(log.table(), sample=sample)
+    sample = ObservationSample(log, perfect, views, soft=False)
+    found = describe(log.table(), observations=sample)
     assert found.agreement.alpha.value > 0.95
     assert found.verdict.level == "partly stable"
-    assert found.reach.worst.name in ("2", "3")
-    assert found.reach.worst.reached.high < 0.6
-    assert describe(log.table(), sample=sample, critical=["0"]).verdict.level == "stable"
+    assert found.ceiling_share.worst.name in ("2", "3")
+    assert found.ceiling_share.worst.share.high < 0.6
+    assert describe(log.table(), observations=sample, critical=["0"]).verdict.level == "stable"
 
 
 def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict():
@@ -256,7 +256,7 @@ def test_the_ground_truth_of_a_real_scene_is_stable_at_every_voxel_size(voxel_si
     for frame in shelf:
         sampler.add(frame)
         backend.integrate(frame)
-    assert describe(backend.table(), sample=sampler.sample()).verdict.level == "stable"
+    assert describe(backend.table(), observations=sampler.sample()).verdict.level == "stable"
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensa
 from semstab.model.records import Variation
 from semstab.model.results import Unit
 from semstab.settings import resolve
-from semstab.statistics import Looks, compare_backbones
+from semstab.statistics import CellObservations, compare_backbones
 from semstab.task import read
 
 
@@ -324,7 +324,7 @@ def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_p
     (found,) = result.comparisons
     maps = {record.unit.backbone: record.table() for record in result.select()}
     truth = maps.pop("gt")
-    looks = {record.unit.backbone: Looks.load(record.looks_file) for record in result.select()}
+    looks = {record.unit.backbone: CellObservations.load(record.looks_file) for record in result.select()}
     looks.pop("gt")
     expected = compare_backbones(maps, truth=truth, looks=looks, scene="wall")
     assert to_json(found) == to_json(expected)

@@ -10,8 +10,7 @@ from semstab.engine.tiling.collected import Collected, Seen
 from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, sights_of
 from semstab.engine.tiling.stretches import stretches_of
-from semstab.statistics.looks import Sampler
-from semstab.statistics.looks.sampler import merged
+from semstab.statistics.sampler import Sampler, merged_observations
 from semstab.testing import random_frames
 
 ORIGIN = (0, 0, 0)
@@ -73,7 +72,7 @@ def test_samplers_of_stretches_keep_what_one_keeps(tmp_path) -> None:
         for frame in some:
             own.add(frame)
         stretches.append(own.looks(("a", "b", "c", "d")))
-    expected, found = whole.looks(("a", "b", "c", "d")), merged(stretches, budget=300)
+    expected, found = whole.looks(("a", "b", "c", "d")), merged_observations(stretches, budget=300)
     assert 0 < len(expected) <= 300
     assert expected.share < max(each.share for each in stretches)
     for name in ("cell", "view", "label", "weight", "drawn", "share", "soft", "classes"):

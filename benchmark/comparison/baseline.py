@@ -19,7 +19,7 @@ from semstab.errors import DataError, one_line
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace
 from semstab.model.results import UnitSummary
-from semstab.statistics.sampling import InfluenceSums
+from semstab.statistics.cluster_sums import ClusterSums
 
 SCHEMA, KIND = 1, "semstab small summary"
 CONTENT = "summary.json"
@@ -53,7 +53,7 @@ class Baseline:
 
     backbone: str
     scenes: Mapping[str, Kept]
-    sums: Mapping[str, InfluenceSums]
+    sums: Mapping[str, ClusterSums]
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def load_baseline(path: str | Path) -> Baseline:
             part = Path(folder) / "sums.parquet"
             part.write_bytes(data)
             try:
-                sums[scene.name] = InfluenceSums.load(part)
+                sums[scene.name] = ClusterSums.load(part)
             except DataError as error:
                 raise DataError(f"{path}: the sums of {scene.name} are damaged; write the summary again") from error
     kept = {
@@ -149,7 +149,7 @@ def load_baseline(path: str | Path) -> Baseline:
     return Baseline(content.backbone, kept, sums)
 
 
-def _archive(content: str, sums: list[InfluenceSums]) -> bytes:
+def _archive(content: str, sums: list[ClusterSums]) -> bytes:
     """The file, byte for byte the same for the same content."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, tempfile.TemporaryDirectory() as folder:
@@ -161,7 +161,7 @@ def _archive(content: str, sums: list[InfluenceSums]) -> bytes:
     return data.getvalue()
 
 
-def _coarser(sums: InfluenceSums) -> InfluenceSums:
+def _coarser(sums: ClusterSums) -> ClusterSums:
     """With half as many groups of frames where there are many, else with larger cubes."""
     if sums.step and sums.frames > MANY_GROUPS:
         return sums.coarsened(sums.edge, 2 * sums.step)

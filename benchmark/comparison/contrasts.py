@@ -29,27 +29,23 @@ from semstab.model.contrast import Contrast
 from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
+from semstab.statistics.cluster_sums import ClusterSums, functional, of_space_alone, value
 from semstab.statistics.correctness import ACCURACY, MIOU
-from semstab.statistics.sampling import (
-    InfluenceSums,
-    Places,
+from semstab.statistics.intervals import (
     coverage,
     difference,
     difference_over_frames,
     estimate,
     mean_of,
     mean_over_frames,
-    none,
-    of_places_alone,
+    no_difference,
     question_of,
     standard_error,
     unpaired,
-    value,
 )
-from semstab.statistics.sampling.influence import functional
-from semstab.statistics.versus.differences import holm
-from semstab.statistics.versus.standard import LEAST_VOXELS
+from semstab.statistics.paired_differences import LEAST_VOXELS, holm
 
 FORGIVING, DECIDED = (REACHED, ALPHA_BETWEEN), (ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that forgive what a score leaves open, and those of the fused labels alone."""
@@ -141,7 +137,7 @@ def _comparable(quantity: Quantity, common: Common) -> bool:
 
 
 def _row(
-    quantity: Quantity, base: InfluenceSums, other: InfluenceSums, common: Common, k: int | None = None, of: str = ""
+    quantity: Quantity, base: ClusterSums, other: ClusterSums, common: Common, k: int | None = None, of: str = ""
 ) -> Iterator[Contrast]:
     """A number of the sums, where either run has it."""
     key = quantity.key
@@ -150,7 +146,7 @@ def _row(
         yield Contrast(key, of, before, after, _difference(base, other, key, k, common), math.nan, "")
 
 
-def _difference(base: InfluenceSums, other: InfluenceSums, key: str, k: int | None, common: Common) -> Interval:
+def _difference(base: ClusterSums, other: ClusterSums, key: str, k: int | None, common: Common) -> Interval:
     question, number = _question(key, k, base, other), functional(key, k)
     if common.basis == "flights":
         return unpaired(estimate(other, key, k, question), estimate(base, key, k, question))
@@ -159,18 +155,21 @@ def _difference(base: InfluenceSums, other: InfluenceSums, key: str, k: int | No
     return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
 
 
-def _question(key: str, k: int | None, *sums: InfluenceSums) -> Question:
-    all_tell = {question_of(own) for own in sums} == {NEXT_FLIGHT} and not of_places_alone(key, k)
+def _question(key: str, k: int | None, *sums: ClusterSums) -> Question:
+    all_tell = {question_of(own) for own in sums} == {NEXT_FLIGHT} and not of_space_alone(key, k)
     return NEXT_FLIGHT if all_tell else THIS_MAP
 
 
 def _same_ceiling(base: Entry, other: Entry) -> bool:
     """Whether both judge against the same labels: those of the truth, or their own in finer cells."""
     found = [entry.summary.statistics for entry in (base, other)]
-    return len({own.reach.by if own is not None and own.reach is not None else "" for own in found} - {""}) == 1
+    return (
+        len({own.ceiling_share.by if own is not None and own.ceiling_share is not None else "" for own in found} - {""})
+        == 1
+    )
 
 
-def _coverage(base: InfluenceSums, other: InfluenceSums) -> Contrast:
+def _coverage(base: ClusterSums, other: ClusterSums) -> Contrast:
     change = _with_p_value(coverage(other, base))
     return Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
 
@@ -193,10 +192,10 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     known = ~np.isnan(before) & ~np.isnan(after)
     if not known.any():
         return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
-    places, columns = Places.of(base, edge, where=known), np.stack([after - before, known], axis=1)
+    places, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
     before, after = before[known], after[known]
     change = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
-    found = none(change) if np.array_equal(before, after) else _with_p_value(change)
+    found = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
     return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
 
 
@@ -226,7 +225,7 @@ def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str]
                 yield from _row(quantity, before, after, common, k, name)
 
 
-def _enough(sums: InfluenceSums, k: int) -> bool:
+def _enough(sums: ClusterSums, k: int) -> bool:
     """Whether a class has evidence worth so many voxels."""
     seen = sums["observations"].sum() / max(sums["voxels"].sum(), 1e-9)
     return bool(sums["evidence"][:, k].sum() >= LEAST_VOXELS * seen)

@@ -17,7 +17,7 @@ from semstab.report.figures.statistics import draw_intervals
 from semstab.report.figures.style import Figure
 from semstab.statistics.agreement import PSA
 from semstab.statistics.correctness import MIOU
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.intervals import LEAST_FRAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -19,21 +19,19 @@ from semstab.comparison.tables import COVERAGE, FLICKER, SBD_EXCESS
 from semstab.config import nearest, read_yaml, validated
 from semstab.errors import ConfigError, DataError
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
-from semstab.statistics.sampling import (
+from semstab.statistics.cluster_sums import ClusterSums, of_space_alone, sums_for, value
+from semstab.statistics.intervals import (
+    LEAST_DEGREES,
     LEAST_FRAMES,
-    InfluenceSums,
+    TOO_FEW,
     coverage,
     difference,
     difference_over_frames,
     estimate,
     mean_of,
     mean_over_frames,
-    of_places_alone,
     same_flight,
-    value,
 )
-from semstab.statistics.sampling.influence import columns_of
-from semstab.statistics.sampling.intervals import LEAST_DEGREES, TOO_FEW
 
 # The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
 
@@ -148,8 +146,8 @@ def verdict(rule: Rule, found: Interval) -> Verdict:
 
 
 def change(
-    new: InfluenceSums,
-    base: InfluenceSums,
+    new: ClusterSums,
+    base: ClusterSums,
     measure: GateMeasure,
     k: int | None,
     level: float,
@@ -167,7 +165,7 @@ def change(
 
 
 def rule_value(
-    new: InfluenceSums, measure: GateMeasure, k: int | None, level: float, frames: Frames = "random"
+    new: ClusterSums, measure: GateMeasure, k: int | None, level: float, frames: Frames = "random"
 ) -> Interval:
     """The number itself, each end of its interval missed with probability `level`."""
     key = measure.key
@@ -175,10 +173,10 @@ def rule_value(
 
 
 def _question(key: str, k: int | None, frames: Frames) -> Question:
-    return THIS_MAP if frames == "fixed" or of_places_alone(key, k) else NEXT_FLIGHT
+    return THIS_MAP if frames == "fixed" or of_space_alone(key, k) else NEXT_FLIGHT
 
 
-def comparable(new: InfluenceSums, base: InfluenceSums) -> tuple[InfluenceSums, InfluenceSums]:
+def comparable(new: ClusterSums, base: ClusterSums) -> tuple[ClusterSums, ClusterSums]:
     """Both without what only one of them knows of the ground truth."""
     if new.truth == base.truth:
         return new, base
@@ -209,7 +207,7 @@ def of_frames(found: Interval, frames: int) -> Interval:
     return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))
 
 
-def _frames(*sums: InfluenceSums) -> int:
+def _frames(*sums: ClusterSums) -> int:
     return min(own.frames * own.step for own in sums)
 
 
@@ -408,7 +406,7 @@ def _has(rule: Rule, entry: Entry) -> bool:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
         return True
-    columns = columns_of(entry.sums, rule.measure.key, _k(rule, entry))
+    columns = sums_for(entry.sums, rule.measure.key, _k(rule, entry))
     return bool(columns.size) and (rule.measure.quantity is not SBD_EXCESS or bool(columns[:, 1].any()))
 
 

@@ -17,7 +17,7 @@ from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace, Record, Result
 from semstab.model.results import Unit, UnitSummary
-from semstab.statistics.sampling import InfluenceSums
+from semstab.statistics.cluster_sums import ClusterSums
 
 Flicker = Mapping[int, float]
 """Percent of the pixels whose label differs from that of the frame before, by frame index."""
@@ -40,7 +40,7 @@ class Entry:
     up: tuple[float, float, float] | None
     seed: int | None
     record: Record | None
-    read_sums: Callable[[], InfluenceSums]
+    read_sums: Callable[[], ClusterSums]
     read_flicker: Callable[[], Flicker]
 
     @property
@@ -49,7 +49,7 @@ class Entry:
         return self.summary.unit
 
     @functools.cached_property
-    def sums(self) -> InfluenceSums:
+    def sums(self) -> ClusterSums:
         """Its sums by frame and cube of space. Raises DataError where the run kept none."""
         return self.read_sums()
 
@@ -178,12 +178,12 @@ def _entry(folder: Path, result: Result, record: Record) -> Entry:
     )
 
 
-def _sums(folder: Path, record: Record) -> InfluenceSums:
+def _sums(folder: Path, record: Record) -> ClusterSums:
     file = record.influence_file
     if file is None or not file.is_file():
         raise DataError(f"{folder}: kept no sums by frame and place of {record.unit.slug}; run it again")
     try:
-        return InfluenceSums.load(file)
+        return ClusterSums.load(file)
     except DataError as error:
         raise DataError(f"{error}; run it again") from error
 

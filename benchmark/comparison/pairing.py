@@ -19,13 +19,13 @@ from semstab.model.measures import sbd
 from semstab.model.records import Record
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.common_observations import compared_observations
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.looks import Looks
-from semstab.statistics.looks.ignored import common_looks
-from semstab.statistics.order.drift import expected_sbd, streams
-from semstab.statistics.sampling import InfluenceSums, influence_sums
-from semstab.statistics.versus.backbones import Region, Regions, truth_at
-from semstab.statistics.versus.comparison import coverage_of, held, repeated_rows
+from semstab.statistics.drift import expected_sbd, streams
+from semstab.statistics.model_comparison import Region, Regions, coverage_of, held, repeated_rows, truth_at
+from semstab.statistics.observations import CellObservations
 
 NEAR = 1e-3
 """Metres within which cameras of the same frame lie."""
@@ -70,7 +70,7 @@ class Common:
 
     basis: Basis
     remarks: tuple[str, ...]
-    sums: tuple[InfluenceSums, ...]
+    sums: tuple[ClusterSums, ...]
     mixed: bool = False
     tables: tuple[VoxelTable, ...] = ()
     logs: tuple[Events, ...] = ()
@@ -83,7 +83,7 @@ class Common:
     frames_differ: bool = False
     shown: float = 1.0
 
-    def among(self, where: Mask) -> tuple[InfluenceSums, ...]:
+    def among(self, where: Mask) -> tuple[ClusterSums, ...]:
         """The sums of some of the common places (n,)."""
         return tuple(
             _sums(rows_of(table, where), _some(log, where), None if self.label is None else self.label[where])
@@ -157,7 +157,7 @@ def _by_looks(names: Sequence[str], records: Sequence[Record], regions: Regions)
     there = [own for own in looks if own is not None]
     if len(there) < len(looks) or not _same_frames(there):
         return None
-    shared = common_looks(dict(zip(names, there, strict=True)))
+    shared = compared_observations(dict(zip(names, there, strict=True)))
     tables = tuple(log.table() for log in shared.logs.values())
     if not any(table.op.max(initial=0) >= 2 for table in tables):
         return None
@@ -208,20 +208,20 @@ def _of_whole_maps(basis: Basis, remark: str, entries: Sequence[Entry]) -> Commo
     return Common(basis, (remark,), sums)
 
 
-def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> InfluenceSums:
-    return influence_sums(table, log, label, sbd_excess=sbd(table) - expected_sbd(table))
+def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> ClusterSums:
+    return cluster_sums_of(table, log, label, sbd_excess=sbd(table) - expected_sbd(table))
 
 
 def _some(log: Events | None, where: Mask) -> Events | None:
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
 
 
-def _looks_of(record: Record) -> Looks | None:
+def _looks_of(record: Record) -> CellObservations | None:
     file = record.looks_file
-    return Looks.load(file) if file is not None and file.is_file() else None
+    return CellObservations.load(file) if file is not None and file.is_file() else None
 
 
-def _same_frames(looks: Sequence[Looks]) -> bool:
+def _same_frames(looks: Sequence[CellObservations]) -> bool:
     """Whether frames of one index were taken from one place, and most of the shorter flight's are in the others."""
     first, *others = (own.views for own in looks)
     for other in others:
@@ -233,7 +233,7 @@ def _same_frames(looks: Sequence[Looks]) -> bool:
     return True
 
 
-def _fewer_frames(looks: Sequence[Looks]) -> tuple[str, ...]:
+def _fewer_frames(looks: Sequence[CellObservations]) -> tuple[str, ...]:
     """Where not all of a run's frames are in the others."""
     frames = [own.views.frame for own in looks]
     both = len(functools.reduce(np.intersect1d, frames))

@@ -12,7 +12,7 @@ from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.intervals import LEAST_FRAMES
 
 # What is compared, in the order of the tables.
 

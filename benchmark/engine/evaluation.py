@@ -8,10 +8,8 @@ from collections.abc import Mapping
 from semstab.config import Config
 from semstab.datasets import GROUND_TRUTH
 from semstab.errors import ConfigError
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, BackboneComparison, Looks, Sample, analyse
-from semstab.statistics.versus.backbones import Regions, compare_regions
+from semstab.statistics import Analysis, BackboneComparison, CellObservations, MapSample, ObservationSample, analyse
+from semstab.statistics.model_comparison import Regions, compare_regions
 from semstab.task import Task
 
 
@@ -26,22 +24,15 @@ def truth_task(task: Task) -> Task | None:
     return dataclasses.replace(task, backbone=GROUND_TRUTH, mapping=mapping)
 
 
-def analyse_map(
-    task: Task,
-    config: Config,
-    table: VoxelTable,
-    events: Events | None = None,
-    truth: VoxelTable | None = None,
-    sample: Sample | None = None,
-) -> Analysis:
-    """What the statistics say of one map; `truth` is what is right, and how far geometry lets labels agree."""
+def analyse_map(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
+    """Return the statistics of one map, from a sample of its voxels and of its observations."""
     critical = config.critical_classes
-    return analyse(
-        table, events, truth, limit=truth, sample=sample, name=task.backbone, edges=config.strata, critical=critical
-    )
+    return analyse(sample, observations, name=task.backbone, edges=config.strata, critical=critical)
 
 
-def comparison(scene: str, regions: Regions, looks: Mapping[str, Looks] | None = None) -> BackboneComparison | None:
+def comparison(
+    scene: str, regions: Regions, looks: Mapping[str, CellObservations] | None = None
+) -> BackboneComparison | None:
     """Maps of a scene beside each other; None where there are not two or more of them in one label space.
 
     With the logs of all of them, also under other rules of fusion; with the sampled looks of all, on common ones.

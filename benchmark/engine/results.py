@@ -25,8 +25,8 @@ from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Resul
 from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import BackboneComparison, Looks, claimed_together
-from semstab.statistics.versus.backbones import Region, Regions
+from semstab.statistics import BackboneComparison, CellObservations, claimed_together
+from semstab.statistics.model_comparison import Region, Regions
 
 
 @dataclass
@@ -152,7 +152,9 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
         if len(there) > 1:
             regions = _regions_of(there, config, tables)
             kept = {record.unit.backbone: record.looks_file for record in there}
-            looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
+            looks = {
+                name: CellObservations.load(file) for name, file in kept.items() if file is not None and file.exists()
+            }
             found = comparison(scene, regions, looks if len(looks) == len(there) else None)
             if found is not None:
                 yield found

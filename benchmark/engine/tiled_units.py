@@ -18,13 +18,11 @@ from semstab.engine.tiling.again import SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
 from semstab.engine.tiling.portion import PART, STRETCH, Finished
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.assembly import Joined, Sampled, assembled, joined, second_looks
+from semstab.engine.work.assembly import Joined, Sampled, assembled, joined
 from semstab.engine.work.jobs import Job, Outcome, Request, failed, split
 from semstab.engine.work.memory import GB
-from semstab.engine.work.passes import look_again
 from semstab.errors import DataError, OutgrownError, SemstabError
 from semstab.model.results import Unit
-from semstab.statistics.sums import Whole
 
 # What this process puts together while others do the work.
 
@@ -77,7 +75,6 @@ class TiledUnit:
         whole = self._evened(Request.portions(planned, self.key, tiling, width), width, there)
         requests = [each for request in whole for each in self._as_cut(request, there - {_name(one) for one in whole})]
         self._requests = {_name(request): request for request in requests}
-        self._whole: Whole | None = None
         self._second: dict[str, Request] | None = None  # looks at the parts, once all of them are there
         self._again: dict[str, SeenAgain] = {}
         for name in self._requests.keys() & there:
@@ -121,8 +118,8 @@ class TiledUnit:
         name = None if outcome is None else outcome.portion
         if outcome is not None and name is not None and outcome.error is None:
             if self._second is not None:
-                self._again[name] = outcome.again or self._look_again(self._second[name])
-            elif (error := self._keep(outcome, name)) is not None:
+                raise AssertionError(name)  # no part is looked at twice
+            if (error := self._keep(outcome, name)) is not None:
                 return error
         elif outcome is not None and name is not None and outcome.outgrown and name in self._requests:
             if not self._cut(self._requests[name]):
@@ -153,18 +150,14 @@ class TiledUnit:
             assert self._sampled is not None
             sampled = self._sampled.result()
             if self._second is None:
-                parts = {name: each for name, each in finished.items() if each.about.kind == PART}
-                self._whole, looks = second_looks(self.planned, parts, sampled)
-                self._waiting = Request.of(self.planned).looking_again(looks)
-                self._second = {each.name: request for each, request in zip(looks, self._waiting, strict=True)}
+                self._waiting, self._second = [], {}
                 together = partial(joined, self.planned, finished, self._loaded, self._folder.path, sampled)
                 self._joined = self._beside.submit(together)
             if len(self._again) < len(self._second):
                 return None
             assert self._joined is not None
-            again = [self._again[name] for name in self._second]
             own = self._joined.result()
-            content = assembled(self.planned, finished, own, self._folder.path, sampled, self._whole, again)
+            content = assembled(self.planned, finished, own, self._folder.path, sampled)
             return Outcome(self.planned.identity, content)
         except SemstabError as error:
             return failed([*self._requests.values()][:1], error)[0]
@@ -174,11 +167,6 @@ class TiledUnit:
         if (found := self._folder.portion(self.key, name)) is None:
             raise DataError(f"{self.name}: part {name} is no longer in the folder as it was; start it again")
         return found
-
-    def _look_again(self, request: Request) -> SeenAgain:
-        """Here, where the worker does not see the folder."""
-        assert request.again is not None
-        return look_again(request.again, self._folder.path)
 
     def _look_ahead(self) -> None:
         """Prepare what all frames tell, once they are looked at, while others fuse the parts."""

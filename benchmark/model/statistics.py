@@ -24,6 +24,11 @@ class Estimate:
     high: float
 
     @property
+    def ends(self) -> Estimate:
+        """The value with its interval alone."""
+        return Estimate(self.value, self.low, self.high)
+
+    @property
     def percent(self) -> Estimate:
         """Of a share, in percent."""
         return Estimate(100 * self.value, 100 * self.low, 100 * self.high)
@@ -116,7 +121,7 @@ class FrameAgreement:
 
     within, between  the parts of 1 - PSA that are there within a frame, and between frames
     alpha_between    alpha of the evidence of frames: forgives what is within one
-    each_place       the same with each voxel counting once, however often it was seen: weights that flights share
+    voxel_weighted       the same with each voxel counting once, however often it was seen: weights that flights share
     """
 
     psa: Interval
@@ -126,24 +131,24 @@ class FrameAgreement:
     within: Interval
     between: Interval
     alpha_between: Interval
-    each_place: Interval
+    voxel_weighted: Interval
     classes: tuple[ClassAgreement, ...]
 
 
 @dataclass(frozen=True)
-class ClassReach:
-    """`Reach` of one class against all others.
+class ClassCeilingShare:
+    """`CeilingShare` of one class against all others.
 
-    places   the evidence for it in the whole map's voxels with OP >= 2, in voxels
-    matters  whether the verdict depends on it
+    locations           the evidence for it in the whole map's voxels with OP >= 2, in voxels
+    counts_for_verdict  whether the verdict depends on it
     """
 
     name: str
-    places: float
-    matters: bool
+    locations: float
+    counts_for_verdict: bool
     alpha: float
     ceiling: float
-    reached: Interval
+    share: Interval
 
 
 @dataclass(frozen=True)
@@ -181,32 +186,32 @@ class Correlogram:
 
 
 @dataclass(frozen=True)
-class Reach:
+class CeilingShare:
     """Alpha between frames beside its ceiling, that of labels which do not depend on the view, in sampled voxels.
 
-    Intervals are as those of `Judged`.
+    Intervals are as those of `HeadlineStatistics`.
 
     by       whose labels those are
     voxels   sampled ones with OP >= 2
-    reached  alpha / ceiling: what is left to the model, whatever the size of the voxels
+    share    alpha / ceiling: what is left to the model, whatever the size of the voxels
     """
 
     by: str
     voxels: int
     alpha: Interval
     ceiling: Interval
-    reached: Interval
-    classes: tuple[ClassReach, ...]
+    share: Interval
+    classes: tuple[ClassCeilingShare, ...]
 
     @property
-    def worst(self) -> ClassReach | None:
+    def worst(self) -> ClassCeilingShare | None:
         """The class that matters whose frames agree least; one of which nothing is known first."""
-        matter = [row for row in self.classes if row.matters]
-        return min(matter, key=lambda row: (not math.isnan(row.reached.value), row.reached.value), default=None)
+        matter = [row for row in self.classes if row.counts_for_verdict]
+        return min(matter, key=lambda row: (not math.isnan(row.share.value), row.share.value), default=None)
 
 
 @dataclass(frozen=True)
-class Judged:
+class HeadlineStatistics:
     """The numbers that a verdict rests on, with intervals for the next flight: other frames and places like these.
 
     Where frames are not known, or too few to tell, the intervals are for this map, as their `question` says. vss is at
@@ -396,15 +401,15 @@ class StratumStatistics:
 
 
 @dataclass(frozen=True)
-class BeyondCoin:
+class ExcessOverChance:
     """What a coin tossed as often as places were seen would not show; 0 for it, whatever the OP.
 
     disagreement  PSA of the places that two frames saw less that of the places that more saw
-    settling      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
+    drift_below_null      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
     """
 
     disagreement: Interval
-    settling: Interval
+    drift_below_null: Interval
 
 
 # --- One map ----------------------------------------------------------------------------------------------------------
@@ -426,8 +431,8 @@ class MapStatistics:
     verdict: StabilityVerdict
     agreement: FrameAgreement
     flipping: Flipping | None
-    judged: Judged
-    reach: Reach | None
+    headline: HeadlineStatistics
+    ceiling_share: CeilingShare | None
     correlogram: Correlogram | None
     drift: DriftStatistics
     uncertainty: EntropyParts
@@ -435,7 +440,7 @@ class MapStatistics:
     correctness: CorrectnessStatistics | None
     fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
-    beyond_coin: BeyondCoin
+    excess_over_chance: ExcessOverChance
 
     @property
     def order_known(self) -> bool:

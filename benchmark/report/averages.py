@@ -33,7 +33,7 @@ class Pooled:
     psa        pairwise semantic agreement
     alpha      Krippendorff's alpha
     drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
-    disagreement, settling  as in `BeyondCoin`
+    disagreement, drift_below_null  as in `ExcessOverChance`
     vss_error  half of the 95 % interval of VSS; without statistics as if voxels were independent and at their worst
     """
 
@@ -51,7 +51,7 @@ class Pooled:
     drift: Estimate = UNDEFINED
     drift_null: float = math.nan
     disagreement: Estimate = UNDEFINED
-    settling: Estimate = UNDEFINED
+    drift_below_null: Estimate = UNDEFINED
     vss_error: float = math.nan
 
     @property
@@ -96,8 +96,10 @@ def pooled(records: Sequence[Record]) -> Pooled:
         alpha=_estimate(records, lambda found: found.agreement.alpha),
         drift=_estimate(records, lambda found: found.drift.sbd if found.order_known else UNDEFINED),
         drift_null=_macro(records, lambda found: found.drift.null if found.order_known else UNDEFINED),
-        disagreement=_together(records, lambda found: found.beyond_coin.disagreement),
-        settling=_together(records, lambda found: found.beyond_coin.settling if found.order_known else UNDEFINED),
+        disagreement=_together(records, lambda found: found.excess_over_chance.disagreement),
+        drift_below_null=_together(
+            records, lambda found: found.excess_over_chance.drift_below_null if found.order_known else UNDEFINED
+        ),
         vss_error=_vss_error(records, voxels),
     )
 

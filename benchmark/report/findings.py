@@ -160,14 +160,14 @@ def falling_drift(voxels: Pooled) -> ClaimResult:
     strata = [row for row in voxels.strata if row.defined(SBD) >= ENOUGH]
     if len(strata) < 2:
         return _untested(f"Fewer than two strata of OP have {ENOUGH:,} voxels with an SBD.")
-    if math.isnan(voxels.settling.low):
+    if math.isnan(voxels.drift_below_null.low):
         return _untested("What a random order of the observations gives is not known; ask for statistics.")
     why = [f"No fall from {a.name} to {b.name}." for a, b in pairwise(strata) if a[SBD] - b[SBD] < VISIBLE_SBD]
-    if not voxels.settling.low > 0:
+    if not voxels.drift_below_null.low > 0:
         why.append("A coin tossed as often would show it: in random order SBD is no higher.")
     return _outcome(
         f"SBD {', '.join(f'{row[SBD]:.4f} at {row.name}' for row in strata)};"
-        f" {_way(voxels.settling, 'lower', 'higher')} than in random order for OP>=3.",
+        f" {_way(voxels.drift_below_null, 'lower', 'higher')} than in random order for OP>=3.",
         why,
     )
 

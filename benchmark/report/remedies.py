@@ -210,7 +210,7 @@ def _harm(found: Remedies, row: Remedy) -> str:
 
 def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
     qualities = [record.quality for record in records if record.quality is not None]
-    judged = [record.statistics.judged for record in records if record.statistics is not None]
+    judged = [record.statistics.headline for record in records if record.statistics is not None]
 
     def mean(name: str) -> float:
         return macro_mean([getattr(quality, name) for quality in qualities])

@@ -25,37 +25,37 @@ from semstab.statistics.agreement import (
     krippendorff_alpha,
     psa,
 )
-from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
+from semstab.statistics.ceiling import ceiling, ceiling_share, losses, rendered
 from semstab.statistics.correctness import Truth, correctness, join_truth, quadrants, reliability, stable_wrong
+from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.looks import Looks, Sample, Sampler, Views, correlogram, reach_of
-from semstab.statistics.order.drift import Flips, VoxelDrift, expected_sbd, flips, voxel_drift
-from semstab.statistics.order.fusion_rules import RULES, Fused, fuse
-from semstab.statistics.order.p_values import benjamini_hochberg
+from semstab.statistics.drift import Flips, VoxelDrift, benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.fusion_rules import RULES, Fused, fuse
+from semstab.statistics.model_comparison import compare_backbones, coverage, paired
+from semstab.statistics.observations import CellObservations, ObservationSample, Views
+from semstab.statistics.paired_differences import claimed_together, standardised
+from semstab.statistics.sample import MOST_VOXELS, MapSample
+from semstab.statistics.sampler import Sampler
 from semstab.statistics.scene_drift import SceneDrift, scene_drift
-from semstab.statistics.verdict import ceiling, losses, rendered, verdict
-from semstab.statistics.versus.backbones import compare_backbones
-from semstab.statistics.versus.comparison import coverage, paired
-from semstab.statistics.versus.differences import claimed_together
-from semstab.statistics.versus.standard import standardised
+from semstab.statistics.verdict import verdict
 
 __all__ = [
+    "MOST_VOXELS",
     "RULES",
     "Analysis",
     "BackboneComparison",
-    "BlockBootstrap",
-    "Blocks",
+    "CellObservations",
     "ClassAgreement",
     "Correctness",
     "Estimate",
     "Flips",
     "Fused",
-    "Looks",
     "Losses",
+    "MapSample",
     "MapStatistics",
+    "ObservationSample",
     "Quadrants",
     "Reliability",
-    "Sample",
     "Sampler",
     "SceneDrift",
     "StabilityVerdict",
@@ -67,6 +67,7 @@ __all__ = [
     "analyse",
     "benjamini_hochberg",
     "ceiling",
+    "ceiling_share",
     "claimed_together",
     "class_agreement",
     "compare_backbones",
@@ -86,11 +87,9 @@ __all__ = [
     "paired",
     "psa",
     "quadrants",
-    "reach_of",
     "reliability",
     "rendered",
     "scene_drift",
-    "spatial_blocks",
     "stable_wrong",
     "standardised",
     "verdict",

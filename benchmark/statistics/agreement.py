@@ -18,7 +18,6 @@ from semstab.model.events import Events
 from semstab.model.measures import Quantity, entropy
 from semstab.model.statistics import ClassAgreement
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.observed import Log
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
@@ -183,21 +182,20 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
     return class_agreement_of(class_sums(table, events), table.classes)
 
 
-def class_sums(table: VoxelTable, events: Log | None = None) -> Float64:
+def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
     """(7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2."""
     from semstab.statistics.loops.rows import add_class_sums
 
     again, one_hot, sums = table.op >= 2, table.self_sum == table.op, np.zeros((7, table.K))
-    voxels = table.voxels
     if events is None:
         one_hot, told = np.ones(len(table), np.bool_), one_hot_where(table, again)
         log, rows = table.evidence.entries, (none := np.zeros(len(table), np.int64), none)
     else:
         log, rows, told = events.evidence.entries, (events.starts, events.ends), True
-    add_class_sums(table.evidence.entries, table.op, voxels, one_hot, *rows, log, sums[:5])
+    add_class_sums(table.evidence.entries, table.op, one_hot, *rows, log, sums[:5])
     if not told:
         sums[2:5, sums[0] > 0] = np.nan
-    sums[5], sums[6] = voxels.sum(where=again), (voxels * table.op).sum(where=again)
+    sums[5], sums[6] = np.count_nonzero(again), table.op.sum(where=again, dtype=np.float64)
     return sums
 
 

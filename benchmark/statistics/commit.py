@@ -19,9 +19,9 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.measures import Beliefs, dominant, margin, vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
+from semstab.statistics.cluster_sums import cubes_of
 from semstab.statistics.correctness import Truth
-from semstab.statistics.sampling.cubes import cubes
-from semstab.statistics.sampling.intervals import of_places
+from semstab.statistics.intervals import interval_of_cubes
 
 Evidence = Literal["op", "belief", "margin"]
 
@@ -176,7 +176,7 @@ class _Labels:
     ) -> None:
         self._right, self._evidence = right, evidence
         if len(index):
-            self._cell, self._of, self._edge = cubes((index[:, 0], index[:, 1], index[:, 2]), size)
+            self._cell, self._of, self._edge = cubes_of((index[:, 0], index[:, 1], index[:, 2]), size)
 
     def least(self, precision: float, error: float) -> Threshold:
         """The threshold that leaves most of them."""
@@ -218,7 +218,9 @@ class _Labels:
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
             return _of_few(sums, error)
-        found = of_places(self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error)
+        found = interval_of_cubes(
+            self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error
+        )
         return found.value, found.low if found.decided else 0.0
 
 

@@ -18,10 +18,10 @@ from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, domi
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
+from semstab.statistics.accumulate import Cubes, CubeSums
 from semstab.statistics.agreement import STABLE, ratio_of
-from semstab.statistics.order.fusion_rules import Fused
-from semstab.statistics.sampling.places import Places, PlaceSums
-from semstab.statistics.steady import LIKELY, steady
+from semstab.statistics.fusion_rules import Fused
+from semstab.statistics.stability import LIKELY, stability_posterior
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
@@ -65,13 +65,12 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Predictions:
     """Beliefs beside the true classes, (n,) each.
 
     label, predicted  the true and the most likely class
     confidence        belief in the latter
     error             squared distance of the belief from certainty of the true class, for Brier's score
-    voxels            how many each stands for
     K                 number of classes
     """
 
@@ -79,22 +78,17 @@ class Judged:
     predicted: Int64
     confidence: Float64
     error: Float64
-    voxels: Float64
     K: int
 
     @classmethod
-    def of(cls, evidence: Float64 | Evidence, label: Int64, voxels: Float64 | None = None) -> Judged:
-        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing.
-
-        Each is of so many voxels (n,), of one where that is not given.
-        """
+    def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
+        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
         from semstab.statistics.loops.rows import square_errors
 
         kept = Evidence.of(evidence)
         found, error, rest = kept.concentration, np.empty(len(kept)), kept.unseen
         square_errors(kept.entries, np.zeros(0) if rest is None else rest, kept.K, label, error)
-        many = np.ones(len(kept)) if voxels is None else voxels
-        return cls(label, found.label.astype(np.int64), found.largest, error, many, kept.K)
+        return cls(label, found.label.astype(np.int64), found.largest, error, kept.K)
 
     @property
     def right(self) -> Mask:
@@ -105,14 +99,14 @@ class Judged:
 
 def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> Correctness:
     """Of beliefs (n, K) and true classes (n,)."""
-    return _correctness(Judged.of(belief, label), name)
+    return _correctness(Predictions.of(belief, label), name)
 
 
-def _correctness(judged: Judged, name: str = "all") -> Correctness:
+def _correctness(judged: Predictions, name: str = "all") -> Correctness:
     return correctness_of(judged_sums(judged), name)
 
 
-def judged_sums(judged: Judged) -> Float64:
+def judged_sums(judged: Predictions) -> Float64:
     """(3 + 3 BINS + 3 K,) what all that is said of them is a function of.
 
     Voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right, true and
@@ -121,19 +115,19 @@ def judged_sums(judged: Judged) -> Float64:
     return judged_where(judged, np.ones(len(judged.label), np.bool_))
 
 
-def judged_where(judged: Judged, where: Mask) -> Float64:
+def judged_where(judged: Predictions, where: Mask) -> Float64:
     """`judged_sums` of those for which `where` (n,) holds."""
     sums: Float64 = _judged_by_group(judged, where - np.int64(1), 1)[0]
     return sums
 
 
-def _judged_by_group(judged: Judged, group: Int64, groups: int) -> Float64:
+def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
     """(G, ...) `judged_sums` of each group; -1 is none."""
     from semstab.statistics.loops.rows import add_judged
 
     def of(some: slice) -> Float64:
         sums = np.zeros((groups, 3 + 3 * BINS + 3 * judged.K))
-        own = (judged.label, judged.predicted, judged.confidence, judged.error, judged.voxels)
+        own = (judged.label, judged.predicted, judged.confidence, judged.error)
         add_judged(group[some], *(values[some] for values in own), BINS, sums)
         return sums
 
@@ -165,23 +159,22 @@ def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
 
 def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
     """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
-    return rule_means_of(rule_sums(fused, where.astype(np.float64), truth))
+    return rule_means_of(rule_sums(fused, where, truth))
 
 
-def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None = None) -> Float64:
+def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None = None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
 
-    Each of what was fused stands for so many voxels (n,), 0 leaves it out.
+    Over the voxels for which `where` (n,) holds.
     """
     evidence = Evidence.of(fused.evidence).measured()
     fused = Voxels(fused.op, evidence, fused.drift_sum)
-    all_of_it = np.zeros(len(voxels), np.int64)
-    total, defined = by_group(all_of_it, [measure.of(fused) for measure in measures()], 1, voxels)
-    often = [voxels.sum(where=fused.op >= measure.lowest_op) for measure in measures()]
+    total, defined = by_group(where - np.int64(1), [measure.of(fused) for measure in measures()], 1)
+    often = [np.count_nonzero(where & (fused.op >= measure.lowest_op)) for measure in measures()]
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
         return rows
-    return np.concatenate([rows, judged_where(Judged.of(evidence, truth.label, voxels), truth.known)])
+    return np.concatenate([rows, judged_where(Predictions.of(evidence, truth.label), truth.known & where)])
 
 
 def rule_means_of(sums: Float64) -> RuleMeans:
@@ -196,7 +189,7 @@ def rule_means_of(sums: Float64) -> RuleMeans:
 
 def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:
     """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    return reliability_of(judged_sums(Judged.of(belief, label)))
+    return reliability_of(judged_sums(Predictions.of(belief, label)))
 
 
 def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[Correctness, ...]:
@@ -206,10 +199,10 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
 
 def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
     """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
-    return judged_strata(Judged.of(table.evidence, truth.label, table.voxels), table.op, truth.known, edges)
+    return judged_strata(Predictions.of(table.evidence, truth.label), table.op, truth.known, edges)
 
 
-def judged_strata(judged: Judged, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:
+def judged_strata(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:
     """The same of what is judged already, by OP (n,) and where a true class is known (n,)."""
     group = np.where(known, groups_of(op, edges), -1)
     sums = _judged_by_group(judged, group, len(edges) + 1)
@@ -222,29 +215,29 @@ def strata_of(sums: Float64, edges: Sequence[int]) -> tuple[Correctness, ...]:
     return tuple(correctness_of(own, name) for own, name in zip(sums, names, strict=True))
 
 
-def quadrants(table: VoxelTable, truth: Truth, places: Places, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, places: Cubes, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
     A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
     places were seen. `places` are those of all of the table's voxels.
     """
-    return quadrants_of(quadrant_sums(table, truth, steady(table, stable=stable), places.edge))
+    return quadrants_of(quadrant_sums(table, truth, stability_posterior(table, stable=stable), places.edge))
 
 
 QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
 
 
-def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> PlaceSums:
+def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> CubeSums:
     """What `quadrants_of` is a function of, over cubes of that edge, by the probability (n,) that each is stable."""
     counted, likely, right = _masks(table, truth, stable)
-    places = Places.of(table, edge, where=counted)
+    places = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
     sums = places.means(dict(zip(QUADRANTS, parts, strict=True)))
     wrong, every = sums["stable_wrong"][:, 0], sums["stable_right"][:, 0] + sums["stable_wrong"][:, 0]
-    return PlaceSums(places.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
+    return CubeSums(places.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
 
 
-def quadrants_of(sums: PlaceSums) -> Quadrants:
+def quadrants_of(sums: CubeSums) -> Quadrants:
     """The shares, from `quadrant_sums`."""
     voxels = int(sums["stable_right"][1])
     if not voxels:
@@ -254,7 +247,7 @@ def quadrants_of(sums: PlaceSums) -> Quadrants:
 
 def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
     """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
-    return wrong_of_steady(table, truth, steady(table, stable=stable))
+    return wrong_of_steady(table, truth, stability_posterior(table, stable=stable))
 
 
 def wrong_of_steady(table: VoxelTable, truth: Truth, stable: Float64) -> Mask:

@@ -2,37 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
 
-import numpy as np
-import numpy.typing as npt
-
-from semstab.backends import FusionBackend
-from semstab.backends.shared.association import back_project, voxel_index
-from semstab.core.types import Float64, Int64
-from semstab.errors import DataError
-from semstab.metrics import dominant
-from semstab.metrics.agreement import shared_rows, voxel_keys
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.model.statistics import (
     NEXT_FLIGHT,
-    ClassReach,
+    CeilingShare,
+    ClassCeilingShare,
     Estimate,
     Flipping,
+    HeadlineStatistics,
     Interval,
-    Judged,
     Level,
-    Losses,
-    Reach,
     StabilityVerdict,
 )
-from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.blocks import BlockBootstrap, Blocks, Occupied, interval
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.intervals import LEAST_FRAMES
 
 RELIABLE = 0.8
 """Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""
@@ -70,8 +53,8 @@ ONE_CLASS = "hardly more than one class was predicted, so that agreement says no
 def verdict(
     backbone: str,
     *,
-    judged: Judged,
-    reach: Reach | None,
+    headline: HeadlineStatistics,
+    ceiling: CeilingShare | None,
     flips: Flipping | None = None,
     voxels: int,
     share: float,
@@ -79,32 +62,32 @@ def verdict(
 ) -> StabilityVerdict:
     """Judge by the intervals, never by values alone, from voxels with OP >= 2 only.
 
-    judged         of these voxels
-    reach          the same beside its ceiling; where it is not known, alpha between frames is judged as it is
-    flips          of them, the places about which frames do not agree: few of them hide in any mean
+    headline       numbers of these voxels
+    ceiling        alpha between frames and its ceiling; where that is not known, alpha is judged as it is
+    flips          the locations about which frames do not agree: few of them hide in any mean
     voxels, share  how many they are, and of all voxels
     blocks         in how many cubes of space they lie
     """
     enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
-    level = _level(judged, reach) if enough else "no verdict"
+    level = _level(headline, ceiling) if enough else "no verdict"
     support = f"{voxels} places seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
         return StabilityVerdict(level, f"{backbone}: no verdict, {ONE_CLASS if enough else ADVICE[level]}; {support}")
-    psa, wrong = judged.psa, judged.wrong_of_stable
+    psa, wrong = headline.psa, headline.wrong_of_stable
     found = [f"two frames agree on {psa.value:.0%} of the places ({psa.low:.0%} to {psa.high:.0%})"]
-    found += [_alpha(judged.alpha_between)] if reach is None else _reached(reach)
+    found += [_alpha(headline.alpha_between)] if ceiling is None else _reached(ceiling)
     if not math.isnan(wrong.low):
         found.append(f"{wrong.value:.0%} of the stable places are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     if flips is not None and level in ACTED_ON:
         found += _flips(flips)
-    basis = _basis(judged, reach)
+    basis = _basis(headline, ceiling)
     reason = basis.undecided if level == "undecided" and basis.undecided else ADVICE[level]
     return StabilityVerdict(level, f"{backbone}: {level}, {reason}: {', '.join(found)}; {support}; {_holds(basis)}")
 
 
-def _basis(judged: Judged, reach: Reach | None) -> Interval:
+def _basis(headline: HeadlineStatistics, ceiling: CeilingShare | None) -> Interval:
     """The interval that decides."""
-    return judged.alpha_between if reach is None else reach.reached
+    return headline.alpha_between if ceiling is None else ceiling.share
 
 
 def _holds(basis: Interval) -> str:
@@ -129,165 +112,38 @@ def _flips(flips: Flipping) -> list[str]:
     return [f"not to act on: {far}{part}"]
 
 
-def _reached(reach: Reach) -> list[str]:
-    share = reach.reached
-    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {reach.ceiling.value:.2f} by {reach.by}"
+def _reached(ceiling: CeilingShare) -> list[str]:
+    share = ceiling.share
+    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {ceiling.ceiling.value:.2f} by {ceiling.by}"
     chance = ", no better than chance," if share.value < 0 else ""
-    said = [f"alpha between frames {reach.alpha.value:.2f}{chance} is {share.value:.0%} {far}"]
-    if (worst := reach.worst) is not None:
+    said = [f"alpha between frames {ceiling.alpha.value:.2f}{chance} is {share.value:.0%} {far}"]
+    if (worst := ceiling.worst) is not None:
         said.append(f"worst class {worst.name} {_class_share(worst)}")
     return said
 
 
-def _class_share(row: ClassReach) -> str:
-    if math.isnan(row.reached.value):
+def _class_share(row: ClassCeilingShare) -> str:
+    if math.isnan(row.share.value):
         return "not known"
-    chance = "no better than chance, " if row.reached.value < 0 else ""
-    return f"{chance}{row.reached.value:.0%} ({row.reached.low:.0%} to {row.reached.high:.0%})"
+    chance = "no better than chance, " if row.share.value < 0 else ""
+    return f"{chance}{row.share.value:.0%} ({row.share.low:.0%} to {row.share.high:.0%})"
 
 
-def _level(judged: Judged, reach: Reach | None) -> Level:
-    basis = _basis(judged, reach)
+def _level(headline: HeadlineStatistics, ceiling: CeilingShare | None) -> Level:
+    basis = _basis(headline, ceiling)
     if math.isnan(basis.low):
         return "no verdict"
-    if judged.wrong_of_stable.low > DANGEROUS:
+    if headline.wrong_of_stable.low > DANGEROUS:
         return "misleading"
     if basis.low < TENTATIVE or not basis.decided:
         return "unstable" if basis.decided and basis.high < TENTATIVE else "undecided"
-    if reach is not None and not reach.ceiling.value >= LEAST_CEILING:
+    if ceiling is not None and not ceiling.ceiling.value >= LEAST_CEILING:
         return "too coarse"
     if basis.low < RELIABLE:
         return "usable"
-    return "stable" if reach is None or _every_class_holds(reach) else "partly stable"
+    return "stable" if ceiling is None or _every_class_holds(ceiling) else "partly stable"
 
 
-def _every_class_holds(reach: Reach) -> bool:
+def _every_class_holds(ceiling: CeilingShare) -> bool:
     """Whether each class that matters allows at least tentative conclusions."""
-    return all(row.reached.low >= TENTATIVE for row in reach.classes if row.matters)
-
-
-# Geometry or semantics: what agreement would be left if the labels did not depend on the view at all.
-#
-# View-independent labels are fused under the same poses, depth and noise. What is lost there is geometry's: pixels that
-# fall into the wrong voxel, voxels that hold more than one thing. The rest of the loss is the model's.
-
-
-def ceiling(
-    frames: Iterable[Frame],
-    make_backend: Callable[[], FusionBackend],
-    *,
-    world: VoxelTable | None = None,
-    views: Iterable[Frame] | None = None,
-) -> VoxelTable:
-    """The map of view-independent labels: what the fusion of `frames` would be with a model that never errs.
-
-    frames        the frames as they were fused, noise included; one is held at a time
-    make_backend  makes a new, empty map of the same voxels: `lambda: create("numba", voxel_size=0.2, num_classes=7)`
-    world         a map whose dominant labels are rendered into the frames; where there is none, the frames' own labels
-                  count, which are to be the ground truth
-    views         the same frames free of the noise that was added to them: labels are seen from there
-
-    With `world` the map itself and no `views` nothing is lost, as each pixel sees the voxel that it falls into. Give
-    ground truth, a map of finer voxels, or the frames before noise was added.
-    Raises DataError where frames and views do not fit together.
-    """
-    backend = make_backend()
-    for frame in frames if world is None else rendered(frames, world, views):
-        backend.integrate(frame)
-    return backend.table()
-
-
-def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] | None = None) -> Iterator[Frame]:
-    """The frames with the labels that the map shows in them: each pixel has the dominant label of the voxel it sees.
-
-    A pixel that sees no voxel of the map is ignored. `views` (the frames themselves where not given) say where a pixel
-    sees. Raises DataError where a view is missing or differs in size from its frame.
-    """
-    labels = _Labels(world)
-    for frame, view in ((frame, frame) for frame in frames) if views is None else _paired(frames, views):
-        seen = np.full(view.shape, labels.ignore, dtype=labels.dtype)
-        seen[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
-        yield dataclasses.replace(frame, labels=seen, scores=None)
-
-
-def losses(table: VoxelTable, limit: VoxelTable, *, seed: int = 0) -> Losses:
-    """Split the disagreement in a model's map by the ceiling's map `limit` of the same voxels.
-
-    Raises DataError where the maps differ in K or voxel size.
-    """
-    edge = Occupied.of(table.index[repeated(table, limit)[0]]).edge()
-    return losses_of([loss_sums(table, limit, edge)], edge * table.voxel_size, seed=seed)
-
-
-def repeated(table: VoxelTable, limit: VoxelTable) -> list[Int64]:
-    """The rows of either map of the voxels that both saw twice or more."""
-    rows, limit_rows = shared_rows(table, limit)
-    both = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
-    return [rows[both], limit_rows[both]]
-
-
-def loss_sums(table: VoxelTable, limit: VoxelTable, edge: int) -> Float64:
-    """(B, 3 + 4) over blocks of an edge in voxels: which block, the loss, geometry's and the model's, and places."""
-    rows, limit_rows = repeated(table, limit)
-    total, geometry = 1 - psa(table)[rows], 1 - psa(limit)[limit_rows]
-    blocks, of = np.unique(table.index[rows] // edge, axis=0, return_inverse=True)
-    sums = [
-        np.bincount(of.ravel(), weights=values, minlength=len(blocks))
-        for values in (total, geometry, total - geometry, np.ones(len(rows)))
-    ]
-    return np.column_stack([blocks, *sums]).astype(np.float64)
-
-
-def losses_of(parts: Sequence[Float64], size: float, *, seed: int = 0) -> Losses:
-    """The split, from the `loss_sums` of the parts of a map over blocks of that size in metres."""
-    rows = np.concatenate(parts)
-    at, of = np.unique(rows[:, :3], axis=0, return_inverse=True)
-    blocks = Blocks(of.ravel(), len(at), size)
-    sums, weights = blocks.sums(rows[:, 3:]), BlockBootstrap(blocks, seed=seed).weights
-    total, geometry, model, places = range(4)
-
-    def mean(of: int, by: int, bounds: tuple[float, float] = (-1.0, 1.0)) -> Estimate:
-        return interval(sums[:, [of, by]], ratio_of, weights, bounds)
-
-    return Losses(
-        voxels=int(sums[:, places].sum()),
-        total=mean(total, places, (0.0, 1.0)),
-        geometry=mean(geometry, places, (0.0, 1.0)),
-        model=mean(model, places),
-        share=mean(geometry, total, (0.0, np.inf)),
-    )
-
-
-class _Labels:
-    """The dominant label of a map's voxel by its index; `ignore` where the map has no voxel."""
-
-    def __init__(self, world: VoxelTable) -> None:
-        if not len(world):
-            raise DataError("the map to render has no voxels")
-        few = world.K <= IGNORE_8BIT
-        self.dtype = np.uint8 if few else np.uint16
-        self.ignore = IGNORE_8BIT if few else IGNORE_16BIT
-        self._low = world.index.min(axis=0).astype(np.int64)
-        self._size = world.index.max(axis=0) - self._low + 1
-        (self._keys,) = voxel_keys(world.index)
-        self._labels = dominant(world).astype(self.dtype)
-
-    def at(self, index: Int64) -> npt.NDArray[np.integer]:
-        """Labels (n,) of voxel indices (3, n)."""
-        x, y, z = index - self._low[:, None]
-        inside = (
-            (np.minimum(np.minimum(x, y), z) >= 0) & (x < self._size[0]) & (y < self._size[1]) & (z < self._size[2])
-        )
-        key = (x * self._size[1] + y) * self._size[2] + z
-        row = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
-        return np.where(inside & (self._keys[row] == key), self._labels[row], self.dtype(self.ignore))
-
-
-def _paired(frames: Iterable[Frame], views: Iterable[Frame]) -> Iterator[tuple[Frame, Frame]]:
-    frames, views = iter(frames), iter(views)
-    for frame in frames:
-        view = next(views, None)
-        if view is None or view.shape != frame.shape:
-            what = "there is none" if view is None else f"it is {view.shape[1]}x{view.shape[0]}"
-            raise DataError(f"frame {frame.index}: needs a view of its size to see labels from; {what}")
-        yield frame, view
+    return all(row.share.low >= TENTATIVE for row in ceiling.classes if row.counts_for_verdict)

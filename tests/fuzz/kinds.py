@@ -58,9 +58,9 @@ from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.settings import load_config, load_study
+from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.commit import Commit
-from semstab.statistics.looks import Looks
-from semstab.statistics.sampling.influence import InfluenceSums
+from semstab.statistics.observations import CellObservations
 
 SHAPE = (12, 16)
 CAMERA = Intrinsics(12, 12, 7.5, 5.5)
@@ -224,8 +224,8 @@ def of_results(folder: Path) -> Iterator[Kind]:
     first: dict[str, Read] = {
         "voxels/*.parquet": VoxelTable.load,
         "events/*.parquet": Events.load,
-        "looks/*.parquet": Looks.load,
-        "influence/*.parquet": InfluenceSums.load,
+        "looks/*.parquet": CellObservations.load,
+        "influence/*.parquet": ClusterSums.load,
         "overview/*.npz": Overview.load,
         "units/*.json": lambda file: from_json(UnitContent, read_json(file), file),
         "summary.json": lambda _: read_result(run),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-
-from semstab.statistics.sums import Overall, SecondSums
+from typing import Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +20,7 @@ class Again:
     """
 
     name: str
-    overall: Overall
+    overall: Any
     tiles: tuple[str, ...]
     slug: str
     written: bool
@@ -32,5 +31,5 @@ class Again:
 class SeenAgain:
     """The part's sums, and digests of the files that were written, by their path in the folder."""
 
-    sums: SecondSums
+    sums: Any
     files: Mapping[str, str]

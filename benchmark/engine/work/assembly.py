@@ -6,6 +6,7 @@ import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +16,23 @@ import numpy.typing as npt
 from semstab.core.rows import Rows
 from semstab.core.types import Float64
 from semstab.datasets.formats.disk import file_digest
+from semstab.engine.evaluation import analyse_map
 from semstab.engine.series import NUMBERS, Series
-from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.portion import PART, PORTIONS, STRETCH, TRUE_LOOKS, Finished, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work.finish import no_voxels, reduced_of, unit_summary
+from semstab.engine.work.finish import SAMPLE, no_voxels, reduced_of, save_voxels, unit_summary
 from semstab.engine.work.image_space import COLUMNS, image_space_of
 from semstab.engine.work.stream import AXES, some_poses
 from semstab.engine.work.up_axis import estimate_up
 from semstab.errors import DataError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
-from semstab.model.records import FRAMES, INFLUENCE, LOOKS, VOXELS, UnitContent
+from semstab.model.parquet import tile_of
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.results import Agreement
-from semstab.model.statistics import Correlogram
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Looks, Sample
-from semstab.statistics.description import concluded
-from semstab.statistics.looks.correlogram import correlogram
-from semstab.statistics.looks.sampler import merged
-from semstab.statistics.sums import FirstSums, SecondSums, Whole
+from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample
+from semstab.statistics.sampler import merged_observations
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th is looked at for the up axis."""
@@ -42,11 +40,10 @@ UP_VOXELS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What was sampled of the frames of a unit, cell by cell, as observations, and by lag; None where nothing was."""
+    """What was sampled of the frames of a unit, cell by cell and as observations; None where nothing was."""
 
-    looks: Looks | None
-    sample: Sample | None
-    by_lag: Correlogram | None
+    looks: CellObservations | None
+    sample: ObservationSample | None
 
     @classmethod
     def of(cls, finished: Iterable[Finished], folder: Path) -> Sampled:
@@ -56,7 +53,7 @@ class Sampled:
         sample = None if looks is None else looks.sample()
         if sample is not None and true_looks is not None:
             sample = sample.against(true_looks.sample())
-        return cls(looks, sample, None if sample is None else correlogram(sample))
+        return cls(looks, sample)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,33 +118,21 @@ def assembled(
     joined: Joined,
     folder: Path,
     sampled: Sampled,
-    whole: Whole | None,
-    again: Sequence[SeenAgain],
 ) -> UnitContent:
-    """The unit's content, from what its portions come to, and second looks at its parts, in order."""
+    """The unit's content, from what its portions come to."""
     task, config, files = planned.task, planned.config, {**joined.files}
     classes, strata = task.mapping.target.classes, config.strata
-    found = None
-    if whole is not None:
-        found = concluded(
-            whole,
-            SecondSums.merged([each.sums for each in again]),
-            voxel_size=config.voxel_size,
-            classes=classes,
-            sample=sampled.sample,
-            by_lag=sampled.by_lag,
-            name=task.backbone,
-            edges=strata,
-            critical=config.critical_classes,
-        )
-        if planned.kept:
-            files |= _saved(folder, f"{INFLUENCE}/{planned.unit.slug}.parquet", found[1].save)
-            files |= {name: digest for each in again for name, digest in each.files.items()}
+    own = [name for each in finished.values() for name in each.about.files if name.startswith(f"{PORTIONS}/")]
+    found = _analysed(planned, own, folder, sampled)
+    if found is not None and planned.kept:
+        files |= _saved(folder, f"{INFLUENCE}/{planned.unit.slug}.parquet", found.sums.save)
+        if config.statistics:
+            files |= _write_tiles(planned, own, found, folder, files)
     summary = unit_summary(
         task,
         joined.rows,
         joined.sums.summary(config.voxel_size, classes, strata),
-        None if found is None else found[0],
+        None if found is None else found.summary,
         None if joined.reduced is None else reduced_of(joined.reduced),
         next((each.about.sizes for each in finished.values() if each.about.sizes), ()),
     )
@@ -192,29 +177,39 @@ def _saved(folder: Path, name: str, save: Callable[[Path], None]) -> dict[str, s
     return {name: file_digest(folder / name).hex()}
 
 
-def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> Looks | None:
+def _looks(stretches: Sequence[Finished], folder: Path, *, true: bool) -> CellObservations | None:
     """What was sampled of all frames, or of their ground truth; None where nothing was."""
     names = [name for each in stretches for name in each.about.files if name.startswith(f"{PORTIONS}/")]
     chosen = [name for name in names if name.endswith(TRUE_LOOKS) == true]
-    return merged([Looks.load(folder / name) for name in chosen]) if chosen else None
+    return merged_observations([CellObservations.load(folder / name) for name in chosen]) if chosen else None
 
 
-def second_looks(
-    planned: PlannedUnit, parts: Mapping[str, Finished], sampled: Sampled
-) -> tuple[Whole | None, list[Again]]:
-    """What all parts together tell of the map, and the second look at each that it asks for; nothing where unjudged."""
-    if not planned.judged or sampled.sample is None or not any(part.about.voxels for part in parts.values()):
-        return None, []
-    classes, slug = planned.task.mapping.target.classes, planned.unit.slug
-    whole = Whole(FirstSums.merged([FirstSums.read(part.sums, classes) for part in parts.values()]))
-    written = planned.kept and planned.config.statistics
-    looks = []
-    for name, part in parts.items():
-        tiles = tuple(file for file in part.about.files if Path(file).parent.name in ("voxels", slug))
-        tiles = tuple(file for file in tiles if file.startswith((f"{VOXELS}/", f"{PORTIONS}/")))
-        if tiles:
-            looks.append(Again(f"{name} again", whole.overall, tiles, slug, written, planned.image_space))
-    return whole, looks
+def _analysed(planned: PlannedUnit, portions: Sequence[str], folder: Path, sampled: Sampled) -> Analysis | None:
+    """The statistics of the whole map, whose tiles are written once more with its columns; None where unjudged."""
+    samples = [name for name in portions if name.endswith(SAMPLE)]
+    if not planned.judged or sampled.sample is None or not samples:
+        return None
+    whole = MapSample.merged([MapSample.load(folder / name) for name in samples])
+    if not len(whole.table):
+        return None
+    return analyse_map(planned.task, planned.config, whole, sampled.sample)
+
+
+def _write_tiles(
+    planned: PlannedUnit, portions: Sequence[str], found: Analysis, folder: Path, files: Mapping[str, str]
+) -> dict[str, str]:
+    """Write the tiles of the map with the columns of the statistics; their digests."""
+    written: dict[str, str] = {}
+    truths = {Path(name).name: folder / name for name in portions if Path(name).parent.name == "truth"}
+    for name in (name for name in files if name.startswith(f"{VOXELS}/")):
+        file, table = folder / name, VoxelTable.load(folder / name)
+        truth = VoxelTable.load(truths[file.name]) if file.name in truths else None
+        tile = tile_of(file)
+        written |= _saved(folder, name, partial(save_voxels, table, columns=found.columns(table, truth), tile=tile))
+        if truth is not None and planned.image_space:
+            path = f"{TRUTH}/{planned.unit.slug}/{file.name}"
+            written |= _saved(folder, path, partial(truth.save, tile=tile))
+    return written
 
 
 def _checked(found: Sequence[Agreement | None]) -> Agreement | None:

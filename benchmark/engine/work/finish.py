@@ -50,13 +50,12 @@ from semstab.model.results import (
 )
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, Sample
+from semstab.statistics import Analysis, MapSample, ObservationSample
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
-from semstab.statistics.correctness import join_truth
-from semstab.statistics.kinds import Kinds, spread
-from semstab.statistics.map_sums import maps_of
-from semstab.statistics.sums import first_look
 from semstab.task import Task, read
+
+SAMPLE = "sample.npz"
+"""Of the file of a part's sample of voxels, after its name."""
 
 WORST = 3
 """So many frames are named that moved the map most."""
@@ -87,7 +86,8 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("statistics"):
         truth = None if one.truth is None else _table(one.truth, task)
         events = one.backend.events() if config.statistics else None
-        found = analyse_map(task, config, table, events, truth, sample_of(one)) if one.request.judged else None
+        drawn = MapSample.draw(table, events, truth, edges=config.strata) if one.request.judged else None
+        found = None if drawn is None else analyse_map(task, config, drawn, sample_of(one))
         give_back(least=SMALL)
     with watch("measure"):
         summary = _summary(one, table, found, sizes)
@@ -118,7 +118,7 @@ def _table(backend: FusionBackend | NoMap, task: Task) -> VoxelTable:
     return dataclasses.replace(backend.table(), classes=task.mapping.target.classes)
 
 
-def sample_of(one: UnitMap) -> Sample | None:
+def sample_of(one: UnitMap) -> ObservationSample | None:
     """What was sampled of a unit's frames; its limit is the ground truth's where that was fused as well."""
     if one.sampler is None:
         return None
@@ -247,11 +247,11 @@ def finish_portion(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Part:
-    """The voxels of a part, its sums, and what statistics know of each voxel; its log, and the truth, where wanted."""
+    """The voxels of a part, its sums, and the sample that statistics rest on; its log, and the truth, where wanted."""
 
     table: VoxelTable
     sums: Mapping[str, npt.NDArray[Any]]
-    maps: Mapping[str, npt.NDArray[Any]] = dataclasses.field(default_factory=dict)
+    sample: MapSample | None = None
     events: Events | None = None
     truth: VoxelTable | None = None
 
@@ -262,19 +262,16 @@ def _looked_at(one: UnitMap, table: VoxelTable, *, judged: bool) -> _Part:
     events = None if log is None else dataclasses.replace(log, classes=table.classes)
     one.backend = NoMap()  # what comes next has its memory
     give_back()
+    sums = TableSums.of(table, config.strata).arrays()
     if not judged:
-        return _Part(table, TableSums.of(table, config.strata).arrays(), events=events)
-    if not config.statistics:
-        return _Part(table, first_look(Kinds.found(table), edges=config.strata)[0].arrays(), events=events)
+        return _Part(table, sums, events=events)
     truth = None if one.truth is None else _table(one.truth, one.task)
-    kinds = Kinds.found(table, events, None if truth is None else join_truth(table, truth)).measured()
-    sums, further, null = first_look(kinds, truth, edges=config.strata)
-    maps = spread(further | maps_of(kinds.one.table, null), kinds.of)
-    return _Part(table, sums.arrays(), maps, events, truth)
+    drawn = MapSample.draw(table, events if config.statistics else None, truth, edges=config.strata)
+    return _Part(table, sums, drawn, events, truth)
 
 
 def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part | None) -> Savers:
-    """Where the whole map has still to be waited for, voxels are written so that they are looked at again."""
+    """Tiles are written without the columns that the statistics of the whole map add."""
     unit, config = one.task.units[0], one.request.config
     savers: Savers = {}
     if stream.overview:
@@ -284,10 +281,11 @@ def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part
             savers[file] = sampler.looks(one.task.mapping.target.classes).save
     if found is None or portion.part is None:
         return savers
-    again = portion.judged and (config.statistics or not portion.kept)
-    voxels = f"{portion.folder}/voxels" if again else f"{VOXELS}/{unit.slug}"
+    if found.sample is not None:
+        savers[f"{portion.folder}/{portion.name}.{SAMPLE}"] = found.sample.save
+    voxels = f"{VOXELS}/{unit.slug}"
     for tile, rows in tiles_of(found.table, portion.part.size, portion.key):
-        if portion.kept or again:
+        if portion.kept:
             savers[f"{voxels}/{tile.name}"] = partial(_save_tile, found, rows, tile)
         if found.events is not None and config.events and portion.kept:
             savers[f"{EVENTS}/{unit.slug}/{tile.name}"] = partial(_save_events, found.events, rows, tile)
@@ -298,8 +296,7 @@ def _portion_savers(stream: Stream, one: UnitMap, portion: Portion, found: _Part
 
 
 def _save_tile(found: _Part, voxels: Int64, tile: Tile, path: Path) -> None:
-    columns = {name: values[voxels] for name, values in found.maps.items()}
-    save_voxels(found.table.rows(voxels), path, columns, tile)
+    save_voxels(found.table.rows(voxels), path, tile=tile)
 
 
 def _save_truth(truth: VoxelTable, voxels: Int64, tile: Tile, path: Path) -> None:
@@ -332,7 +329,7 @@ def _savers(
     if not one.request.kept:
         return savers
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(
-        save_voxels, table, columns=found.maps if config.statistics and found is not None else {}
+        save_voxels, table, columns=found.columns(table, truth) if config.statistics and found is not None else {}
     )
     if found is not None:
         savers[f"{INFLUENCE}/{unit.slug}.parquet"] = found.sums.save

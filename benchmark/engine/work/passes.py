@@ -10,8 +10,6 @@ import json
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,29 +20,23 @@ from semstab.config import Config
 from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch, available_bytes, resident_bytes
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
-from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import truth_task
 from semstab.engine.observer import Observer, Observers
 from semstab.engine.series import FrameRow
-from semstab.engine.tiling.again import Again, SeenAgain
-from semstab.engine.tiling.portion import PORTIONS
 from semstab.engine.tiling.sights import seen_by
-from semstab.engine.work.finish import Savers, finish, finish_portion, further_columns, save_voxels, written
-from semstab.engine.work.jobs import Job, Outcome, Request, failed, message, shared_marker
+from semstab.engine.work.finish import finish, finish_portion, written
+from semstab.engine.work.jobs import Job, Outcome, Request, failed, message
 from semstab.engine.work.memory import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, in_order, streams_of
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.model.frames import Frame
-from semstab.model.parquet import tile_of
-from semstab.model.records import TRUTH, VOXELS, RegionFlicker, UnitContent
-from semstab.model.voxels import Extent, VoxelTable
+from semstab.model.records import RegionFlicker, UnitContent
+from semstab.model.voxels import Extent
 from semstab.pixels.preparation import leave_out, perturb
 from semstab.pixels.warp import correspond
-from semstab.statistics import Sampler, Truth, join_truth
-from semstab.statistics.kinds import Kinds, spread
-from semstab.statistics.sums import SecondSums, second_look
+from semstab.statistics import Sampler
 from semstab.task import Task, frame_indices, tasks_of
 
 # What a stretch of frames sees, found by a job.
@@ -58,48 +50,6 @@ def look(job: Job, scene: Scene, request: Request) -> Outcome:
     seen = seen_by(task, config.voxel_size, config.pixel_stride, to.origin, to.cell, job.threads)
     _, files = written(job, {to.file: seen.save})
     return Outcome(request.identity, files=files)
-
-
-# The second look at the voxels of a part, taken by a job.
-
-
-def looked_again(job: Job, request: Request) -> Outcome:
-    """What was found; nothing where the folder is not to be seen from here, so that who sees it has to look."""
-    assert request.again is not None
-    shared = shared_marker(job.folder, job.start).exists()
-    found = look_again(request.again, job.folder) if shared else None
-    return Outcome(request.identity, portion=request.again.name, again=found)
-
-
-def look_again(again: Again, folder: Path) -> SeenAgain:
-    """Tile by tile."""
-    files, found = dict[str, str](), list[SecondSums]()
-    for name in again.tiles:
-        file, table = folder / name, VoxelTable.load(folder / name)
-        true = file.parents[1] / "truth" / file.name
-        truth = VoxelTable.load(true) if name.startswith(f"{PORTIONS}/") and true.exists() else None
-        kinds = Kinds.found(table, truth=_known(table, truth) if again.overall.true else None)
-        sums, more = second_look(kinds, again.overall, truth)
-        found.append(sums)
-        if again.written:
-            maps = VoxelTable.columns(file, further_columns(file))
-            columns, tile = {**maps, **spread(more, kinds.of), **again.overall.maps(table, maps)}, tile_of(file)
-            savers: Savers = {
-                f"{VOXELS}/{again.slug}/{file.name}": partial(save_voxels, table, columns=columns, tile=tile)
-            }
-            if truth is not None and again.true:
-                savers[f"{TRUTH}/{again.slug}/{file.name}"] = partial(truth.save, tile=tile)
-            for path, save in savers.items():
-                save(folder / path)
-                files[path] = file_digest(folder / path).hex()
-    return SeenAgain(SecondSums.merged(found), files)
-
-
-def _known(table: VoxelTable, truth: VoxelTable | None) -> Truth:
-    """The true classes of a tile; none where the ground truth saw nothing of it."""
-    if truth is None:
-        return Truth(np.zeros(len(table), np.bool_), np.full(len(table), -1, np.int64))
-    return join_truth(table, truth)
 
 
 # Flicker of label sources that hold regions without classes, as Segment Anything's proposals do; none is fused.
@@ -172,7 +122,6 @@ def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]
         regions = [request for request in requests if request.regions]
         outcomes += [measure_regions(job, scene, request) for request in regions]
         outcomes += [look(job, scene, request) for request in requests if request.looking is not None]
-        outcomes += [looked_again(job, request) for request in requests if request.again is not None]
         requests = tuple(request for request in requests if request.reads_frames)
         while requests:
             fused = Pass(job, scene, requests, told)

@@ -23,9 +23,9 @@ from semstab.report.figures.statistics import (
 )
 from semstab.report.figures.style import Figure
 from semstab.statistics.agreement import ALPHA, PSA
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.intervals import LEAST_FRAMES
+from semstab.statistics.model_comparison import compared
 from semstab.statistics.verdict import RELIABLE, TENTATIVE
-from semstab.statistics.versus.comparison import compared
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

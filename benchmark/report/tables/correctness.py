@@ -24,9 +24,9 @@ from semstab.report.tables.stability import of_measures, settings
 from semstab.report.tables.statistics import INTERVALS, SEEN_TWICE, Number, by_scene, grouped, judged_records
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
-from semstab.statistics.looks.correlogram import STANDARD
-from semstab.statistics.sampling import LEAST_FRAMES
-from semstab.statistics.versus.comparison import compared
+from semstab.statistics.correlogram import STANDARD
+from semstab.statistics.intervals import LEAST_FRAMES
+from semstab.statistics.model_comparison import compared
 
 RIGHT = (ACCURACY, MIOU, ECE, BRIER)
 """How right fused labels are, in the order of the columns."""

@@ -9,12 +9,12 @@ from typing import TypeVar
 from semstab.metrics import macro_mean
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.records import Record, Result
-from semstab.model.statistics import UNDEFINED, DriftStatistics, DriftTests, Estimate, MapStatistics, Reach
+from semstab.model.statistics import UNDEFINED, CeilingShare, DriftStatistics, DriftTests, Estimate, MapStatistics
 from semstab.report.averages import by_backbone
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
-from semstab.statistics.order.drift import FLIP_RATE
-from semstab.statistics.sampling import LEAST_FRAMES
+from semstab.statistics.drift import FLIP_RATE
+from semstab.statistics.intervals import LEAST_FRAMES
 from semstab.statistics.verdict import ADVICE
 
 SCENE = Column("scene", "Scene")
@@ -51,7 +51,7 @@ def temporal_agreement(result: Result) -> list[Table]:
         lambda found: found.agreement.between.value,
         lambda found: found.agreement.alpha_between.value,
         reached(lambda reach: reach.ceiling.value),
-        reached(lambda reach: reach.reached.percent),
+        reached(lambda reach: reach.share.percent),
         lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
     )
     caption = (
@@ -236,9 +236,9 @@ def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
     return lambda found: take(found.drift) if found.order_known else math.nan
 
 
-def reached(take: Callable[[Reach], float | Estimate]) -> Number:
+def reached(take: Callable[[CeilingShare], float | Estimate]) -> Number:
     """A number of the ceiling; NaN where it is not known."""
-    return lambda found: math.nan if found.reach is None else take(found.reach)
+    return lambda found: math.nan if found.ceiling_share is None else take(found.ceiling_share)
 
 
 def _value(found: float | Estimate) -> float:
@@ -270,15 +270,17 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
 
 def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
     by_name = grouped((row for found in judged for row in found.agreement.classes), lambda row: row.name)
-    reached = grouped((row for found in judged if found.reach for row in found.reach.classes), lambda row: row.name)
+    reached = grouped(
+        (row for found in judged if found.ceiling_share for row in found.ceiling_share.classes), lambda row: row.name
+    )
     return tuple(
         (
             name,
             sum(row.observations for row in rows),
             macro_mean([row.alpha for row in reached.get(name, [])]),
             macro_mean([row.ceiling for row in reached.get(name, [])]),
-            _one_or_mean([row.reached.percent for row in reached.get(name, [])]),
-            "yes" if any(row.matters for row in reached.get(name, [])) else "",
+            _one_or_mean([row.share.percent for row in reached.get(name, [])]),
+            "yes" if any(row.counts_for_verdict for row in reached.get(name, [])) else "",
             macro_mean([row.kappa for row in rows]),
             macro_mean([row.alpha for row in rows]),
         )
@@ -293,13 +295,13 @@ def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
 
 
 def _verdict_row(record: Record, found: MapStatistics) -> Row:
-    right, worst = found.correctness, None if found.reach is None else found.reach.worst
+    right, worst = found.correctness, None if found.ceiling_share is None else found.ceiling_share.worst
     return (
         record.unit.scene,
         found.verdict.level,
-        UNDEFINED if found.reach is None else found.reach.reached.percent,
+        UNDEFINED if found.ceiling_share is None else found.ceiling_share.share.percent,
         "" if worst is None else worst.name,
-        UNDEFINED if worst is None else worst.reached.percent,
+        UNDEFINED if worst is None else worst.share.percent,
         UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
         found.repeated.voxels,
         100 * found.repeated.share,

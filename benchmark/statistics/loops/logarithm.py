@@ -1,8 +1,7 @@
-"""Logarithm and power for compiled loops that the compiler turns into vector instructions, as it cannot a library's."""
+"""Logarithms for compiled loops that the compiler turns into vector instructions, as it cannot a library's."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from llvmlite import ir
@@ -10,26 +9,9 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.beliefs import plogp_of
-from semstab.backends.shared.pixel_keys import bits_of
 from semstab.backends.shared.score_loops import DOUBLES, LANES, spread
-from semstab.core.compiled import serial
-
-MANTISSA_BITS = 52
-ROUNDER = 1.5 * 2.0**MANTISSA_BITS
-"""What is added to it loses its fraction, which is rounded, and has it in its last bits."""
-
-LOWEST = -1000.0
-"""Powers below are 2^LOWEST."""
-
-LN2 = math.log(2.0)
 
 EIGHT = LANES
-
-
-@intrinsic
-def number_of(_typing: Any, _bits: Any) -> Any:
-    """The double of these bits."""
-    return types.float64(types.int64), lambda _, builder, __, given: builder.bitcast(given[0], ir.DoubleType())
 
 
 @intrinsic
@@ -89,28 +71,3 @@ def _plus(builder: Any, a: Any, b: Any) -> Any:
 
 def _times(builder: Any, a: Any, b: Any) -> Any:
     return builder.fmul(a, b, flags=["contract"])
-
-
-@serial
-def exp2_fast(x):
-    """2^x of x <= 0, to a few units in the last place: its fraction by a series, whose 14th term adds 2^-57."""
-    above = max(x, LOWEST)
-    rounded: Any = above + ROUNDER
-    y = (above - (rounded - ROUNDER)) * LN2
-    series = 1.0 / 6227020800.0
-    series = series * y + 1.0 / 479001600.0
-    series = series * y + 1.0 / 39916800.0
-    series = series * y + 1.0 / 3628800.0
-    series = series * y + 1.0 / 362880.0
-    series = series * y + 1.0 / 40320.0
-    series = series * y + 1.0 / 5040.0
-    series = series * y + 1.0 / 720.0
-    series = series * y + 1.0 / 120.0
-    series = series * y + 1.0 / 24.0
-    series = series * y + 1.0 / 6.0
-    series = series * y + 0.5
-    series = series * y + 1.0
-    series = series * y + 1.0
-    whole: Any = bits_of(rounded) << MANTISSA_BITS
-    scaled: Any = number_of(bits_of(series) + whole)
-    return scaled

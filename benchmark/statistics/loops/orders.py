@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from semstab.backends.shared.beliefs import js_term
 from semstab.backends.shared.keys import mix
-from semstab.core.compiled import compiled, serial
-from semstab.statistics.loops.asking import SOON, ask_for_bounds, ask_for_entries
-from semstab.statistics.loops.chunks import CHUNKS
-from semstab.statistics.loops.few_looks import ROUNDING
+from semstab.core.compiled import CHUNKS, compiled, serial
 from semstab.statistics.loops.logarithm import EIGHT, add_step
+
+ENUMERATED = 5
+"""Up to this OP all T! orders are gone through; 5! = 120."""
+
+ROUNDING = 1e-9
+"""Sums of the same terms in another order differ by less."""
 
 LANES = 128
 """Orders that go side by side, at most."""
@@ -159,6 +163,38 @@ def _draw_orders(order, age, T, seed, other):
 
 
 @serial
+def _shares(value, lanes, slack):
+    """The shares of the values of all orders that are as low as the first, which came, and as high."""
+    low = high = 0
+    for lane in range(lanes):
+        low += value[lane] <= value[0] + slack
+        high += value[lane] >= value[0] - slack
+    return low / lanes, high / lanes
+
+
+@serial
+def measure_all_orders(chunk, voxels, first, T, log, K, entries, order, age, trend, null, p):
+    """As `measure_voxels`, of voxels of these numbers (r,), all of OP T <= ENUMERATED, from all of their orders.
+
+    order (T, T!) is the number of the observation that comes at each step, in the first order as they came; age
+    (T, T!) is t - mean t of each observation.
+    """
+    classes, lanes = max(1, min(K, entries)), order.shape[1]
+    x, work, number = np.empty((classes, T)), np.zeros((2 * classes, LANES)), np.full(K, -1)
+    at, value = np.arange(T), np.empty(LANES)
+    for j in range(chunk * voxels.shape[0] // CHUNKS, (chunk + 1) * voxels.shape[0] // CHUNKS):
+        i = voxels[j]
+        A = dense(log, first[i], T, number, at, x)
+        drifts(x, A, T, order, lanes, work, value)
+        null[i] = value[:lanes].mean()
+        p[i, 0], p[i, 1] = _shares(value, lanes, ROUNDING)
+        if T > 2:
+            trends(x, A, T, age, lanes, work, value)
+            trend[i] = value[0]
+            p[i, 2] = _shares(value, lanes, ROUNDING * (1.0 + value[0]))[1]
+
+
+@serial
 def _groups(chunk, rank, T):
     """The voxels of a chunk, those of the same OP together; rank (n,) sorts all by OP."""
     first, last = chunk * rank.shape[0] // CHUNKS, (chunk + 1) * rank.shape[0] // CHUNKS
@@ -246,9 +282,7 @@ def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, d
             _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
             open_ = 0
             for j in range(left):
-                i, soon, later = voxels[j], voxels[min(j + SOON, left - 1)], voxels[min(j + 2 * SOON, left - 1)]
-                ask_for_bounds(log, first[later], steps)
-                ask_for_entries(log, first[soon], steps)
+                i = voxels[j]
                 _own_order(at, steps, seeds[i], own)
                 A = dense(log, first[i], steps, number, at, x)
                 if tried == 0:
@@ -303,3 +337,108 @@ def test_drifts(chunk, rank, first, T, log, K, entries, seeds, seed, most, enoug
                     number_of[open_] = j
                     open_ += 1
             left, tried = open_, tried + lanes
+
+
+# Compiled loop over the orders of stretches of time, the same for all voxels of a scene.
+
+
+@serial
+def _in_order(rank, T, stretches, order, age, bounds, made, begins, came):
+    """The observations of a voxel in each order of the stretches (S, lanes), which rank (T,) puts them into.
+
+    bounds (S + 1,), made (T,), begins (S, LANES) and came (LANES,) are work space.
+    """
+    bounds[:] = 0
+    for t in range(T):
+        bounds[rank[t] + 1] += 1
+    for s in range(bounds.shape[0] - 1):
+        bounds[s + 1] += bounds[s]
+    for t in range(T):
+        made[bounds[rank[t]]] = t
+        bounds[rank[t]] += 1  # now where the next stretch begins
+    came[:] = 0
+    for turn in range(stretches.shape[0]):
+        for lane in range(stretches.shape[1]):
+            s = stretches[turn, lane]
+            begins[s, lane] = came[lane]
+            came[lane] += bounds[s] - (bounds[s - 1] if s else 0)
+    for s in range(stretches.shape[0]):
+        first = bounds[s - 1] if s else 0
+        for j in range(first, bounds[s]):
+            for lane in range(stretches.shape[1]):
+                t = begins[s, lane] + (j - first)
+                age[made[j], lane] = t - 0.5 * (T - 1)
+                order[t, lane] = made[j]
+
+
+@serial
+def permute_stretches(chunk, edges, first, T, log, K, entries, rank, orders, sums):
+    """Statistics of the scene with its stretches of time in other orders, the same for all voxels.
+
+    edges (CHUNKS + 1, 2) bounds each chunk's voxels and their observations; rank (m,) is the stretch of each
+    observation of the voxels, one voxel after the other, orders (S, R) the stretches in each order; `entries` is the
+    most that a voxel has. sums (CHUNKS, R, 2) takes, over voxels: the drift a step; the trend divided by
+    sum_t (t - mean t)^2, over those with T > 2.
+    """
+    x, work, number, order, age, value = room(T, entries, K)
+    natural, made = np.arange(x.shape[1]), np.empty(x.shape[1], np.int64)
+    bounds, at = np.empty(orders.shape[0] + 1, np.int64), edges[chunk, 1]
+    begins, came = np.empty((orders.shape[0], LANES), np.int64), np.empty(LANES, np.int64)
+    for i in range(edges[chunk, 0], edges[chunk + 1, 0]):
+        A = dense(log, first[i], T[i], number, natural, x)
+        for r in range(0, orders.shape[1], LANES):
+            lanes = min(LANES, orders.shape[1] - r)
+            own = rank[at : at + T[i]]
+            _in_order(own, T[i], orders[:, r : r + lanes], order, age, bounds, made, begins, came)
+            drifts(x, A, T[i], order, lanes, work, value)
+            for lane in range(lanes):
+                sums[chunk, r + lane, 0] += value[lane] / (T[i] - 1)
+            if T[i] > 2:
+                trends(x, A, T[i], age, lanes, work, value)
+                for lane in range(lanes):
+                    sums[chunk, r + lane, 1] += value[lane] / (T[i] * (T[i] * T[i] - 1) / 12)
+        at += T[i]
+
+
+# Compiled loops over one-hot observations, whose drift depends on counts only.
+
+LONGEST_TABLE = 256
+"""Up to this OP the drift of one-hot observations is looked up."""
+
+
+@serial
+def one_hot_drift(c, t):
+    """D_JS of the beliefs after t and t + 1 one-hot observations, bits: the new class was seen c times among the t.
+
+    The other classes' shares all shrink by the factor t / (t + 1), so only how many they are in all matters.
+    """
+    return js_term(c / t, (c + 1) / (t + 1)) + (t - c) * js_term(1 / t, 1 / (t + 1))
+
+
+@serial
+def one_hot_drifts(longest):
+    """Table (longest, longest) of `one_hot_drift` at [c, t]."""
+    drifts = np.zeros((longest, longest))
+    for t in range(1, longest):
+        for c in range(t + 1):
+            drifts[c, t] = one_hot_drift(c, t)
+    return drifts
+
+
+@serial
+def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
+    """The part of the expected sum of drifts that a class causes with n of T one-hot observations in random order.
+
+    At step t + 1 it comes with probability n / T, and c of its other n - 1 observations are then among the t before it
+    with the hypergeometric probability C(n-1, c) C(T-n, t-c) / C(T-1, t).
+    """
+    for i in range(chunk, n.shape[0], CHUNKS):
+        others, rest = n[i] - 1, T[i] - n[i]
+        total = 0.0
+        for t in range(1, T[i]):
+            ways = log_factorial[T[i] - 1] - log_factorial[t] - log_factorial[T[i] - 1 - t]
+            for c in range(max(0, t - rest), min(others, t) + 1):
+                log_p = log_factorial[others] - log_factorial[c] - log_factorial[others - c] - ways
+                log_p += log_factorial[rest] - log_factorial[t - c] - log_factorial[rest - t + c]
+                total += np.exp(log_p) * drifts[c, t]
+        out[i] = n[i] / T[i] * total

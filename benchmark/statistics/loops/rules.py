@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import compiled, serial
-from semstab.statistics.loops.asking import ask_for_bounds, ask_for_entries
-from semstab.statistics.loops.chunks import CHUNKS
-from semstab.statistics.loops.logarithm import EIGHT, add_plogp, exp2_fast
+from semstab.core.compiled import CHUNKS, compiled, serial
+from semstab.statistics.loops.logarithm import EIGHT, add_plogp
 
 LANES = 64
 """Voxels of the same OP that go side by side, at most."""
+
+LOWEST = -1000.0
+"""Powers of two below are none."""
 
 AVERAGING, MAJORITY, PRODUCT, GEOMETRIC = range(4)
 
@@ -68,7 +69,7 @@ def _beliefs(total, lanes, of, scale, pooled, after, logs, norm):
     for a in range(total.shape[0]):
         for lane in range(lanes):
             z = (total[a, lane] - top[lane]) * scale
-            power = exp2_fast(z)
+            power = np.exp2(max(z, LOWEST))
             after[a, lane] = power
             norm[lane] += of[a, lane] * power
             logs[lane] += of[a, lane] * power * z
@@ -154,11 +155,6 @@ def fuse_by_rules(chunk, rank, starts, ends, log, K, first, classes, most, rules
             of[:seen, lane] = 1.0
             of[A, lane] = K - seen
         drift[:] = 0.0
-        for j in range(begin + LANES, min(begin + 3 * LANES, end)):
-            if j >= begin + 2 * LANES:
-                ask_for_bounds(log, starts[rank[j]], ends[rank[j]] - starts[rank[j]])
-            else:
-                ask_for_entries(log, starts[rank[j]], ends[rank[j]] - starts[rank[j]])
         for t in range(T):
             for lane in range(lanes):
                 e = at[row[lane] + t]

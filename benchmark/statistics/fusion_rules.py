@@ -1,0 +1,137 @@
+"""Other rules to fuse a voxel's observations, applied to their log: does the choice change the findings?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from semstab.core.types import Float64, Int32, Int64, UInt16
+from semstab.errors import ConfigError
+from semstab.model.events import Events
+from semstab.model.evidence import Evidence
+from semstab.model.information import Concentration
+from semstab.statistics.agreement import ONE_HOT
+from semstab.statistics.ranks import ranked
+
+RULES = ("averaging", "majority", "product", "geometric")
+"""The paper's mean of evidence; the share of frames that vote for a class; Bayes' product of the frames' evidence under
+a flat prior; its geometric mean."""
+
+FLOOR = 0.01
+"""Smallest evidence of a class in the two products: a frame that gives a class none would veto it for ever."""
+
+
+@dataclass(frozen=True, eq=False)
+class Belief(Evidence):
+    """Beliefs (n, K) by the classes that each voxel saw; `rest` (n,) is that in each of the others."""
+
+    rest: Float64
+
+    @classmethod
+    def with_bits(cls, first: Int64, label: UInt16, weight: Float64, K: int, rest: Float64, bits: Float64) -> Belief:
+        """Where the entropy (n,) of each is known."""
+        known = Concentration.of(first, label, weight, K, rest, bits)
+        return cls(first, label, weight, K, rest, known=known)
+
+    @property
+    def unseen(self) -> Float64:
+        """(n,) what each class without an entry has."""
+        return self.rest
+
+    def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
+        dense = super()._stretch(first, last)
+        rest = np.broadcast_to(self.rest[first : first + len(dense), None], dense.shape)
+        np.copyto(dense, rest, where=dense == 0.0)
+        return dense
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """A map fused by one rule, of which every measure can be computed: `VSS.of(fused)`.
+
+    evidence   the belief after the last observation
+    op         (n,) int32 observations
+    drift_sum  (n,) sum of the Jensen-Shannon divergences of successive beliefs, bits
+    """
+
+    evidence: Belief
+    op: Int32
+    drift_sum: Float64
+
+    @property
+    def belief(self) -> Float64:
+        """(n, K) the belief after the last observation."""
+        return np.asarray(self.evidence)
+
+
+def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
+    """Fuse the observations of every voxel, in their order, by one of `RULES`.
+
+    A vote is for the argmax of s_bar, the lowest on ties. The products take max(s_bar, floor), normalised; floor is
+    0.01, or 1/K where that is less.
+    Raises ConfigError for another rule, or a floor outside (0, 1/K].
+    """
+    K = events.evidence.K
+    floor = min(FLOOR, 1 / K) if floor is None else floor
+    if rule not in RULES:
+        raise ConfigError(f"fusion rule '{rule}' is not known; there are {', '.join(RULES)}")
+    if not 0 < floor <= 1 / K:
+        raise ConfigError(f"floor = {floor:g}: it must be above 0 and at most 1/K = {1 / K:g}")
+    return fuse_all(events, [rule], floor=floor)[0]
+
+
+def fuse_all(
+    events: Events,
+    rules: Sequence[str],
+    *,
+    floor: float | None = None,
+    evidence: Evidence | None = None,
+    rows: Int64 | None = None,
+) -> list[Fused]:
+    """What `fuse` makes of a log by each of some rules, in one pass.
+
+    evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
+    rows      (n,) which voxels of the log these are, where they are not all
+    """
+    from semstab.core import compiled
+    from semstab.statistics.loops import rules as loops
+
+    K, log = events.evidence.K, events.evidence.entries
+    first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
+    starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.ends))
+    belief, *sums = (np.zeros((len(rules), size)) for size in (len(label), *3 * [len(starts)]))
+    op, count = ends - starts, np.diff(first)
+    most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
+    seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
+    rank = ranked(op * (most + 1) + count)
+    compiled.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, *sums)
+    return [
+        Fused(Belief.with_bits(first, label, own, K, rest, bits), op.astype(np.int32), drift_sum)
+        for own, rest, drift_sum, bits in zip(belief, *sums, strict=True)
+    ]
+
+
+def classes_seen(events: Events) -> tuple[Int64, UInt16]:
+    """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
+    from semstab.core import compiled
+    from semstab.statistics.loops import rules as loops
+
+    bounds, log = (events.starts, events.ends), events.evidence.entries
+    count = np.zeros(len(events.starts) + 1, np.int64)
+    compiled.in_chunks(loops.count_classes, *bounds, log, events.evidence.K, count)
+    first: Int64 = np.cumsum(count)
+    label = np.zeros(first[-1], np.uint16)
+    compiled.in_chunks(loops.list_classes, *bounds, log, events.evidence.K, first, label)
+    return first, label
+
+
+def labels(evidence: Float64 | Evidence) -> Int64:
+    """Class (n,) of the largest belief of evidence (n, K), the lowest of those that tie: rounding decides none."""
+    from semstab.statistics.loops.rows import label_near
+
+    kept = Evidence.of(evidence)
+    rest, found = kept.unseen, np.empty(len(kept), np.int64)
+    label_near(kept.entries, np.zeros(0) if rest is None else rest, kept.K, ONE_HOT, found)
+    return found

@@ -1,0 +1,192 @@
+"""The compiled pass over the log that adds up what each frame contributed to each cube of space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.core.compiled import CHUNKS, serial
+
+(VOXELS, PSA, OBSERVATIONS, AGREEING, OWN, TWICE, TWICE_AGREEING, RECURRENT, VSS, ENTROPY) = range(10)
+"""The columns that every map has, before those by class."""
+
+DRIFT = 2
+"""How many columns of drift follow those."""
+
+(KNOWN, RIGHT, LOOKS, LOOKS_RIGHT, STABLE, STABLE_WRONG) = range(6)
+"""The columns with ground truth, counted from the first of them."""
+
+TIE = 1e-12
+"""Sums of evidence that differ by no more are equal."""
+
+
+@serial
+def _looks(log, first, T, number, active, x, total, squares, own):
+    """A voxel's observations by the classes that it ever saw, which are returned as how many they are.
+
+    log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by look and class, active (A,) the
+    classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each look's
+    squares; number (K,) is work space, all -1.
+    """
+    at, label, weight = log
+    A = 0
+    for e in range(at[first], at[first + T]):
+        k = np.int64(label[e])
+        if number[k] < 0:
+            number[k], j = 0, A
+            while j > 0 and active[j - 1] > k:
+                active[j] = active[j - 1]
+                j -= 1
+            active[j] = k
+            A += 1
+    for j in range(A):
+        number[active[j]], total[j], squares[j] = j, 0.0, 0.0
+    x[: T * A] = 0.0
+    for t in range(T):
+        own[t] = 0.0
+        for e in range(at[first + t], at[first + t + 1]):
+            j, square = number[label[e]], weight[e] ** 2
+            x[t * A + j] = weight[e]
+            total[j] += weight[e]
+            squares[j] += square
+            own[t] += square
+    for j in range(A):
+        number[active[j]] = -1
+    return A
+
+
+@serial
+def _label(total, A):
+    """Which class is the dominant one, the lowest of equals."""
+    best, top = 0, total[0]
+    for j in range(1, A):
+        more = total[j] > top
+        best, top = (j if more else best), (total[j] if more else top)
+    return best
+
+
+@serial
+def _label_without(total, x, look, A):
+    """Which is the dominant class of the other observations."""
+    best, top = 0, total[0] - x[look]
+    for j in range(1, A):
+        rest = total[j] - x[look + j]
+        more = rest > top + TIE
+        best, top = (j if more else best), (rest if more else top)
+    return best
+
+
+@serial
+def _add_truth(sums, base, x, first, T, frames, truth, likely, total, active, A, label, without, mean, column, K):
+    """What is right of a voxel: of the fused label by leaving a frame out, of each look by itself.
+
+    mean (A,) is room.
+    """
+    true, lead, most = -1, total[label], 0.0
+    for j in range(A):
+        true = j if active[j] == truth else true
+        lead = min(lead, total[label] - total[j]) if j != label else lead
+    for t in range(T):
+        most = max(most, x[t * A + label])
+    right, part, alike = (1.0 if label == true else 0.0), 1.0 / T, lead > most + TIE  # whichever is left out
+    if not alike:
+        mean[:A] = 0.0
+        for t in range(T):
+            without[t] = _label_without(total, x, t * A, A)
+            mean[without[t]] += part
+    share, (group, frame) = part, frames
+    for t in range(T):
+        r = base + group[frame[first + t]]
+        own = right * share
+        if not alike and true >= 0:
+            own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
+        sums[r, column + KNOWN] += share
+        sums[r, column + RIGHT] += own
+        sums[r, column + LOOKS] += 1.0
+        if true >= 0:
+            sums[r, column + LOOKS_RIGHT] += x[t * A + true]
+        if T > 2:
+            sums[r, column + STABLE] += likely * share
+            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * share
+        if K:
+            sums[r, column + 6 + truth] += share
+            sums[r, column + 6 + K + truth] += own
+            if alike:
+                sums[r, column + 6 + 2 * K + active[label]] += share
+                continue
+            for j in range(A):
+                predicted = (label == j) + (T - 1) * (mean[j] - (without[t] == j))
+                sums[r, column + 6 + 2 * K + active[j]] += predicted * share
+
+
+@serial
+def _agreement(total, squares, T, A, certain, surprise, apart):
+    """The agreement of two observations; of each class how surprising it is, and how far apart two of them are.
+
+    certain is what a class is to be sure of, log K.
+    """
+    agreed = 0.0
+    for j in range(A):
+        pairs = total[j] ** 2 - squares[j]
+        agreed += pairs
+        surprise[j] = -np.log(total[j] / T) / certain / T if total[j] > 0.0 else 0.0
+        apart[j] = 2.0 * (total[j] / T - pairs / (T * (T - 1.0)))
+    return agreed / (T * (T - 1.0))
+
+
+@serial
+def add_influences(
+    chunk, order, bounds, rows, longest, log, K, frames, truth, likely, by_class, with_truth, groups, sums
+):
+    """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
+
+    order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
+    voxel's rows of the log, `longest` at most; frames: see `FrameGroups`. truth (n,) is its true class or -1, likely
+    (n,) how likely it is stable. The pairwise agreement P of a location is shared out as P + 2 (T - 1) / (T - 2)
+    (a_t - P), a_t being frame t's mean agreement with the others: what is left of a frame is then its own quality, free
+    of that of the frames it was held against, and the shares add up to T P.
+    """
+    starts, ends = rows
+    x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
+    total, squares, own, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
+    mean, surprise, apart, certain = np.empty(K), np.empty(K), np.empty(K), np.log(K)
+    first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
+    group, frame = frames
+    for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
+        for at in range(bounds[cell], bounds[cell + 1]):
+            i = order[at]
+            first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
+            A = _looks(log, first, T, number, active, x, total, squares, own)
+            agreed, label = _agreement(total, squares, T, A, certain, surprise, apart), _label(total, A)
+            spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
+            part, of_others = 1.0 / T, 1.0 / (T - 1.0)
+            for t in range(T):
+                r = cell * groups + group[frame[first + t]]
+                with_others = surprised = 0.0
+                for j in range(A):
+                    k, s = active[j], x[t * A + j]
+                    with_others += s * total[j]
+                    sums[r, ENTROPY + 1 + k] += s
+                    surprised += s * surprise[j]
+                    if by_class:
+                        others = (total[j] - s) * of_others
+                        differs = s + others - 2.0 * s * others
+                        sums[r, ENTROPY + 1 + K + k] += apart[j] + spread * (differs - apart[j])
+                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2
+                share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
+                sums[r, VOXELS] += part
+                sums[r, PSA] += share * part
+                sums[r, OBSERVATIONS] += 1.0
+                sums[r, AGREEING] += share
+                sums[r, OWN] += own[t]
+                sums[r, ENTROPY] += surprised
+                if T == 2:
+                    sums[r, TWICE] += 1.0
+                    sums[r, TWICE_AGREEING] += agreed
+                else:
+                    sums[r, RECURRENT] += part
+                    sums[r, VSS] += x[t * A + label] * part
+            if with_truth and truth[i] >= 0:
+                _add_truth(
+                    sums, cell * groups, x, first, T, frames, truth[i], steady, total, active, A, label, without,
+                    mean, first_truth, K if by_class else 0,
+                )  # fmt: skip

@@ -1,0 +1,347 @@
+"""Compiled passes over a frame's pixels: which show a sampled voxel, and which of those are of one cell and class."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from semstab.backends.shared.pixel_keys import in_voxels
+from semstab.core.compiled import serial
+from semstab.statistics.observation_keys import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
+
+FIRST, SECOND, THIRD = SHIFTS
+HIGH, MIDDLE, LOW = WITHIN
+
+ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uint32(0x8CB92BA7)
+"""Weights of a voxel's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no
+plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectiveness of Quasirandom Sequences)."""
+
+HELD = 1024
+"""Pixels whose cells are computed together: as many as stay in a core's nearest cache."""
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+@serial
+def hash_row(at_x, at_y, at_z, hashed):
+    """The hash (n,) of voxels, uint32: of the weighted sum of their indices modulo 2^32, one of its own for each sum.
+
+    It is mixed as in lowbias32 (Wellons 2018, Prospecting for Hash Functions). Products of 32 bits are vector
+    instructions on every processor, those of 64 are not.
+    """
+    for u in range(len(hashed)):
+        x, y, z = np.uint32(at_x[u]), np.uint32(at_y[u]), np.uint32(at_z[u])
+        h = np.uint32(np.uint32(x * ALONG_X) + np.uint32(y * ALONG_Y) + np.uint32(z * ALONG_Z))
+        h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x7FEB352D))
+        h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x846CA68B))
+        hashed[u] = h ^ (h >> np.uint32(16))
+
+
+@serial
+def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label, pixel):
+    """The pixels that show a sampled voxel: key of the cell, hash, label and number; returns how many they are."""
+    n = held = 0
+    H, W = depth.shape
+    at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
+    found = np.empty(W, np.int32)
+    x, y, z = np.empty(HELD + W), np.empty(HELD + W), np.empty(HELD + W)
+    for v in range(H):
+        place_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
+        hash_row(at[0], at[1], at[2], hashed)
+        end = 0
+        for u in range(W):  # without a branch: where depth is noisy, none can be foretold
+            found[end] = u
+            end += hashed[u] <= last
+        for u in found[:end]:
+            d = np.float64(depth[v, u])
+            x[held], y[held], z[held] = ray_x[u] * d, ray_y[v] * d, d
+            drawn[n], label[n], pixel[n] = hashed[u], labels[v, u], v * W + u
+            n += valid[v, u]
+            held += valid[v, u]
+        if held >= HELD or v == H - 1:
+            cells_of(x[:held], y[:held], z[:held], T, size, origin, reach, cell[n - held : n])
+            held = 0
+    return n
+
+
+@serial
+def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
+    """The voxel of each pixel of a row, of invalid ones any; without a branch, for vectors."""
+    x0, x1, x2, x3 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    y0, y1, y2, y3 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    z0, z1, z2, z3 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    for u in range(len(depth)):
+        z = np.float64(depth[u])
+        x, y = ray_x[u] * z, ray_y * z
+        at_x[u] = np.int32(np.floor(in_voxels(x0, x1, x2, x3, x, y, z, size)))
+        at_y[u] = np.int32(np.floor(in_voxels(y0, y1, y2, y3, x, y, z, size)))
+        at_z[u] = np.int32(np.floor(in_voxels(z0, z1, z2, z3, x, y, z, size)))
+
+
+@serial
+def cells_of(at_x, at_y, at_z, T, size, origin, reach, key):
+    """Keys (n,) of the cells of points of the camera, see `keys`; -1 out of reach."""
+    x0, x1, x2, x3, low_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3], float(origin[0] - reach)
+    y0, y1, y2, y3, low_y = T[1, 0], T[1, 1], T[1, 2], T[1, 3], float(origin[1] - reach)
+    z0, z1, z2, z3, low_z = T[2, 0], T[2, 1], T[2, 2], T[2, 3], float(origin[2] - reach)
+    span = float(2 * reach)
+    for n in range(len(key)):
+        x, y, z = at_x[n], at_y[n], at_z[n]
+        a = in_voxels(x0, x1, x2, x3, x, y, z, size)
+        b = in_voxels(y0, y1, y2, y3, x, y, z, size)
+        c = in_voxels(z0, z1, z2, z3, x, y, z, size)
+        i, j, k = np.floor(a), np.floor(b), np.floor(c)
+        child = (digit(a - i) << HIGH) | (digit(b - j) << MIDDLE) | (digit(c - k) << LOW)
+        i, j, k = i - low_x, j - low_y, k - low_z
+        near = (i >= 0.0) & (i < span) & (j >= 0.0) & (j < span) & (k >= 0.0) & (k < span)
+        i, j, k = i if near else 0.0, j if near else 0.0, k if near else 0.0
+        voxel = (np.int64(np.int32(i)) << FIRST) | (np.int64(np.int32(j)) << SECOND) | (np.int64(np.int32(k)) << THIRD)
+        key[n] = voxel | child if near else np.int64(-1)
+
+
+@serial
+def digit(part):
+    """Which of the cells along a voxel's edge a part of it, from 0 to 1, falls in."""
+    cell = part * CELLS
+    return np.int64(np.int32(cell if cell < CELLS else CELLS - 1.0))
+
+
+@serial
+def grouped(cell, label, drawn, of, pixels):
+    """The number (n,) of each pixel's cell and label in order of appearance, and how many pixels each of these has.
+
+    Cells, labels and hashes move to the front, once each; returns how many they are. Those of one voxel lie side by
+    side in the table, as they do in the image. Nobody can foretell whether a pixel's cell is a new one, so that there
+    is no branch for it. The numbers are left out where `of` is empty.
+    """
+    bits = 7
+    while len(cell) > 1 << bits:
+        bits += 1
+    table, mask, shift = np.full(2 << bits, -1, np.int32), (2 << bits) - 1, np.uint64(69 - bits)
+    n = 0
+    for i in range(len(cell)):
+        own, its_label = cell[i], label[i]
+        near = np.int64((np.uint64((own >> DIGITS) ^ (np.int64(its_label) << 48)) * GOLDEN) >> shift)
+        slot = near << DIGITS | (own & ((1 << DIGITS) - 1))
+        there = table[slot] if table[slot] >= 0 else i
+        while (cell[there] != own) | (label[there] != its_label):
+            slot = (slot + 1) & mask
+            there = table[slot] if table[slot] >= 0 else i
+        cell[n], label[n], drawn[n], pixels[n] = own, its_label, drawn[i], 0.0  # of the next one, should it be new
+        new = table[slot] < 0
+        number = n if new else there
+        table[slot] = number
+        n += new
+        pixels[number] += 1.0
+        if len(of):
+            of[i] = number
+    return n
+
+
+@serial
+def add_rows(rows, of, sums):
+    """Add rows (n, K) to those of the sums (m, K) that they are of."""
+    for i in range(len(rows)):
+        for k in range(rows.shape[1]):
+            sums[of[i], k] += rows[i, k]
+
+
+@serial
+def keep(share, entries, key, view, label, weight, drawn):
+    """Move the entries whose hash is below `share` to the front, without a branch; returns how many they are."""
+    n = 0
+    for i in range(entries):
+        key[n], view[n], label[n], weight[n], drawn[n] = key[i], view[i], label[i], weight[i], drawn[i]
+        n += drawn[n] < share
+    return n
+
+
+@serial
+def append(share, entries, seen, cell, said, more, hashed, key, view, label, weight, drawn):
+    """Put entries of a view whose hash is below `share` behind so many others; returns how many there are then."""
+    n = entries
+    for i in range(len(cell)):
+        if hashed[i] < share:
+            key[n], view[n], label[n], weight[n], drawn[n] = cell[i], seen, said[i], more[i], hashed[i]
+            n += 1
+    return n
+
+
+# Compiled passes over entries in order of voxel and frame: what cells show, and what each look at a voxel says.
+
+
+@serial
+def voxel_of(key):
+    """The three voxel indices of a key, from where keys begin."""
+    return key >> FIRST, (key >> SECOND) & (SPAN - 1), (key >> THIRD) & (SPAN - 1)
+
+
+@serial
+def extent(key, low, high):
+    """Set low and high (3,) to the least and largest voxel index of each axis in keys (n,), 0 where there are none."""
+    low[:], high[:] = SPAN - 1 if len(key) else 0, 0
+    for i in range(len(key)):
+        x, y, z = voxel_of(key[i])
+        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
+        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
+
+
+@serial
+def places(key, view, low, size, views, place):
+    """A number (n,) for the voxel and frame of each entry, ascending with x, y, z and frame, of voxels in a box."""
+    for i in range(len(key)):
+        x, y, z = voxel_of(key[i])
+        voxel = ((x - low[0]) * size[1] + (y - low[1])) * size[2] + (z - low[2])
+        place[i] = voxel * views + view[i]
+
+
+@serial
+def gather(order, key, view, label, weight, own_key, own_view, own_label, own_weight):
+    """Entries (n,) in that order, into columns of their own."""
+    for i in range(len(order)):
+        k = order[i]
+        own_key[i], own_view[i], own_label[i], own_weight[i] = key[k], view[k], label[k], weight[k]
+
+
+@serial
+def settle(key, view, label, weight, cells, K, least, kept, shown):
+    """Whether `least` frames or more saw each entry's cell, and the class with the largest sum of shares there.
+
+    A frame's classes have shares of its pixels in the cell; the lowest class on ties. All arrays are (n,); a voxel has
+    so many `cells`.
+    """
+    seen, pixels, sums = np.zeros(cells, np.int64), np.zeros(cells), np.zeros((cells, K))
+    most, best, which = np.zeros(cells), np.zeros(cells, np.uint16), (1 << DIGITS) - 1
+    start = 0
+    while start < len(key):
+        end, voxel = start, key[start] >> DIGITS
+        while end < len(key) and key[end] >> DIGITS == voxel:
+            first = end
+            while end < len(key) and key[end] >> DIGITS == voxel and view[end] == view[first]:
+                c = key[end] & which
+                seen[c] += pixels[c] == 0.0
+                pixels[c] += weight[end]
+                end += 1
+            for i in range(first, end):
+                c = key[i] & which
+                sums[c, label[i]] += weight[i] / pixels[c]
+            for i in range(first, end):
+                pixels[key[i] & which] = 0.0
+        for i in range(start, end):
+            c = key[i] & which
+            own = sums[c, label[i]]
+            if own > most[c] or (own == most[c] and label[i] < best[c]):
+                most[c], best[c] = own, label[i]
+        for i in range(start, end):
+            c = key[i] & which
+            kept[i], shown[i] = seen[c] >= least, best[c]
+        for i in range(start, end):
+            c = key[i] & which
+            seen[c], most[c], sums[c, label[i]] = 0, 0.0, 0.0
+        start = end
+
+
+@serial
+def look(key, view, label, weight, kept, K, first, of, pixels, starts, classes, shares):
+    """The looks at voxels: of each its voxel, its pixels, and the share of each class among them, classes ascending.
+
+    Only of what is kept. `first` is an entry of each look, `of` counts voxels that have one; returns how many looks,
+    and how many classes of them together, there are. All arrays are as long as the entries, `starts` longer by one.
+    """
+    sums, met = np.zeros(K), np.empty(K, np.int64)
+    n = m = start = 0
+    voxels = -1
+    before = np.int64(-1)
+    starts[0] = 0
+    while start < len(key):
+        end, many, total, voxel = start, 0, 0.0, key[start] >> DIGITS
+        while end < len(key) and key[end] >> DIGITS == voxel and view[end] == view[start]:
+            if kept[end]:
+                if sums[label[end]] == 0.0:
+                    met[many] = label[end]
+                    many += 1
+                sums[label[end]] += weight[end]
+                total += weight[end]
+            end += 1
+        if many:
+            voxels += voxel != before
+            before = voxel
+            first[n], of[n], pixels[n] = start, voxels, total
+            if many > 1:
+                met[:many].sort()
+            for own in met[:many]:
+                classes[m], shares[m], sums[own] = own, sums[own] / total, 0.0
+                m += 1
+            n += 1
+            starts[n] = m
+        start = end
+    return n, m
+
+
+# Compiled passes over pairs of looks: how far they are apart and agree, and their sums by bin, cube and frames.
+
+
+@serial
+def products(starts, label, weight, first, lag, out):
+    """s . s' (m,) of the looks of these numbers, and those `lag` later, by the entries of their evidence."""
+    for i in range(len(first)):
+        a, b = starts[first[i]], starts[first[i] + lag]
+        end_a, end_b = starts[first[i] + 1], starts[first[i] + lag + 1]
+        total = 0.0
+        while a < end_a and b < end_b:
+            if label[a] == label[b]:
+                total += weight[a] * weight[b]
+            ahead_a, ahead_b = label[a] <= label[b], label[b] <= label[a]
+            a, b = a + ahead_a, b + ahead_b
+        out[i] = total
+
+
+@serial
+def distances(first, lag, rank, centre, ray, reach, time, cosine, ratio, baseline):
+    """Of each pair (m,): steps between its frames, cosine of its directions, ratio of its ranges, and metres between.
+
+    rank (n,) of each look's frame, centre (F, 3) of its camera, ray (n, 3) to it and reach (n,) of that
+    """
+    for i in range(len(first)):
+        a, b = first[i], first[i] + lag
+        p, q = rank[a], rank[b]
+        time[i] = abs(q - p)
+        cosine[i] = (ray[a, 0] * ray[b, 0] + ray[a, 1] * ray[b, 1] + ray[a, 2] * ray[b, 2]) / (reach[a] * reach[b])
+        ratio[i] = max(reach[a], reach[b]) / min(reach[a], reach[b])
+        x, y, z = centre[q, 0] - centre[p, 0], centre[q, 1] - centre[p, 1], centre[q, 2] - centre[p, 2]
+        baseline[i] = math.sqrt(x * x + y * y + z * z)
+
+
+@serial
+def add_pairs(first, lag, bins, apart, cell, seen, limit, sums, limit_sums, pairs, distance):
+    """Add pairs of looks, and those in the limit, to the sums of the bin that each is in along each axis.
+
+    bins, apart  (m, A) the bin of each pair, and how far it is apart
+    cell         (n,) the row of each look in the sums of a bin
+    seen, limit  starts, label and weight of the entries of all looks, ||s||^2 (n,) of each, and s . s' (m,)
+    sums         (bins, cells, 3 + K) of s . s' with the other look, of looks, of ||s||^2, and of s: what `between_of`
+                 is a function of; limit_sums (bins, 3 + K), pairs and distance (bins,)
+    """
+    for i in range(len(first)):
+        a, b = first[i], first[i] + lag
+        for axis in range(bins.shape[1]):
+            pairs[bins[i, axis]] += 1.0
+            distance[bins[i, axis]] += apart[i, axis]
+        for one in (a, b):
+            add_look(sums[:, cell[one]], bins[i], one, i, seen)
+            add_look(limit_sums, bins[i], one, i, limit)
+
+
+@serial
+def add_look(sums, bins, one, pair, looks):
+    """Add a look of that number, in that pair, to these rows of the sums."""
+    starts, label, weight, squares, product = looks
+    for own in bins:
+        sums[own, 0] += product[pair]
+        sums[own, 1] += 1.0
+        sums[own, 2] += squares[one]
+    for entry in range(starts[one], starts[one + 1]):
+        column, more = 3 + np.int64(label[entry]), weight[entry]
+        for own in bins:
+            sums[own, column] += more

@@ -1,0 +1,267 @@
+"""What was seen of sampled voxels, by cells a quarter as wide: what observations and ceilings follow from.
+
+Kept in the folder of a run, it lets maps be compared on the very looks that all of them made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core import arrays
+from semstab.core.files import atomic_path, parse_json
+from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt32
+from semstab.errors import DataError, one_line
+from semstab.metrics.agreement import shared_observations
+from semstab.model.events import Events
+from semstab.model.evidence import Evidence
+from semstab.model.voxels import index_columns
+from semstab.statistics.observation_keys import CELLS, DIGITS, Voxel, alike, cells_of, keys_of
+from semstab.statistics.ranks import ranked
+
+# Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
+
+# Where the frames of a sample of observations were taken.
+
+VIEW = 5
+"""Numbers of a view: frame, centre, time stamp."""
+
+AT_ONCE = 4096
+"""Views that are made text together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Indices (V,) of frames, camera centres (V, 3) in metres, and time stamps (V,) in seconds or NaN."""
+
+    frame: Int64
+    centre: Float64
+    timestamp: Float64
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[float]] | Float64) -> Views:
+        """Of rows (V, 5). Raises ValueError where they are of another shape, or an index is not a finite number."""
+        table = np.asarray(rows, np.float64).reshape(len(rows), VIEW)
+        if not np.isfinite(table[:, 0]).all():
+            raise ValueError("a frame without an index")
+        return cls(table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4].copy())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Views]) -> Views:
+        """One after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+    def rows(self) -> Float64:
+        """(V, 5) what `of` takes."""
+        return np.concatenate([self.frame[:, None], self.centre, self.timestamp[:, None]], axis=1)
+
+    def text(self) -> str:
+        """Its rows as JSON, made some at a time: as Python's numbers all of them would take ten times the memory."""
+        rows = self.rows()
+        return f"[{', '.join(json.dumps(rows[k : k + AT_ONCE].tolist())[1:-1] for k in range(0, len(rows), AT_ONCE))}]"
+
+    def take(self, rows: Int64) -> Views:
+        """Some of them."""
+        return Views(self.frame[rows], self.centre[rows], self.timestamp[rows])
+
+    def rank(self, frame: npt.NDArray[np.integer]) -> Int64:
+        """Which of these, in their order, the frames (m,) of these indices are."""
+        order = np.argsort(self.frame)
+        return np.asarray(order[np.searchsorted(self.frame, frame, sorter=order)], np.int64)
+
+
+LEAST_FRAMES = 2
+"""What a cell shows counts where so many frames saw it: its label is to be more than one frame's own."""
+
+COLUMNS = "key", "view", "label", "weight", "drawn"
+"""Of entries."""
+
+SCHEMA = 2
+OWN, TRUTH = "its own labels in finer cells", "the ground truth"
+
+Entries = tuple[Int64, Int32, UInt16, Float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationSample:
+    """What was seen of the sampled voxels, and what would have been had their labels not depended on the view.
+
+    seen   observations (s_bar of a voxel in a frame), of the cells that LEAST_FRAMES or more saw
+    limit  the same rows, each cell having the dominant label of all frames in each of them
+    views  of all frames, in order of integration
+    soft   whether the evidence is scores
+    by     whose labels the limit has: the map's own in finer cells, or those of the ground truth
+    """
+
+    seen: Events
+    limit: Events
+    views: Views
+    soft: bool
+    by: str = OWN
+
+    def shared(self) -> tuple[Events, Events]:
+        """The observations that both logs have."""
+        seen, limit = shared_observations(self.seen, self.limit)
+        return seen, limit
+
+    def against(self, truth: ObservationSample) -> ObservationSample:
+        """The same with the ground truth's labels as the limit, of a sample of the same frames."""
+        return dataclasses.replace(self, limit=truth.seen, by=TRUTH)
+
+
+@dataclass(frozen=True, eq=False)
+class CellObservations:
+    """Entries (m,) of a cell, a frame and a class: what the frame's pixels in the cell say for the class.
+
+    key     (m,) int64 of the cell, see `keys`
+    view    (m,) int32 row of `views`
+    label   (m,) uint16
+    weight  (m,) pixels of that label, or the sum of their scores
+    drawn   (m,) uint32, the hash of the voxel; in the sample are those below `share`
+    low     voxel at which keys begin
+    """
+
+    key: Int64
+    view: Int32
+    label: UInt16
+    weight: Float64
+    drawn: UInt32
+    low: Voxel
+    views: Views
+    voxel_size: float
+    K: int
+    share: int = 1 << 32
+    soft: bool = False
+    classes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.key)
+
+    @property
+    def cell(self) -> Int64:
+        """(m, 3) index of the cell, of which a voxel has CELLS along its edge."""
+        return cells_of(self.key, self.low)
+
+    def sample(self) -> ObservationSample:
+        """Observations of the voxels, and those of labels that do not depend on the view."""
+        from semstab.statistics.loops.observations import settle
+
+        key, view, label, weight = self._in_order()
+        kept, shown = np.empty(len(key), np.bool_), np.empty(len(key), np.uint16)
+        settle(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
+        seen, limit = (self._log(key, view, which, weight, kept) for which in (label, shown))
+        return ObservationSample(seen, dataclasses.replace(seen, evidence=limit.evidence), self.views, self.soft)
+
+    def only(self, rows: Any) -> CellObservations:
+        """Some of the entries."""
+        return self._each(lambda column: column[rows])
+
+    def copied(self) -> CellObservations:
+        """The same in memory of its own."""
+        return self._each(np.copy)
+
+    def _each(self, change: Callable[[Any], Any]) -> CellObservations:
+        columns: dict[str, Any] = {name: change(getattr(self, name)) for name in COLUMNS}
+        return dataclasses.replace(self, **columns)
+
+    @classmethod
+    def joined(cls, parts: Sequence[CellObservations]) -> CellObservations:
+        """The entries of one after the other, with all else of the first."""
+        keys, low = alike([part.key for part in parts], [part.low for part in parts])
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS[1:]
+        }
+        return dataclasses.replace(parts[0], key=np.concatenate(keys), **columns, low=low)
+
+    def observations(self) -> Events:
+        """The log of the sampled voxels: what the entries of a voxel and a frame say together."""
+        own = self._in_order()
+        return self._log(*own, np.ones(len(self), np.bool_))
+
+    def _in_order(self) -> Entries:
+        """Keys, views, labels and weights by voxel and frame, entries of one as they come."""
+        from semstab.statistics.loops.observations import extent, gather, places
+
+        low, high, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(len(self), np.int64)
+        extent(self.key, low, high)
+        size, views = high - low + 1, len(self.views)
+        if math.prod(size.tolist()) * views < 2**63:
+            places(self.key, self.view, low, size, views, place)
+        else:
+            place = np.unique(self.key >> DIGITS, return_inverse=True)[1] * views + self.view
+        entries: tuple[npt.NDArray[Any], ...] = self.key, self.view, self.label, self.weight
+        key, view, label, weight = (np.empty_like(column) for column in entries)
+        gather(ranked(place), *entries, key, view, label, weight)
+        return key, view, label, weight
+
+    def _log(
+        self,
+        key: Int64,
+        view: Int32,
+        label: UInt16,
+        weight: Float64,
+        kept: Mask,
+    ) -> Events:
+        """The log of the kept ones of entries that are in order."""
+        from semstab.statistics.loops.observations import look
+
+        n = len(self)
+        first, of, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
+        pixels, share, said = np.empty(n), np.empty(n), np.empty(n, np.uint16)
+        n, m = look(key, view, label, weight, kept, self.K, first, of, pixels, starts, said, share)
+        first, of = first[:n], of[:n]
+        at = key[first[np.flatnonzero(np.diff(of, prepend=-1))]]
+        return Events(
+            **index_columns(cells_of(at, self.low) // CELLS),
+            voxel=of,
+            frame=self.views.frame.astype(np.int32)[view[first]],
+            evidence=Evidence(starts[: n + 1], said[:m], share[:m], self.K),
+            pixels=np.rint(pixels[:n]).astype(np.int32),
+            voxel_size=self.voxel_size,
+            classes=self.classes,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write Parquet, atomically."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        columns = dict(zip("xyz", self.cell.astype(np.int32).T, strict=True))
+        columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
+        about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
+        content = pa.table({name: arrays.column(values) for name, values in columns.items()})
+        text = f'{json.dumps({"schema": SCHEMA, "kind": "Looks", **about})[:-1]}, "views": {self.views.text()}}}'
+        with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
+            file.write_table(content)
+            file.add_key_value_metadata({"semstab": text})  # a schema's own is written twice, and copied more often
+
+    @classmethod
+    def load(cls, path: str | Path) -> CellObservations:
+        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+                content = file.read()
+            about = parse_json((content.schema.metadata or {})[b"semstab"])
+            if (about.pop("kind"), about.pop("schema")) != ("Looks", SCHEMA):
+                raise DataError("of another kind, or of another version, which sampled other voxels: run it again")
+            views = Views.of(about.pop("views"))
+            about["classes"] = tuple(about["classes"])
+            x, y, z, view, label, weight, drawn = map(arrays.values_of, content.columns)
+            key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
+            return cls(key, view, label, weight, drawn, low, views, **about)
+        except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
+            raise DataError(f"{path}: not a file of sampled looks ({one_line(error)})") from error

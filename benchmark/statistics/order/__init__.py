@@ -1,1 +1,0 @@
-"""What the order of observations adds: drift of places, and other rules to fuse by."""

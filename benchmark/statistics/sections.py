@@ -1,0 +1,260 @@
+"""Sums over cubes of space that the sections of a description are functions of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64, Int64
+from semstab.model.events import Events
+from semstab.model.evidence import stretches
+from semstab.model.measures import Beliefs, sbd, vss
+from semstab.model.statistics import Flipping, Interval, RuleOutcome
+from semstab.model.voxels import VoxelTable
+from semstab.statistics import fusion_rules
+from semstab.statistics.accumulate import Cubes, CubeSums, Mean
+from semstab.statistics.agreement import alpha_of, between_of, decompose, disagreement, kappa_of, psa, ratio_of
+from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
+from semstab.statistics.drift import TESTABLE, Flips, VoxelDrift, benjamini_hochberg, flips, rounded_up, trend_columns
+from semstab.statistics.intervals import EstimateSpec
+from semstab.statistics.sample import MapSample
+from semstab.statistics.scene_drift import OrderTest, order_test
+
+Columns = dict[str, npt.NDArray[Any]]
+
+FALSE_DISCOVERIES = 0.05
+"""Rate at which single voxels are reported as trending, or as drifting unusually."""
+
+
+# --- Columns and means ------------------------------------------------------------------------------------------------
+
+
+def row_columns(table: VoxelTable, null: Float64) -> Columns:
+    """Return the columns (n,) that follow from the row of each voxel and its SBD in random order, `null` (n,)."""
+    within, between = disagreement(table)
+    parts = decompose(table)
+    return {
+        "psa": psa(table),
+        "disagreement_within": within,
+        "disagreement_between": between,
+        "sbd_null": null,
+        "sbd_excess": sbd(table) - null,
+        "entropy_within": parts.within,
+        "entropy_between": parts.between,
+    }
+
+
+def _less(sums: Float64) -> Float64:
+    """A ratio less another, (...,) from sums (..., 4)."""
+    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
+
+
+SIGNED = (-1.0, 1.0)
+MEANS: Mapping[str, Mean] = {
+    **{name: Mean(name) for name in ("psa", "vss", "within", "between", "sbd", "null")},
+    **{name: Mean(name) for name in ("entropy", "entropy_within", "entropy_between")},
+    **{name: Mean(name, bounds=SIGNED) for name in ("excess", "steadier")},
+    "coin": Mean("coin", _less, SIGNED),
+    "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
+    "alpha": Mean("alpha", alpha_of, SIGNED, "agreement"),
+    "alpha_between": Mean("alpha", between_of, SIGNED, "agreement"),
+    "voxel_weighted": Mean("voxel_weighted", between_of, SIGNED, "agreement"),
+}
+"""Over the voxels with OP >= 2, of values where they are defined, and agreement beyond chance."""
+
+OF_FLIPS: Mapping[str, Mean] = {
+    **{name: Mean(name) for name in ("flip_rate", "flip_null")},
+    "flip_excess": Mean("flip_excess", bounds=SIGNED),
+}
+"""Over the same voxels as the first of `MEANS`, so that those are the same to the last bit without a log."""
+
+OF_CHANGES: Mapping[str, Mean] = {
+    "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
+    "trend_excess": Mean("trend_excess", bounds=SIGNED),
+}
+"""Over fewer voxels."""
+
+
+def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
+    """Return the sums over cubes of the voxels with OP >= 2 of which `MEANS` are functions."""
+    T, op, agreement = table.op.astype(np.float64), table.op, columns["psa"]
+    sums = places.means(
+        {
+            "psa": agreement,
+            "vss": vss(table),
+            "sbd": columns["sbd_excess"] + columns["sbd_null"],
+            "null": columns["sbd_null"],
+            "excess": columns["sbd_excess"],
+            "steadier": np.where(op > 2, -columns["sbd_excess"], np.nan),
+            "entropy": columns["entropy_within"] + columns["entropy_between"],
+            "entropy_within": columns["entropy_within"],
+            "entropy_between": columns["entropy_between"],
+            "of two": np.where(op == 2, agreement, np.nan),
+            "of more": np.where(op > 2, agreement, np.nan),
+            "observations": T,
+            "agreeing": T * agreement,
+            "own": table.self_sum,
+            "own of an observation": table.self_sum / T,
+            **{name: T * columns[f"disagreement_{name}"] for name in ("within", "between")},
+        }
+    )
+    observations, agreeing, own, own_of_one = (
+        sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own", "own of an observation")
+    )
+    by_observation, by_voxel = places.sums_by_class(table)
+    further = {
+        **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
+        "coin": [sums.pop("of two"), sums.pop("of more")],
+        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns` twice
+        "alpha": [agreeing, observations, own, by_observation],
+        "voxel_weighted": [sums["psa"], own_of_one, by_voxel],
+    }
+    return CubeSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
+
+
+# --- Locations that flip
+
+ENOUGH = 4
+"""Observations from which on places that flip can be told from places that err now and then."""
+
+UNIT = 2.0**-32
+"""Of probabilities: sums of multiples of it are exact, in whatever order a map's tiles are added."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlippingSums:
+    """What is known of the places of a map that flip, as sums over its places with OP >= 2.
+
+    share     over the cubes: how likely places are not stable, and how many there are
+    often     how many were seen ENOUGH times
+    together  (K, K), above the diagonal: how often two looks at one place are of two classes, where it is not stable
+    """
+
+    share: CubeSums
+    often: int
+    together: Float64
+
+    @classmethod
+    def of(cls, table: VoxelTable, stable: Float64, places: Cubes) -> FlippingSums:
+        """Of a table, by the probability (n,) of `steady`, over the cubes of its voxels with OP >= 2."""
+        unsteady = np.round((1 - stable) / UNIT) * UNIT
+        share = CubeSums(places.cell, places.edge, places.means({"": unsteady}))
+        return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
+
+    def asked(self) -> Iterator[EstimateSpec]:
+        """For `answers`: the share of the places that are not stable."""
+        return self.share.asked({"": Mean("")})
+
+    def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
+        """That share, as it was answered, and the two classes that stand together most often there."""
+        places = self.share[""][1]
+        seen = float(self.often / places) if places else float("nan")
+        total = float(self.together.sum())
+        if not total > 0:
+            return Flipping(share, seen)
+        a, b = np.unravel_index(self.together.argmax(), self.together.shape)
+        names = classes or tuple(str(k) for k in range(len(self.together)))
+        return Flipping(share, seen, names[int(a)], names[int(b)], float(self.together[a, b]) / total)
+
+
+def _together(table: VoxelTable, unsteady: Float64) -> Float64:
+    """(K, K) of voxels that are unsteady with that probability (n,), NaN for those that do not count."""
+    from semstab.statistics.loops.rows import add_pairs
+
+    pairs = np.zeros((table.K, table.K))
+    add_pairs(table.evidence.entries, table.op, unsteady, pairs)
+    return pairs
+
+
+# --- What needs a log
+
+
+@dataclass(frozen=True, eq=False)
+class LogSums:
+    """The sums and tests that need a log: sums over cubes, `trend_columns` summed (3,), and how many voxels trend."""
+
+    places: CubeSums
+    trend: Float64
+    test: OrderTest
+    tested: int
+    unusual: int
+    trending: int
+
+
+def log_sums(
+    table: VoxelTable, sample: MapSample, places: Cubes, drift: VoxelDrift | None, seed: int
+) -> tuple[Columns, LogSums | None]:
+    """The columns and sums that need a log; none without one."""
+    if sample.events is None or drift is None:
+        return {}, None
+    changes: Flips = flips(sample.events)
+    tell, trend = trend_columns(table, drift)
+    trends = places.rows(tell).sums(trend)
+    means = {
+        "flip_rate": changes.rate,
+        "flip_null": changes.null,
+        "flip_excess": changes.rate - changes.null,
+        "frames_since": changes.since,
+    }
+    sums = places.means(means)
+    sums["trend_excess"] = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
+    testable = table.op >= TESTABLE
+    drift_q = benjamini_hochberg(np.where(testable, drift.p_value, np.nan))
+    trend_q = benjamini_hochberg(rounded_up(np.where(testable, drift.trend_p, np.nan)))
+    log = LogSums(
+        CubeSums(places.cell, places.edge, sums),
+        trends.sum(axis=0),
+        order_test(table, sample.events, seed=seed),
+        int(np.count_nonzero(~np.isnan(trend_q))),
+        int(np.count_nonzero(drift_q <= FALSE_DISCOVERIES)),
+        int(np.count_nonzero(trend_q <= FALSE_DISCOVERIES)),
+    )
+    columns: Columns = {
+        "sbd_null": drift.null,
+        "drift_p": drift.p_value,
+        "trend": drift.trend,
+        "trend_p": drift.trend_p,
+        "flip_rate": changes.rate,
+        "frames_since_flip": changes.since,
+        "drift_q": drift_q,
+        "trend_q": trend_q,
+    }
+    return columns, log
+
+
+# --- Other rules of fusion
+
+TOGETHER = 1 << 16
+"""Voxels whose beliefs under all rules are in memory at once."""
+
+
+def rule_outcomes(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
+    """Return the means over the voxels with OP >= 2 under each rule of fusion."""
+    again = np.flatnonzero(table.op >= 2)
+    parts = [_rule_sums(table, events, truth, again[some]) for some in stretches(len(again), TOGETHER)]
+    total = np.sum(parts, axis=0)
+    return tuple(
+        RuleOutcome(rule, rule_means_of(own[2:]), float(ratio_of(own[:2])))
+        for rule, own in zip(fusion_rules.RULES, total, strict=True)
+    )
+
+
+def _rule_sums(table: VoxelTable, events: Events, truth: Truth | None, rows: Int64) -> Float64:
+    """(R, 2 + C) for each rule how many voxels it relabels, of how many, and `rule_sums`."""
+    _, *others = fusion_rules.RULES  # the first one is the map's own
+    some, own = table.rows(rows), None if truth is None else Truth(truth.known[rows], truth.label[rows])
+    fused: list[Beliefs] = [some, *fusion_rules.fuse_all(events, others, evidence=some.evidence, rows=rows)]
+    usual, *labels = (fusion_rules.labels(belief.evidence) for belief in fused)
+    relabelled = [0, *(np.count_nonzero(label != usual) for label in labels)]
+    every = np.ones(len(rows), np.bool_)
+    return np.stack(
+        [
+            np.concatenate([[count, len(rows)], rule_sums(belief, every, own)])
+            for count, belief in zip(relabelled, fused, strict=True)
+        ]
+    )

@@ -1,1 +1,0 @@
-"""Several backbones beside each other: on the same places, by the same looks."""
