@@ -35,7 +35,6 @@ from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.kinds import Kinds
 from semstab.statistics.order.fusion_rules import fuse_all
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -184,7 +183,6 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     for name, call in sections(table, events).items():
         watch(f"  {name}", call)
     counts = {"voxels": len(table), "observations": len(events), "frames": arguments.frames}
-    counts |= {"kinds": len(Kinds.found(table, events, statistics.join_truth(table, table)).one.table)}
     return {**counts, "K": K, "seconds": watch.seconds, "peak": watch.peak}
 
 
@@ -208,7 +206,6 @@ def main() -> None:
     n, m, fusion = found["voxels"], found["observations"], found["seconds"]["fusion"]
     loop = sum(found["seconds"][name] for name in LOOP)
     print(f"{found['frames']} frames, {m:,} observations of {n:,} voxels ({m / n:.1f} looks each), K = {found['K']}")
-    print(f"voxels that the statistics look at, one of each kind: {found['kinds']:,}")
     print(f"{'step':<24}{'CPU s':>9}{'us/observation':>16}{'of fusion':>11}{'of loop':>9}{'peak bytes/voxel':>18}")
     for name, seconds in found["seconds"].items():
         row = f"{name:<24}{seconds:9.2f}{1e6 * seconds / m:16.3f}{seconds / fusion:11.2f}{seconds / loop:9.2f}"

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.looks import Sample
+from semstab.statistics.looks import ObservationSample
 from semstab.statistics.sampling import InfluenceSums, influence_sums
 
 ROUGH = 0.5
@@ -164,7 +164,7 @@ def sums_of(labels: np.ndarray, over: World, flight: Flight = Flight()) -> Influ
     return influence_sums(table_of(log), log, over.truth[some])
 
 
-def sample_of(labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator) -> Sample:
+def sample_of(labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator) -> ObservationSample:
     """What a sampler takes of a flight: at borders each frame sees another part of the next class.
 
     A label that errs moves all that the frame sees of a voxel by as many classes.
@@ -178,4 +178,4 @@ def sample_of(labels: np.ndarray, over: World, flight: Flight, rng: np.random.Ge
         evidence = (1 - part) * np.eye(flight.K)[first] + part * np.eye(flight.K)[(first + 1) % flight.K]
         return Events(*over.index[some].T, voxel, frame, evidence, np.ones(n), 0.125)
 
-    return Sample(log(labels[some][voxel, frame]), log(truth), (), soft=False)
+    return ObservationSample(log(labels[some][voxel, frame]), log(truth), (), soft=False)

@@ -19,7 +19,7 @@ from records import record, study, voxels
 import semstab
 from semstab.core.json_form import to_json
 from semstab.engine import Observer, load_result, run_study
-from semstab.engine.work.memory import Kind
+from semstab.engine.memory import MemoryModel
 from semstab.errors import ConfigError
 from semstab.metrics import sbd
 from semstab.model.events import Events
@@ -31,7 +31,7 @@ from semstab.report.figures.statistics import DriftByOP, draw_intervals, draw_re
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
-from semstab.statistics import Estimate, Looks, Reliability, Sample, analyse, describe
+from semstab.statistics import CellObservations, Estimate, MapSample, ObservationSample, Reliability, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 from semstab.statistics.steady import steady
 
@@ -54,9 +54,9 @@ def ran(tmp_path_factory):
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
-def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, Sample]:
+def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, ObservationSample]:
     name = f"wall__{backbone}__numpy.parquet"
-    looks = Looks.load(run / "looks" / name).sample()
+    looks = CellObservations.load(run / "looks" / name).sample()
     return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), looks
 
 
@@ -67,10 +67,10 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
         name = entry["backbone"]
         table, events, sample = saved(run, name)
         true, sample = (None, sample) if name == "gt" else (truth, sample.against(of_truth))
-        expected = analyse(table, events, true, limit=true, sample=sample, name=name, edges=(1, 3))
+        expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), sample, name=name, edges=(1, 3))
         assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
-        for column, values in expected.maps.items():
+        for column, values in expected.columns(table).items():
             np.testing.assert_array_equal(columns.column(column).to_numpy(), values)
     by_name = {entry["backbone"]: entry["statistics"] for entry in summary["runs"]}
     assert by_name["gt"]["agreement"]["psa"]["value"] == 1.0
@@ -103,8 +103,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    sample = Looks.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
-    assert to_json(entry.statistics) == to_json(describe(table, sample=sample, name="a"))
+    sample = CellObservations.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
+    assert to_json(entry.statistics) == to_json(describe(table, observations=sample, name="a"))
     assert entry.statistics.drift.tests is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
@@ -114,8 +114,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
 class Interrupting(Observer):
     """Ctrl-C when the second backbone is to be fused."""
 
-    def frame_fused(self, unit, frame, row) -> None:
-        if unit.backbone == "b":
+    def frame_fused(self, task, frame, rows) -> None:
+        if task.backbone == "b":
             raise KeyboardInterrupt
 
 
@@ -168,7 +168,7 @@ def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=30)
-    without, expected = (Kind("numba", 3, logged=wanted).bytes(222, 30 * 48) for wanted in (False, True))
+    without, expected = (MemoryModel("numba", 3, logged=wanted).map_bytes(222, 30 * 48) for wanted in (False, True))
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
     assert expected - without > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):

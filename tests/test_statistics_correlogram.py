@@ -11,7 +11,7 @@ from simulated_events import grid, log_of
 from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
 from semstab.recording.voxel_maps import looks_report
 from semstab.report.figures.statistics import draw_correlogram
-from semstab.statistics import Sample, Views, correlogram, describe, krippendorff_alpha
+from semstab.statistics import ObservationSample, Views, correlogram, describe, krippendorff_alpha
 
 SIDE = 20
 
@@ -21,7 +21,7 @@ def sample_of(labels, centres, limit=None, K=3):
     log = log_of(labels, K=K, index=grid(SIDE))
     centres = np.asarray(centres, float)
     views = Views(np.arange(len(centres)), centres, np.full(len(centres), math.nan))
-    return Sample(log, log if limit is None else log_of(limit, K=K, index=grid(SIDE)), views, soft=False)
+    return ObservationSample(log, log if limit is None else log_of(limit, K=K, index=grid(SIDE)), views, soft=False)
 
 
 def flown(step, frames=8, height=10.0):
@@ -89,12 +89,12 @@ def test_frames_of_one_look_have_no_correlogram_and_all_outputs_take_it():
     found = correlogram(sample_of(once, flown(1.0, 2)))
     assert found.time == found.angle == ()
     assert (found.standard.pairs, math.isnan(found.standard.alpha.value)) == (0, True)
-    summary = describe(log_of(once).table(), sample=sample_of(once, flown(1.0, 2)))
+    summary = describe(log_of(once).table(), observations=sample_of(once, flown(1.0, 2)))
     assert "no verdict" in looks_report(summary)
     labels = tied_to_the_view(np.random.default_rng(3))
     many = correlogram(sample_of(labels, flown(1.0)))
     assert len(draw_correlogram({"net": many}).axes) == 4
-    report = looks_report(describe(log_of(labels).table(), sample=sample_of(labels, flown(1.0))))
+    report = looks_report(describe(log_of(labels).table(), observations=sample_of(labels, flown(1.0))))
     assert report.count("| ceiling |") == 4
 
 

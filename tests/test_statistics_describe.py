@@ -19,7 +19,15 @@ from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import NEXT_FLIGHT, UNKNOWN, ClassReach, Interval, Judged, MapStatistics, Reach
 from semstab.model.voxels import VoxelTable
 from semstab.report.terminal_statistics import comparison_lines, lines
-from semstab.statistics import analyse, compare_backbones, describe, expected_sbd, krippendorff_alpha, verdict
+from semstab.statistics import (
+    MapSample,
+    analyse,
+    compare_backbones,
+    describe,
+    expected_sbd,
+    krippendorff_alpha,
+    verdict,
+)
 from semstab.statistics.agreement import PSA
 
 SIDE, F = 24, 8
@@ -43,7 +51,7 @@ def ground_truth():
 @pytest.fixture(scope="module")
 def described():
     events = backbone(0.2, 0, place=0.2)
-    return analyse(events.table(), events, ground_truth(), limit=ground_truth(), name="sim")
+    return analyse(MapSample.draw(events.table(), events, ground_truth()), name="sim")
 
 
 # --- One map ----------------------------------------------------------------------------------------------------------
@@ -63,9 +71,9 @@ def test_how_many_voxels_are_summed_at_a_time_does_not_matter(monkeypatch, soft)
     """All numbers to 1e-12, also the ends of intervals, and which sums by class are known."""
     table = backbone(0.2, 0, place=0.2).table()
     table = replace(table, self_sum=np.where(np.arange(len(table)) == 7, 0.9, 1.0) * table.self_sum) if soft else table
-    whole = analyse(table)
+    whole = analyse(MapSample.draw(table))
     monkeypatch.setattr("semstab.model.evidence.STRETCH", 50)
-    parts = analyse(table)
+    parts = analyse(MapSample.draw(table))
     assert differences(to_json(whole.summary), to_json(parts.summary), tolerance=1e-12) == []
     for name in ("class_own", "sbd_excess"):
         np.testing.assert_allclose(whole.sums[name].sum(axis=0), parts.sums[name].sum(axis=0), rtol=1e-12)
@@ -91,10 +99,11 @@ def test_a_description_holds_what_the_functions_say(described):
     assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 
-def test_every_map_has_a_value_for_every_voxel(described):
-    assert {len(values) for values in described.maps.values()} == {SIDE**2}
-    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(described.maps)
-    assert 0 <= np.nanmin(described.maps["stable"]) < np.nanmax(described.maps["stable"]) <= 1
+def test_every_column_has_a_value_for_every_voxel(described):
+    columns = described.columns(backbone(0.2, 0, place=0.2).table())
+    assert {len(values) for values in columns.values()} == {SIDE**2}
+    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(columns)
+    assert 0 <= np.nanmin(columns["stable"]) < np.nanmax(columns["stable"]) <= 1
 
 
 def test_the_same_seed_gives_the_same_description():

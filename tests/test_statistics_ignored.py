@@ -14,7 +14,7 @@ from semstab import backends
 from semstab.errors import DataError
 from semstab.model.contrast import CommonLooks
 from semstab.report.terminal_statistics import comparison_lines
-from semstab.statistics import Looks, compare_backbones, psa
+from semstab.statistics import CellObservations, compare_backbones, psa
 from semstab.statistics.looks.common import common, psa_bounds
 from semstab.statistics.versus.standard import Observed
 
@@ -122,7 +122,7 @@ def test_strata_of_op_that_hardly_overlap_are_said():
 def test_looks_come_back_from_their_file(tmp_path):
     looks = sampler_of(flight(4, flicker=0.2), 0.4).looks(("a", "b", "c"))
     looks.save(tmp_path / "looks.parquet")
-    back = Looks.load(tmp_path / "looks.parquet")
+    back = CellObservations.load(tmp_path / "looks.parquet")
     (a, b) = common([looks, back]).logs
     np.testing.assert_array_equal(a.evidence, b.evidence)
     np.testing.assert_array_equal(looks.observations().frame, back.observations().frame)
@@ -130,7 +130,7 @@ def test_looks_come_back_from_their_file(tmp_path):
     np.testing.assert_array_equal(back.views.rows(), looks.views.rows())
     (tmp_path / "other.parquet").write_bytes(b"no")
     with pytest.raises(DataError, match="not a file of sampled looks"):
-        Looks.load(tmp_path / "other.parquet")
+        CellObservations.load(tmp_path / "other.parquet")
 
 
 def test_samples_of_other_voxels_are_refused_and_less_dense_ones_are_met():

@@ -17,7 +17,7 @@ from semstab import backends
 from semstab.datasets import open_dataset
 from semstab.metrics.agreement import shared_observations
 from semstab.statistics import (
-    Sample,
+    ObservationSample,
     Sampler,
     Views,
     alpha_between,
@@ -186,7 +186,7 @@ SIZES = (0.15, 0.3, 0.6)
 def verdict_at(voxel_size, **options):
     frames = list(flight(16, step=0.35, **options))
     table = fused(frames, voxel_size).table()
-    return describe(table, sample=sampled(frames, voxel_size))
+    return describe(table, observations=sampled(frames, voxel_size))
 
 
 def test_the_truth_reaches_its_ceiling_at_every_voxel_size_while_alpha_falls():
@@ -223,13 +223,13 @@ def test_a_class_that_flips_a_coin_is_the_worst_one_though_it_is_rare():
     steady = np.where(rare, rng.integers(2, 4, size=(n, 1)), own)
     perfect = log_of(np.repeat(steady, 4, axis=1), K=4, index=grid(102))
     views = Views(np.arange(4), np.tile([3.0, 3.0, 9.0], (4, 1)), np.arange(4.0))
-    sample = Sample(log, perfect, views, soft=False)
-    found = describe(log.table(), sample=sample)
+    sample = ObservationSample(log, perfect, views, soft=False)
+    found = describe(log.table(), observations=sample)
     assert found.agreement.alpha.value > 0.95
     assert found.verdict.level == "partly stable"
     assert found.reach.worst.name in ("2", "3")
     assert found.reach.worst.reached.high < 0.6
-    assert describe(log.table(), sample=sample, critical=["0"]).verdict.level == "stable"
+    assert describe(log.table(), observations=sample, critical=["0"]).verdict.level == "stable"
 
 
 def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict():
@@ -256,7 +256,7 @@ def test_the_ground_truth_of_a_real_scene_is_stable_at_every_voxel_size(voxel_si
     for frame in shelf:
         sampler.add(frame)
         backend.integrate(frame)
-    assert describe(backend.table(), sample=sampler.sample()).verdict.level == "stable"
+    assert describe(backend.table(), observations=sampler.sample()).verdict.level == "stable"
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from semstab.model.records import Record
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.looks import Looks
+from semstab.statistics.looks import CellObservations
 from semstab.statistics.looks.ignored import common_looks
 from semstab.statistics.order.drift import expected_sbd, streams
 from semstab.statistics.sampling import InfluenceSums, influence_sums
@@ -216,12 +216,12 @@ def _some(log: Events | None, where: Mask) -> Events | None:
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
 
 
-def _looks_of(record: Record) -> Looks | None:
+def _looks_of(record: Record) -> CellObservations | None:
     file = record.looks_file
-    return Looks.load(file) if file is not None and file.is_file() else None
+    return CellObservations.load(file) if file is not None and file.is_file() else None
 
 
-def _same_frames(looks: Sequence[Looks]) -> bool:
+def _same_frames(looks: Sequence[CellObservations]) -> bool:
     """Whether frames of one index were taken from one place, and most of the shorter flight's are in the others."""
     first, *others = (own.views for own in looks)
     for other in others:
@@ -233,7 +233,7 @@ def _same_frames(looks: Sequence[Looks]) -> bool:
     return True
 
 
-def _fewer_frames(looks: Sequence[Looks]) -> tuple[str, ...]:
+def _fewer_frames(looks: Sequence[CellObservations]) -> tuple[str, ...]:
     """Where not all of a run's frames are in the others."""
     frames = [own.views.frame for own in looks]
     both = len(functools.reduce(np.intersect1d, frames))

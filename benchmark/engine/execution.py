@@ -1,4 +1,4 @@
-"""A run or a study: every unit of its plan that an earlier start did not finish is computed; together they make a result."""
+"""A run or a study computes every unit of its plan that an earlier start did not finish; all of them make a result."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ from semstab.model.results import (
 )
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, MapSample, Sample, analyse
+from semstab.statistics import Analysis, MapSample, ObservationSample, analyse
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
 from semstab.task import Task, read
 
@@ -155,7 +155,7 @@ def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: 
     return analyse_sample(live.task, config, sample, observations)
 
 
-def analyse_sample(task: Task, config: Config, sample: MapSample, observations: Sample | None) -> Analysis:
+def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
     """The statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     name, critical = task.backbone, config.critical_classes
     return analyse(sample, observations, name=name, edges=config.strata, critical=critical)

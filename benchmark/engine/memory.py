@@ -1,4 +1,4 @@
-"""The memory of maps: a plain estimate before anything is fused, tiles where a map will not fit, a watch while it grows."""
+"""The memory of maps: estimated before anything is fused, tiles where a map will not fit, watched while it grows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 GB = 1e9
 
 LOADED, LOADED_FOR_SCORES, LOADED_FOR_TILES = 170e6, 30e6, 50e6
-"""Bytes of code and tables that a run loads once it is planned, of the sample of observations, and left between tiles."""
+"""Bytes of code that a run loads once it is planned, of the sample of observations, and left between tiles."""
 
 FRAMES_AT_WORK = 3
 """Frames that are in memory beside those which are read ahead."""
@@ -41,19 +41,18 @@ BLOCK = 4
 
 @dataclass(frozen=True)
 class MemoryModel:
-    """The bytes that a unit takes, roughly.
+    """The bytes that the map of a unit takes, roughly.
 
-    first    frame, as it is fused
+    K        number of classes
+    soft     whether frames have scores, which are fused as labels as well
     logged   whether every observation is kept, and the ground truth fused too
     sampled  whether the reference follows a sample of its voxels
     touched  voxels that a frame touches
-    filled   share of the voxels of blocks of space that it touches
+    filled   share of the voxels of blocks of space that it touches, 0 where that does not matter
     """
 
     backend: str
     K: int
-    first: Frame
-    threads: int | None
     soft: bool = False
     logged: bool = False
     sampled: bool = False
@@ -62,13 +61,12 @@ class MemoryModel:
 
     @classmethod
     def of(cls, planned: PlannedUnit, first: Frame, *, soft: bool) -> MemoryModel:
-        """The model of a unit."""
+        """The model of a unit, whose first frame is that one."""
         config, backend, K = planned.config, planned.unit.backend, len(planned.task.mapping.target)
-        touched = voxels_in(first, config.voxel_size, K)
-        return cls(
-            backend, K, first, config.threads, soft, config.statistics or config.events, planned.sampled,
-            len(touched) if frame_bytes(backend, 1, 2) else 0, filled_share(touched) if takes_blocks(backend) else 0.0,
-        )  # fmt: skip
+        seen = voxels_in(first, config.voxel_size, K)
+        touched, filled = len(seen) if frame_bytes(backend, 1, 2) else 0, filled_share(seen)
+        logged = config.statistics or config.events
+        return cls(backend, K, soft, logged, planned.sampled, touched, filled if takes_blocks(backend) else 0.0)
 
     def map_bytes(self, voxels: float, observations: float) -> float:
         """Bytes of a map of so many voxels and observations, and of its tables."""
@@ -83,12 +81,12 @@ class MemoryModel:
         fused += frame_bytes(self.backend, min(n, self.touched), self.K)
         return fused + (1 + self.logged) * table_bytes(n, self.K, soft=self.soft)
 
-    def process_bytes(self, *, in_tiles: bool = False) -> float:
-        """Bytes that a process takes beside its maps: code, and frames."""
-        threads = default_threads() if self.threads is None else self.threads
-        pixels = self.first.shape[0] * self.first.shape[1]
-        frames = (threads + FRAMES_AT_WORK) * pixels * (6 + (4 * self.K if self.soft else 0))
-        return LOADED + self.soft * LOADED_FOR_SCORES + in_tiles * LOADED_FOR_TILES + frames
+
+def process_bytes(first: Frame, K: int, threads: int | None, *, soft: bool, in_tiles: bool = False) -> float:
+    """Bytes that a process takes beside its maps: code, and frames like the first one."""
+    threads = default_threads() if threads is None else threads
+    frames = (threads + FRAMES_AT_WORK) * first.shape[0] * first.shape[1] * (6 + (4 * K if soft else 0))
+    return LOADED + soft * LOADED_FOR_SCORES + in_tiles * LOADED_FOR_TILES + frames
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
@@ -145,7 +143,7 @@ SMALLEST, LARGEST = 8, 1 << 16
 
 @dataclass
 class Sizing:
-    """Units that would not fit into memory, by identity: the edge of their tiles in voxels, or why they cannot be fused.
+    """Units that would not fit into memory, by identity: the edge of their tiles, or why they cannot be fused.
 
     lines  say so, one for each sequence in tiles
     """
@@ -182,14 +180,16 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
             raise ConfigError(f"tile_size = {config.tile_size}: {why}")
         sizing.tile_sizes |= {each.identity: config.tile_size for each in group}
         return
-    first = _geometry(task, settings, task.indices[0])
-    soft = read(task, task.indices[0], settings.pixel_stride).scores is not None
-    models = [MemoryModel.of(each, first, soft=soft) for each in group]
-    free = available_for_maps(config, width, models[0].process_bytes())
-    most = DOUBT * len(task.indices) * len(voxels_in(first.every(2), settings.voxel_size, models[0].K))
-    if sum(model.map_bytes(most, most) for model in models) <= free:
-        return
-    size = map_size(task, settings, models[0].K)
+    first, K = _geometry(task, settings, task.indices[0]), len(task.mapping.target)
+    most = DOUBT * len(task.indices) * len(voxels_in(first.every(2), settings.voxel_size, K))
+    for soft in (True, False):  # if scores would fit, no label is decoded to know, which a network may have to predict
+        models = [MemoryModel.of(each, first, soft=soft) for each in group]
+        free = available_for_maps(config, width, process_bytes(first, K, settings.threads, soft=soft))
+        if sum(model.map_bytes(most, most) for model in models) <= free:
+            return
+        if soft and read(task, task.indices[0], settings.pixel_stride).scores is not None:
+            break
+    size = map_size(task, settings, K)
     needed = sum(model.map_bytes(size.voxels, size.observations) for model in models)
     if needed <= free:
         return
@@ -205,7 +205,7 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
         )
         sizing.refused |= {each.identity: line for each in group}
         return
-    in_tiles = available_for_maps(config, width, models[0].process_bytes(in_tiles=True))
+    in_tiles = available_for_maps(config, width, process_bytes(first, K, settings.threads, soft=soft, in_tiles=True))
     edges = [size.tile_edge(model, SHARE * in_tiles, width) for model in models]
     sizing.tile_sizes |= {each.identity: edge for each, edge in zip(group, edges, strict=True)}
     sizing.lines.append(
@@ -231,7 +231,7 @@ class MapSize:
     by_column: float
 
     def tile_edge(self, model: MemoryModel, budget: float, width: int) -> int:
-        """The largest edge of a tile, a power of 2, whose map is within the budget; smaller ones for several processes."""
+        """The largest edge of a tile, a power of 2, within the budget; smaller where several processes share them."""
         edge = LARGEST
         seen = self.observations / max(self.voxels, 1.0)
         while edge > SMALLEST:
@@ -246,12 +246,12 @@ class MapSize:
 def map_size(task: Task, settings: Config, num_classes: int) -> MapSize:
     """Estimate a map from a few pairs of successive frames, evenly spaced.
 
-    Without a place that is seen again later, each frame adds as many voxels as a second one of a pair adds to the first.
-    Where frames far apart see the same voxels, it adds fewer: as many as if frames drew their voxels from a fixed number
-    of them, which follows from how many of the sampled ones are distinct.
+    If no place is seen again later, each frame adds as many voxels as the second one of a pair adds to the first.
+    Where frames far apart see the same voxels, it adds fewer: as many as if frames drew their voxels at random from a
+    fixed number of them, which follows from how many of the sampled ones are distinct.
     """
     first = [task.indices[k] for k in evenly(len(task.indices), FEW)]
-    after = {index: later for index, later in zip(task.indices, task.indices[1:], strict=False)}
+    after = dict(zip(task.indices, task.indices[1:], strict=False))
     seen, new = list[Int64](), list[float]()
     for index in first:
         seen.append(voxels_in(_geometry(task, settings, index), settings.voxel_size, num_classes))
@@ -269,7 +269,7 @@ def map_size(task: Task, settings: Config, num_classes: int) -> MapSize:
 
 
 def _drawn_from(distinct: int, each: float, frames: int) -> float:
-    """Of how many voxels so many frames see `each`, at random, where so many are distinct; infinite where none repeats."""
+    """The number of voxels of which so many frames see `each` at random, if so many are distinct; maybe infinite."""
     if distinct >= 0.999 * frames * each:
         return math.inf
     low, high = max(float(distinct), each * (1 + 1e-9)), 1e4 * frames * each
@@ -296,7 +296,7 @@ STEP = 32e6
 """Bytes by which the process may grow before its maps are looked at closer."""
 
 AMPLE = 4
-"""Where that many times the bytes of the maps are left, freed memory is kept: the next images need not clear it again."""
+"""Where that many times the bytes of the maps are left, freed memory is kept: the next images need not clear it."""
 
 
 class MemoryBudget:

@@ -26,7 +26,7 @@ from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Resul
 from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import BackboneComparison, Looks, claimed_together
+from semstab.statistics import BackboneComparison, CellObservations, claimed_together
 from semstab.statistics.versus.backbones import Region, Regions, compare_regions
 
 
@@ -160,13 +160,17 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
         if len(there) > 1:
             regions = _regions_of(there, config, tables)
             kept = {record.unit.backbone: record.looks_file for record in there}
-            looks = {name: Looks.load(file) for name, file in kept.items() if file is not None and file.exists()}
+            looks = {
+                name: CellObservations.load(file) for name, file in kept.items() if file is not None and file.exists()
+            }
             compared = _compared_maps(scene, regions, looks if len(looks) == len(there) else None)
             if compared is not None:
                 yield compared
 
 
-def _compared_maps(scene: str, regions: Regions, looks: Mapping[str, Looks] | None) -> BackboneComparison | None:
+def _compared_maps(
+    scene: str, regions: Regions, looks: Mapping[str, CellObservations] | None
+) -> BackboneComparison | None:
     """The comparison of a scene's maps; None where there are not two or more of them in one label space.
 
     With the logs of all of them, also under other rules of fusion; with the samples of all, on matched observations.

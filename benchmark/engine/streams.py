@@ -275,9 +275,9 @@ class Stream:
             with self._watch("observe") as lap:
                 self._observers.tell(lambda observer: observer.frame_fused(self.task, now.frame, watched))
         for live, row in rows.items():
-            if lap is not None and live.unit in watched and live.work.watched:
-                row = dataclasses.replace(row, logging_seconds=lap.seconds / len(watched))
-            live.rows.append(row)
+            logged = lap is not None and live.work.watched
+            seconds = lap.seconds / len(watched) if logged and lap is not None else math.nan
+            live.rows.append(dataclasses.replace(row, logging_seconds=seconds))
             if live.work.tile is None:
                 unit = live.unit
                 what = f"{unit.scene} · {unit.backbone} · {unit.backend}"

@@ -25,7 +25,7 @@ from semstab.metrics.summary import TableSums
 from semstab.model.parquet import tile_of
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, Looks, MapSample, Sample
+from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th tells the up axis."""
@@ -112,7 +112,7 @@ class TiledUnit:
 def assembled(
     planned: PlannedUnit, frames: TileResult, tasks: Sequence[TileTask], tiles: Sequence[TileResult], folder: Path
 ) -> UnitContent:
-    """The content of a unit, from the results of its frames and its tiles. Raises DataError where no pixel was valid."""
+    """The content of a unit, from the results of its frames and tiles. Raises DataError where no pixel was valid."""
     task, config, unit = planned.task, planned.config, planned.unit
     sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles))
     if not sums.total[2]:
@@ -125,7 +125,7 @@ def assembled(
     if planned.kept:
         files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", rows.save_csv)
         if observations.exists():
-            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", Looks.load(observations).save)
+            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", CellObservations.load(observations).save)
         if analysis is not None:
             files |= _saved(folder, f"{INFLUENCE}/{unit.slug}.parquet", analysis.sums.save)
     if planned.kept and analysis is not None and config.statistics:
@@ -167,10 +167,10 @@ def _analysed(planned: PlannedUnit, tasks: Sequence[TileTask], files: Iterable[s
     return analyse_sample(planned.task, planned.config, sample, _observations(tasks[0], folder))
 
 
-def _observations(task: TileTask, folder: Path) -> Sample | None:
+def _observations(task: TileTask, folder: Path) -> ObservationSample | None:
     """The sample of observations of all frames, against that of the ground truth where there is one."""
     files = [folder / task.folder / f"{task.size}_{name}" for name in (OBSERVATIONS, TRUE_OBSERVATIONS)]
-    own, true = (Looks.load(file).sample() if file.exists() else None for file in files)
+    own, true = (CellObservations.load(file).sample() if file.exists() else None for file in files)
     return own if own is None or true is None else own.against(true)
 
 

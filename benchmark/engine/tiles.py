@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -70,8 +69,8 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     low, high = (np.floor((edge + side) / size) for edge, side in _ranges(corners))
     if (count := float(np.prod(high - low + 1))) > MOST_TILES:
         raise DataError(
-            f"{frame.where('depth')}: up to {depth.max():g} m deep, it sees {count:.0f} tiles of {size * voxel_size:g} m;"
-            " mask such depth, or use a larger --tile-size"
+            f"{frame.where('depth')}: up to {depth.max():g} m deep, it sees {count:.0f} tiles of"
+            f" {size * voxel_size:g} m; mask such depth, or use a larger --tile-size"
         )
     columns, rows = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
     tiles = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -154,11 +153,8 @@ class TileMeta:
     origin: tuple[int, int, int] | None
 
 
-ARRAYS = tuple(
-    each.name
-    for each in dataclasses.fields(TileResult)
-    if each.name not in {f.name for f in dataclasses.fields(TileMeta)} | {"sums"}
-)
+ARRAYS = ("series", "reduced", "image", "poses", "seen")
+"""The fields that are arrays, beside the sums."""
 
 # --- The time series of a unit in tiles -------------------------------------------------------------------------------
 

@@ -28,14 +28,9 @@ from semstab.report.tables import tables, write_tables
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from semstab.config import Config
     from semstab.engine.units import Plan, Planned
-    from semstab.model.results import Unit, UnitSummary
     from semstab.model.voxels import VoxelTable
     from semstab.report.figures import DrawingProcess
-    from semstab.task import Task
 
 
 # The parts of a page that needs no other file: its style, tables and figures.

@@ -28,10 +28,11 @@ from semstab.statistics.agreement import (
 from semstab.statistics.blocks import BlockBootstrap, Blocks, spatial_blocks
 from semstab.statistics.correctness import Truth, correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.looks import Looks, Sample, Sampler, Views, correlogram, reach_of
+from semstab.statistics.looks import CellObservations, ObservationSample, Sampler, Views, correlogram, reach_of
 from semstab.statistics.order.drift import Flips, VoxelDrift, expected_sbd, flips, voxel_drift
 from semstab.statistics.order.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.order.p_values import benjamini_hochberg
+from semstab.statistics.sample import MOST_VOXELS, MapSample
 from semstab.statistics.scene_drift import SceneDrift, scene_drift
 from semstab.statistics.verdict import ceiling, losses, rendered, verdict
 from semstab.statistics.versus.backbones import compare_backbones
@@ -40,22 +41,24 @@ from semstab.statistics.versus.differences import claimed_together
 from semstab.statistics.versus.standard import standardised
 
 __all__ = [
+    "MOST_VOXELS",
     "RULES",
     "Analysis",
     "BackboneComparison",
     "BlockBootstrap",
     "Blocks",
+    "CellObservations",
     "ClassAgreement",
     "Correctness",
     "Estimate",
     "Flips",
     "Fused",
-    "Looks",
     "Losses",
+    "MapSample",
     "MapStatistics",
+    "ObservationSample",
     "Quadrants",
     "Reliability",
-    "Sample",
     "Sampler",
     "SceneDrift",
     "StabilityVerdict",

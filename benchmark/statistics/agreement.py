@@ -18,7 +18,6 @@ from semstab.model.events import Events
 from semstab.model.measures import Quantity, entropy
 from semstab.model.statistics import ClassAgreement
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.observed import Log
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
@@ -183,7 +182,7 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
     return class_agreement_of(class_sums(table, events), table.classes)
 
 
-def class_sums(table: VoxelTable, events: Log | None = None) -> Float64:
+def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
     """(7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2."""
     from semstab.statistics.loops.rows import add_class_sums
 

@@ -65,7 +65,7 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Predictions:
     """Beliefs beside the true classes, (n,) each.
 
     label, predicted  the true and the most likely class
@@ -83,7 +83,7 @@ class Judged:
     K: int
 
     @classmethod
-    def of(cls, evidence: Float64 | Evidence, label: Int64, voxels: Float64 | None = None) -> Judged:
+    def of(cls, evidence: Float64 | Evidence, label: Int64, voxels: Float64 | None = None) -> Predictions:
         """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing.
 
         Each is of so many voxels (n,), of one where that is not given.
@@ -105,14 +105,14 @@ class Judged:
 
 def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> Correctness:
     """Of beliefs (n, K) and true classes (n,)."""
-    return _correctness(Judged.of(belief, label), name)
+    return _correctness(Predictions.of(belief, label), name)
 
 
-def _correctness(judged: Judged, name: str = "all") -> Correctness:
+def _correctness(judged: Predictions, name: str = "all") -> Correctness:
     return correctness_of(judged_sums(judged), name)
 
 
-def judged_sums(judged: Judged) -> Float64:
+def judged_sums(judged: Predictions) -> Float64:
     """(3 + 3 BINS + 3 K,) what all that is said of them is a function of.
 
     Voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right, true and
@@ -121,13 +121,13 @@ def judged_sums(judged: Judged) -> Float64:
     return judged_where(judged, np.ones(len(judged.label), np.bool_))
 
 
-def judged_where(judged: Judged, where: Mask) -> Float64:
+def judged_where(judged: Predictions, where: Mask) -> Float64:
     """`judged_sums` of those for which `where` (n,) holds."""
     sums: Float64 = _judged_by_group(judged, where - np.int64(1), 1)[0]
     return sums
 
 
-def _judged_by_group(judged: Judged, group: Int64, groups: int) -> Float64:
+def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
     """(G, ...) `judged_sums` of each group; -1 is none."""
     from semstab.statistics.loops.rows import add_judged
 
@@ -181,7 +181,7 @@ def rule_sums(fused: Beliefs, voxels: Float64, truth: Truth | None = None) -> Fl
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
         return rows
-    return np.concatenate([rows, judged_where(Judged.of(evidence, truth.label, voxels), truth.known)])
+    return np.concatenate([rows, judged_where(Predictions.of(evidence, truth.label, voxels), truth.known)])
 
 
 def rule_means_of(sums: Float64) -> RuleMeans:
@@ -196,7 +196,7 @@ def rule_means_of(sums: Float64) -> RuleMeans:
 
 def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:
     """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    return reliability_of(judged_sums(Judged.of(belief, label)))
+    return reliability_of(judged_sums(Predictions.of(belief, label)))
 
 
 def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[Correctness, ...]:
@@ -206,10 +206,10 @@ def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[C
 
 def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
     """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
-    return judged_strata(Judged.of(table.evidence, truth.label, table.voxels), table.op, truth.known, edges)
+    return judged_strata(Predictions.of(table.evidence, truth.label, table.voxels), table.op, truth.known, edges)
 
 
-def judged_strata(judged: Judged, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:
+def judged_strata(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:
     """The same of what is judged already, by OP (n,) and where a true class is known (n,)."""
     group = np.where(known, groups_of(op, edges), -1)
     sums = _judged_by_group(judged, group, len(edges) + 1)

@@ -15,7 +15,7 @@ from semstab.statistics.sampling.intervals import Asked
 from semstab.statistics.sampling.places import Mean
 
 ENOUGH = 4
-"""Looks from which on places that flip can be told from places that err now and then."""
+"""Observations from which on places that flip can be told from places that err now and then."""
 
 UNIT = 2.0**-32
 """Of probabilities: sums of multiples of it are exact, in whatever order a map's tiles are added."""

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.core.types import Float64, Int64, Mask
+from semstab.core.types import Float64, Int64
 from semstab.model.events import Events
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.order.drift import VoxelDrift, drawn, streams, trend_columns, varying
+from semstab.statistics.order.drift import VoxelDrift, streams, trend_columns, varying
 from semstab.statistics.sampling.arrangement import arranged
 from semstab.statistics.sampling.reach import Errors, longest
 
@@ -71,7 +71,7 @@ def scene_drift(
     What neighbouring voxels have in common in a frame stays in common, and so does what frames of one stretch have.
     `drift` is what `voxel_drift` says of the same map.
     """
-    test = order_test(*sampled(table, events, seed), seed=seed, frame_orders=frame_orders)
+    test = order_test(table, events, seed=seed, frame_orders=frame_orders)
     one_way, by_chance, all_of_it = trend_columns(table, drift)[1].sum(axis=0)
     return SceneDrift(
         sbd=mean(sbd(table)),
@@ -85,21 +85,12 @@ def scene_drift(
     )
 
 
-def sampled(table: VoxelTable, events: Events, seed: int = 0, vary: Mask | None = None) -> tuple[VoxelTable, Events]:
-    """The voxels of a map from which it is told whether it drifts, with their observations: see `drawn`.
-
-    vary (n,) says whose observations differ, where that is known.
-    """
-    rows = drawn(table, varying(table, events)[0] if vary is None else vary, SAMPLE, seed)
-    return table.rows(rows), events.rows(rows)
-
-
 def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders: int = ORDERS) -> OrderTest:
-    """Put the stretches of time of what was `sampled`, of a map or of its parts, into random orders."""
+    """Put the stretches of time of a sample of a map's observations into random orders."""
     of = _sampled(table, events, seed)
-    tested, drifted, trended = of.orders(events, table.K, seed, frame_orders)
+    tested, drifted, trended = of.orders(seed, frame_orders)
     known = len(tested) > 0
-    total_drift, total_trend = _total(sbd(table)[tested]), _total(_trends(table, events)[tested])
+    total_drift, total_trend = _total(sbd(of.table)[tested]), _total(_trends(of.table, of.events)[tested])
     p_value = min(1.0, 2 * min(_tail(-drifted, -total_drift), _tail(drifted, total_drift)))
     return OrderTest(
         p_value if known else math.nan,
@@ -126,60 +117,60 @@ def _trends(table: VoxelTable, events: Events) -> Float64:
 class _Sampled:
     """Voxels drawn at random from those whose observations differ.
 
-    voxel, first, T  (n,) their rows of the table and of the log, and OP
-    stretch          (m,) of each of their observations, one voxel after the other; they are numbered in time
-    stretches        how many there are
+    table, events  of these voxels
+    stretch        (m,) of each of their observations; they are numbered in time
+    stretches      how many there are
     """
 
-    voxel: Int64
-    first: Int64
-    T: Int64
+    table: VoxelTable
+    events: Events
     stretch: Int64
     stretches: int
 
-    def orders(self, events: Events, K: int, seed: int, count: int) -> tuple[Int64, Float64, Float64]:
+    def orders(self, seed: int, count: int) -> tuple[Int64, Float64, Float64]:
         """Voxels that many stretches see, and the sums over them of SBD and of trends (R,), in random orders."""
         from semstab.statistics.loops import chunks, stretches
 
-        at = np.concatenate([[0], np.cumsum(self.T)])
+        first, T = self.events.starts, self.table.op.astype(np.int64)
         changes = np.diff(self.stretch, prepend=-1) != 0
-        changes[at[:-1]] = True
-        span = np.add.reduceat(changes, at[:-1]) if len(self.T) else self.T
-        kept = (span >= LEAST_SPAN) & (self.stretches >= LEAST_STRETCHES)
-        first, T = self.first[kept], self.T[kept]
-        stretch = self.stretch[np.repeat(kept, self.T)]
+        changes[first] = True
+        span = np.add.reduceat(changes, first) if len(T) else T
+        some = (span >= LEAST_SPAN) & (self.stretches >= LEAST_STRETCHES)
+        stretch = self.stretch[np.repeat(some, T)]
+        first, T = first[some], T[some]
         at = np.concatenate([[0], np.cumsum(T)])
         as_seen = np.tile(np.arange(self.stretches), (count, 1))
         orders = np.ascontiguousarray(np.random.default_rng(seed).permuted(as_seen, axis=1).T)
         voxels = np.arange(chunks.CHUNKS + 1) * len(T) // chunks.CHUNKS
         edges, sums = np.stack([voxels, at[voxels]], axis=1), np.zeros((chunks.CHUNKS, count, 2))
-        log = events.evidence.entries
+        log = self.events.evidence.entries
         entries = int((log[0][first + T] - log[0][first]).max(initial=0))
-        chunks.in_chunks(stretches.permute_stretches, edges, first, T, log, K, entries, stretch, orders, sums)
+        chunks.in_chunks(
+            stretches.permute_stretches, edges, first, T, log, self.table.K, entries, stretch, orders, sums
+        )
         drifted, trended = sums.sum(axis=0).T
-        return self.voxel[kept], drifted, trended
+        return np.flatnonzero(some), drifted, trended
 
 
 def _sampled(table: VoxelTable, events: Events, seed: int) -> _Sampled:
     """So many voxels that they have about SAMPLE observations, with the stretches that frames are cut into."""
-    vary, first, T = varying(table, events)
-    order = np.argsort(streams(table, vary, seed))
-    chosen = np.sort(order[: np.searchsorted(np.cumsum(T[order]), SAMPLE) + 1])
-    voxel, first, T = np.flatnonzero(vary)[chosen], first[chosen], T[chosen]
-    of = np.repeat(np.arange(len(T)), T)
-    rows = np.arange(len(of)) + (first - np.cumsum(T) + T)[of]
-    frames, rank = np.unique(events.frame[rows], return_inverse=True)
-    lasting = _lasting(_departures(table, events, voxel, of, rows), rank, len(frames))
+    rows = np.flatnonzero(varying(table))
+    order = np.argsort(streams(table, rows, seed))
+    enough = np.searchsorted(np.cumsum(table.op[rows][order]), SAMPLE) + 1
+    chosen = np.sort(rows[order[:enough]])
+    table, events = table.rows(chosen), events.rows(chosen)
+    frames, rank = np.unique(events.frame, return_inverse=True)
+    lasting = _lasting(_departures(table, events), rank, len(frames))
     stretches = min(MOST_STRETCHES, int(len(frames) / (1 + 2 * lasting)))
-    return _Sampled(voxel, first, T, rank * stretches // max(len(frames), 1), stretches)
+    return _Sampled(table, events, rank * stretches // max(len(frames), 1), stretches)
 
 
-def _departures(table: VoxelTable, events: Events, voxel: Int64, of: Int64, rows: Int64) -> Float64:
+def _departures(table: VoxelTable, events: Events) -> Float64:
     """(m,) how much less an observation agrees with its voxel's mean than the voxel's observations do on average."""
-    agrees = np.zeros(len(rows))
-    for some in row_chunks(len(rows), table.K):
-        at = voxel[of[some]]
-        agrees[some] = (events.evidence[rows[some]] * table.evidence[at]).sum(axis=1) / table.op[at]
+    agrees, of = np.zeros(len(events)), events.voxel
+    for some in row_chunks(len(events), table.K):
+        at = of[some]
+        agrees[some] = (events.evidence[some] * table.evidence[at]).sum(axis=1) / table.op[at]
     mean_of = np.bincount(of, weights=agrees) / np.maximum(np.bincount(of), 1)
     departures: Float64 = mean_of[of] - agrees
     return departures

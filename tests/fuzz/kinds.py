@@ -52,7 +52,7 @@ from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.settings import load_config, load_study
 from semstab.statistics.commit import Commit
-from semstab.statistics.looks import Looks
+from semstab.statistics.looks import CellObservations
 from semstab.statistics.sampling.influence import InfluenceSums
 
 SHAPE = (12, 16)
@@ -217,7 +217,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
     first: dict[str, Read] = {
         "voxels/*.parquet": VoxelTable.load,
         "events/*.parquet": Events.load,
-        "looks/*.parquet": Looks.load,
+        "looks/*.parquet": CellObservations.load,
         "influence/*.parquet": InfluenceSums.load,
         "overview/*.npz": Overview.load,
         "units/*.json": lambda file: from_json(UnitContent, read_json(file), file),

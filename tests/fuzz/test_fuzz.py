@@ -30,7 +30,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.report.figures.maps import Overview
 from semstab.report.loaded import read_series
 from semstab.settings import load_config, resolve
-from semstab.statistics.looks import Looks
+from semstab.statistics.looks import CellObservations
 from semstab.statistics.sampling import InfluenceSums
 
 EACH = 8
@@ -206,7 +206,7 @@ def test_no_exceptions_name_is_told() -> None:
 def test_json_nested_too_deeply_is_refused_wherever_it_stands(tmp_path) -> None:
     deep = b"[" * 100_000
     pq.write_table(pa.table({"x": [1]}).replace_schema_metadata({"semstab": deep}), tmp_path / "a.parquet")
-    for load in (VoxelTable.load, Looks.load, InfluenceSums.load):
+    for load in (VoxelTable.load, CellObservations.load, InfluenceSums.load):
         with pytest.raises(DataError, match=r"a\.parquet: "):
             load(tmp_path / "a.parquet")
     with pytest.raises(ValueError, match="nested too deeply"):

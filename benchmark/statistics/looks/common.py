@@ -13,7 +13,7 @@ from semstab.core.types import Float64, Int64
 from semstab.errors import DataError
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.statistics.looks.entries import Looks
+from semstab.statistics.looks.entries import CellObservations
 from semstab.statistics.looks.views import Views
 
 
@@ -31,7 +31,7 @@ class Common:
     missing: tuple[float, ...]
 
 
-def common(maps: Sequence[Looks]) -> Common:
+def common(maps: Sequence[CellObservations]) -> Common:
     """What samples of the same frames have in common. Raises DataError where they differ in K or voxel size."""
     if len({(looks.K, looks.voxel_size) for looks in maps}) > 1:
         raise DataError("samples of other classes or voxel sizes cannot be compared; fuse both alike")
@@ -39,7 +39,7 @@ def common(maps: Sequence[Looks]) -> Common:
     look, first = _numbered(maps)
     pixels = np.stack([np.bincount(own, looks.weight, len(first)) for own, looks in zip(look, maps, strict=True)])
     least, most = pixels.min(axis=0), pixels.max(axis=0)
-    places = Looks.joined(maps).only(first)
+    places = CellObservations.joined(maps).only(first)
     logs, ignoring = [], []
     for looks, own, seen in zip(maps, look, pixels, strict=True):
         shared = dataclasses.replace(looks, weight=looks.weight * (least / np.where(seen > 0, seen, 1.0))[own])
@@ -50,7 +50,7 @@ def common(maps: Sequence[Looks]) -> Common:
     return Common(tuple(logs), tuple(ignoring), missing)
 
 
-def _of_the_same_voxels(maps: Sequence[Looks]) -> list[Looks]:
+def _of_the_same_voxels(maps: Sequence[CellObservations]) -> list[CellObservations]:
     """The voxels that are in all samples by their hash, with the frames of all numbered alike."""
     share = min(looks.share for looks in maps)
     views = Views.joined([looks.views for looks in maps])
@@ -63,21 +63,21 @@ def _of_the_same_voxels(maps: Sequence[Looks]) -> list[Looks]:
     return same
 
 
-def _numbered(maps: Sequence[Looks]) -> tuple[list[Int64], Int64]:
+def _numbered(maps: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
     """The number of each entry's look, the same in all maps, and one entry of each look among those of all maps."""
     F = max((len(looks.views) for looks in maps), default=1)
-    all_of_them = Looks.joined(maps)
+    all_of_them = CellObservations.joined(maps)
     _, cell = np.unique(all_of_them.key, return_inverse=True)
     _, first, look = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
     return np.split(look, np.cumsum([len(looks) for looks in maps])[:-1]), first
 
 
-def _filled(looks: Looks, places: Looks, ignored: Float64) -> Looks:
+def _filled(looks: CellObservations, places: CellObservations, ignored: Float64) -> CellObservations:
     """A map's entries, and those of a further class that has the pixels `ignored` of each of the places."""
     further = dataclasses.replace(places, label=np.full(len(places), looks.K, np.uint16), weight=ignored).only(
         ignored > 0
     )
-    return dataclasses.replace(Looks.joined([looks, further]), K=looks.K + 1, classes=())
+    return dataclasses.replace(CellObservations.joined([looks, further]), K=looks.K + 1, classes=())
 
 
 def decided(log: Events) -> Events:

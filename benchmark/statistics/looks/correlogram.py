@@ -18,7 +18,7 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import between_of
-from semstab.statistics.looks.entries import Sample
+from semstab.statistics.looks.entries import ObservationSample
 from semstab.statistics.ranks import numbered
 from semstab.statistics.sampling.cubes import cubes
 from semstab.statistics.sampling.influence import MOST_GROUPS
@@ -36,7 +36,7 @@ MOST_CUBES, MOST_SUMS = 160, 2**17
 
 @dataclass(frozen=True, eq=False)
 class _Looks:
-    """Looks (n,) by the entries of their evidence, with ||s||^2 of each."""
+    """CellObservations (n,) by the entries of their evidence, with ||s||^2 of each."""
 
     entries: tuple[Int64, UInt16, Float64]
     squares: Float64
@@ -111,7 +111,7 @@ EDGES: dict[str, tuple[float, ...]] = {
 AXES = EDGES | {"standard": STANDARD}
 
 
-def correlogram(sample: Sample) -> Correlogram:
+def correlogram(sample: ObservationSample) -> Correlogram:
     """Alpha between frames in bins of the distance of two looks, over the pairs of looks at sampled voxels.
 
     Of a voxel's looks those that are 1, 2, 4, 8, ... looks apart are paired, so that the cost is linear. Chance is that
@@ -139,7 +139,7 @@ def _of_seen_classes(*logs: Events) -> Iterator[Events]:
     return (dataclasses.replace(log, evidence=log.evidence.only(labels), classes=()) for log in logs)
 
 
-def _pairs(sample: Sample, seen: Events, looks: _Looks, still: _Looks) -> Iterator[_Pairs]:
+def _pairs(sample: ObservationSample, seen: Events, looks: _Looks, still: _Looks) -> Iterator[_Pairs]:
     """The pairs of looks that are 1, 2, 4, ... looks apart, one lag after the other."""
     from semstab.statistics.looks.pairing import distances
 

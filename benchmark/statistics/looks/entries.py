@@ -41,7 +41,7 @@ Entries = tuple[Int64, Int32, UInt16, Float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class ObservationSample:
     """What was seen of the sampled voxels, and what would have been had their labels not depended on the view.
 
     seen   observations (s_bar of a voxel in a frame), of the cells that LEAST_FRAMES or more saw
@@ -62,13 +62,13 @@ class Sample:
         seen, limit = shared_observations(self.seen, self.limit)
         return seen, limit
 
-    def against(self, truth: Sample) -> Sample:
+    def against(self, truth: ObservationSample) -> ObservationSample:
         """The same with the ground truth's labels as the limit, of a sample of the same frames."""
         return dataclasses.replace(self, limit=truth.seen, by=TRUTH)
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class CellObservations:
     """Entries (m,) of a cell, a frame and a class: what the frame's pixels in the cell say for the class.
 
     key     (m,) int64 of the cell, see `keys`
@@ -100,7 +100,7 @@ class Looks:
         """(m, 3) index of the cell, of which a voxel has CELLS along its edge."""
         return cells_of(self.key, self.low)
 
-    def sample(self) -> Sample:
+    def sample(self) -> ObservationSample:
         """Observations of the voxels, and those of labels that do not depend on the view."""
         from semstab.statistics.looks.observing import settle
 
@@ -108,22 +108,22 @@ class Looks:
         kept, shown = np.empty(len(key), np.bool_), np.empty(len(key), np.uint16)
         settle(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
         seen, limit = (self._log(key, view, which, weight, kept) for which in (label, shown))
-        return Sample(seen, dataclasses.replace(seen, evidence=limit.evidence), self.views, self.soft)
+        return ObservationSample(seen, dataclasses.replace(seen, evidence=limit.evidence), self.views, self.soft)
 
-    def only(self, rows: Any) -> Looks:
+    def only(self, rows: Any) -> CellObservations:
         """Some of the entries."""
         return self._each(lambda column: column[rows])
 
-    def copied(self) -> Looks:
+    def copied(self) -> CellObservations:
         """The same in memory of its own."""
         return self._each(np.copy)
 
-    def _each(self, change: Callable[[Any], Any]) -> Looks:
+    def _each(self, change: Callable[[Any], Any]) -> CellObservations:
         columns: dict[str, Any] = {name: change(getattr(self, name)) for name in COLUMNS}
         return dataclasses.replace(self, **columns)
 
     @classmethod
-    def joined(cls, parts: Sequence[Looks]) -> Looks:
+    def joined(cls, parts: Sequence[CellObservations]) -> CellObservations:
         """The entries of one after the other, with all else of the first."""
         keys, low = alike([part.key for part in parts], [part.low for part in parts])
         columns: dict[str, Any] = {
@@ -194,7 +194,7 @@ class Looks:
             file.add_key_value_metadata({"semstab": text})  # a schema's own is written twice, and copied more often
 
     @classmethod
-    def load(cls, path: str | Path) -> Looks:
+    def load(cls, path: str | Path) -> CellObservations:
         """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
         import pyarrow as pa
         import pyarrow.parquet as pq

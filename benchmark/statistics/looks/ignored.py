@@ -11,7 +11,7 @@ from semstab.model.events import Events
 from semstab.model.measures import Quantity, mean
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, alpha_between, psa
 from semstab.statistics.looks.common import common, decided, psa_bounds
-from semstab.statistics.looks.entries import Looks
+from semstab.statistics.looks.entries import CellObservations
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Shared:
     found: CommonLooks
 
 
-def common_looks(looks: Mapping[str, Looks]) -> Shared:
+def common_looks(looks: Mapping[str, CellObservations]) -> Shared:
     """The looks that all backbones made; where labels are compared with scores, each as its largest class.
 
     Two frames that both give a class 0.6 agree by 0.52 in expectation, and entirely by alpha between frames; labels

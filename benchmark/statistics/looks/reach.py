@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from semstab.core.types import Float64
 from semstab.model.statistics import ClassReach, Interval, Reach
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.looks.entries import Sample
+from semstab.statistics.looks.entries import ObservationSample
 from semstab.statistics.sampling import Asked, InfluenceSums, answers, asked_of, influence_sums, question_of, value
 
 SUPPORT = 100.0
@@ -19,7 +19,7 @@ SUPPORT = 100.0
 
 
 def reach_of(
-    sample: Sample,
+    sample: ObservationSample,
     table: VoxelTable,
     sums: InfluenceSums | None = None,
     *,

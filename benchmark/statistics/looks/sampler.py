@@ -19,7 +19,7 @@ from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.statistics.looks.entries import Looks, Sample
+from semstab.statistics.looks.entries import CellObservations, ObservationSample
 from semstab.statistics.looks.keys import SPAN, Voxel
 from semstab.statistics.looks.views import VIEW, Views
 from semstab.statistics.ranks import numbered
@@ -126,19 +126,19 @@ class Sampler:
             self._entries = keep(self._share, self._entries, *self._columns)
         self._entries = append(self._share, self._entries, len(self._views) - 1, *entries, *self._columns)
 
-    def sample(self) -> Sample:
+    def sample(self) -> ObservationSample:
         """What is there so far, as observations of the sampled voxels."""
         return self._so_far().sample()
 
-    def looks(self, classes: tuple[str, ...] = ()) -> Looks:
+    def looks(self, classes: tuple[str, ...] = ()) -> CellObservations:
         """What is there so far, cell by cell."""
         return dataclasses.replace(self._so_far().copied(), classes=classes)
 
-    def _so_far(self) -> Looks:
+    def _so_far(self) -> CellObservations:
         """What is there until the next frame changes it."""
         x, y, z = (0, 0, 0) if self._origin is None else (self._origin - REACH).tolist()
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
-        return Looks(
+        return CellObservations(
             key, view, label, weight, drawn, (x, y, z), self._seen_from(),
             self.voxel_size, self.K, self._share, self._soft,
         )  # fmt: skip
@@ -179,14 +179,14 @@ def _pieces(of: Int64, most: int) -> list[Int64]:
     return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
 
 
-def merged(stretches: Sequence[Looks], budget: int = BUDGET) -> Looks:
+def merged(stretches: Sequence[CellObservations], budget: int = BUDGET) -> CellObservations:
     """What one sampler would have of the stretches of a sequence, in order: voxels go by their hash alone."""
     share = min(looks.share for looks in stretches)
     while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:
         share //= 2
     kept = [looks.only(looks.drawn < share) for looks in stretches]
     before = np.cumsum([0, *(len(looks.views) for looks in stretches)], dtype=np.int32)
-    joined = Looks.joined(
+    joined = CellObservations.joined(
         [dataclasses.replace(own, view=own.view + first) for own, first in zip(kept, before, strict=False)]
     )
     views = Views.joined([looks.views for looks in stretches])

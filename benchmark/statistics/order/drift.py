@@ -14,11 +14,10 @@ import numpy as np
 
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt64
 from semstab.errors import ConfigError
-from semstab.model.evidence import stretches
+from semstab.model.events import Events
 from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.observed import Log, Observed
 from semstab.statistics.ranks import ranked
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
@@ -102,7 +101,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
 
 def voxel_drift(
     table: VoxelTable,
-    events: Log,
+    events: Events,
     *,
     seed: int = 0,
     draws: int = NULL_DRAWS,
@@ -139,25 +138,6 @@ def voxel_drift(
     )
 
 
-def untested_drift(table: VoxelTable, log: Observed, *, seed: int = 0) -> VoxelDrift:
-    """The same, some voxels after the others; no SBD of a voxel with more orders than can be gone through is tested."""
-    null, p_value, trend, trend_p = (np.empty(len(table)) for _ in range(4))
-    for some in stretches(len(table)):
-        own = voxel_drift(table.rows(some), log.rows(some), seed=seed, sample=0)
-        null[some], p_value[some], trend[some], trend_p[some] = own.null, own.p_value, own.trend, own.trend_p
-    return VoxelDrift(null, p_value, trend, trend_p, table)
-
-
-def drift_p(table: VoxelTable, events: Log, *, seed: int = 0) -> Float64:
-    """Of `voxel_drift` p_value (n,) alone."""
-    orders = _Orders.of(table, events, seed)
-    p, few = np.full(len(orders.T), np.nan), np.flatnonzero(~orders.many)
-    _, _, exact = orders.part(few).measure(np.ones(len(few), np.bool_), 1, 1, 1)
-    p[few], some = np.minimum(1.0, 2 * exact[:, :2].min(axis=1)), orders.sampled(DRIFT_SAMPLE)
-    p[some] = orders.test(some, MOST_DRAWS, ENOUGH_HITS)
-    return _spread_out(p, orders.vary)
-
-
 @dataclass(frozen=True, eq=False)
 class _Orders:
     """The observations of the voxels whose observations differ, in other orders.
@@ -179,9 +159,9 @@ class _Orders:
     seed: np.uint64
 
     @classmethod
-    def of(cls, table: VoxelTable, events: Log, seed: int) -> _Orders:
+    def of(cls, table: VoxelTable, events: Events, seed: int) -> _Orders:
         spread = variation(table)
-        vary = _vary(table, spread)
+        vary = spread > ONE_HOT * table.op
         T = table.op[vary].astype(np.int64)
         own = streams(table, vary, seed)
         base = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
@@ -243,24 +223,6 @@ class _Orders:
         )
 
 
-def drawn(table: VoxelTable, vary: Mask, observations: int, seed: int = 0) -> Int64:
-    """The rows (r,) of the voxels whose orders stand for all: those of the lowest hashes whose observations `vary`.
-
-    They are so many that they have that many observations, and those that `voxel_drift` tests for an unusual SBD. So
-    what is drawn of a map is drawn of any part of it that holds it.
-    """
-    from semstab.statistics.loops.few_looks import ENUMERATED
-
-    rows = np.flatnonzero(vary)
-    own, T = streams(table, rows, seed), table.op[rows].astype(np.int64)
-    order = lowest(own, observations // 2 + 1)  # each has two or more
-    enough, many = (
-        order[: np.searchsorted(np.cumsum(T[order]), observations) + 1],
-        np.flatnonzero(T > ENUMERATED),
-    )
-    return rows[np.union1d(enough, many[lowest(own[many], DRIFT_SAMPLE)])]
-
-
 def lowest(numbers: UInt64, count: int) -> Int64:
     """Which of numbers (n,) are the lowest so many, ascending."""
     few = np.argpartition(numbers, count)[:count] if count < len(numbers) else np.arange(len(numbers))
@@ -277,12 +239,12 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]
     return rows, np.stack(parts, axis=1) * variation(table)[rows, None]
 
 
-def flips(events: Log) -> Flips:
+def flips(events: Events) -> Flips:
     """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
     return flips_of(events, *changes(events))
 
 
-def changes(events: Log) -> tuple[Float64, Float64, Int32]:
+def changes(events: Events) -> tuple[Float64, Float64, Int32]:
     """Of `flips` what does not hang on frames: rate and null (n,), and how many looks (n,) follow the last change."""
     from semstab.statistics.loops import chunks, log_kernels
 
@@ -292,7 +254,7 @@ def changes(events: Log) -> tuple[Float64, Float64, Int32]:
     return rate, null, since
 
 
-def flips_of(events: Log, rate: Float64, null: Float64, since: Int32) -> Flips:
+def flips_of(events: Events, rate: Float64, null: Float64, since: Int32) -> Flips:
     """Those of a log, from its `changes`."""
     from semstab.statistics.loops import log_kernels
 
@@ -308,14 +270,9 @@ def variation(table: VoxelTable) -> Float64:
     return np.maximum(spread, 0.0, out=spread)
 
 
-def varying(table: VoxelTable, events: Log) -> tuple[Mask, Int64, Int64]:
-    """The voxels (n,) whose observations differ, with their first rows and OP; the others cannot drift."""
-    vary = _vary(table, variation(table))
-    return vary, events.starts[vary], table.op[vary].astype(np.int64)
-
-
-def _vary(table: VoxelTable, spread: Float64) -> Mask:
-    vary: Mask = spread > ONE_HOT * table.op
+def varying(table: VoxelTable) -> Mask:
+    """(n,) whether the observations of a voxel differ; the others cannot drift."""
+    vary: Mask = variation(table) > ONE_HOT * table.op
     return vary
 
 

@@ -13,7 +13,6 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.information import Concentration
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.observed import Log
 from semstab.statistics.ranks import ranked
 
 RULES = ("averaging", "majority", "product", "geometric")
@@ -84,7 +83,7 @@ def fuse(events: Events, rule: str, *, floor: float | None = None) -> Fused:
 
 
 def fuse_all(
-    events: Log,
+    events: Events,
     rules: Sequence[str],
     *,
     floor: float | None = None,
@@ -114,7 +113,7 @@ def fuse_all(
     ]
 
 
-def classes_seen(events: Log) -> tuple[Int64, UInt16]:
+def classes_seen(events: Events) -> tuple[Int64, UInt16]:
     """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
     from semstab.statistics.loops import chunks
     from semstab.statistics.loops import rules as loops

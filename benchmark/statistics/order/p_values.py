@@ -2,57 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from semstab.core.types import Float64, Int64
 
 ROUNDED = 12
-"""Bits of p-values that are kept: so few different ones are told apart that they can be counted."""
+"""Bits to which the p-values of trends are rounded up before they are adjusted."""
 
 
-@dataclass(frozen=True, eq=False)
-class PValues:
-    """P-values of many voxels, which add up over the parts of a map: rounded up to ROUNDED bits, and how often each.
-
-    value  (v,) ascending; count (v,)
-    """
-
-    value: Float64
-    count: Int64
-
-    @classmethod
-    def of(cls, p: Float64) -> PValues:
-        """Those that are no NaN, which is not a test."""
-        value, count = np.unique(_rounded_up(p[~np.isnan(p)]), return_counts=True)
-        return cls(value, count.astype(np.int64))
-
-    @classmethod
-    def merged(cls, parts: Sequence[PValues]) -> PValues:
-        """Those of a map from its parts."""
-        value, of = np.unique(np.concatenate([part.value for part in parts]), return_inverse=True)
-        count = np.bincount(of, weights=np.concatenate([part.count for part in parts]), minlength=len(value))
-        return cls(value, count.astype(np.int64))
-
-    def adjusted(self, p: Float64) -> Float64:
-        """What `benjamini_hochberg` makes of some of them (n,); NaN stays."""
-        q = self._adjusted()
-        found = np.full(len(p), np.nan)
-        tested = ~np.isnan(p)
-        found[tested] = q[np.searchsorted(self.value, _rounded_up(p[tested]))]
-        return found
-
-    def found(self, rate: float) -> int:
-        """How many are below that rate when they are adjusted."""
-        return int(self.count[self._adjusted() <= rate].sum())
-
-    def _adjusted(self) -> Float64:
-        return _raised(self.value, self.count)
-
-
-def _rounded_up(p: Float64) -> Float64:
+def rounded_up(p: Float64) -> Float64:
+    """Return p-values (n,) rounded up to ROUNDED bits, so that few different ones are told apart."""
     part, exponent = np.frexp(p)
     rounded: Float64 = np.ldexp(np.ceil(np.ldexp(part, ROUNDED)), exponent - ROUNDED)
     return rounded

@@ -16,7 +16,6 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa
-from semstab.statistics.observed import Log
 from semstab.statistics.ranks import SPARSE, distinct, ranked
 from semstab.statistics.sampling.influence import InfluenceSums, most_groups
 from semstab.statistics.sampling.layout import BINS, MOST_CLASSES, OF_PLACES, layout, width
@@ -32,6 +31,8 @@ def influence_sums(
     sample: tuple[Events, Events] | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
+    places: Places | None = None,
+    stable: Float64 | None = None,
 ) -> InfluenceSums:
     """The sums of a map.
 
@@ -43,9 +44,10 @@ def influence_sums(
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
+    places, stable  the cubes, and (n,) the probability of `steady`, where they are known already
     """
-    places = Places.of(table, edge)
-    likely = None if true_label is None else np.nan_to_num(steady(table))
+    places = Places.of(table, edge) if places is None else places
+    likely = None if true_label is None else np.nan_to_num(steady(table) if stable is None else stable)
     about = (places, true_label, likely)
     whole = of_table(table, *about) if events is None else of_log(events, *about)
     whole = with_places(whole, table, places, true_label, sbd_excess)
@@ -75,7 +77,7 @@ def of_table(
 
 
 def of_log(
-    events: Log,
+    events: Events,
     places: Places,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
@@ -168,7 +170,7 @@ class FrameGroups:
     of: tuple[Int64, Int32]
 
     @classmethod
-    def of_log(cls, events: Log) -> FrameGroups:
+    def of_log(cls, events: Events) -> FrameGroups:
         """So many together that there are not too many groups."""
         frame, seen = events.frame, distinct(events.frame)
         step, left = 1, seen
@@ -183,7 +185,7 @@ class FrameGroups:
 
 
 def _sums_of_log(
-    events: Log,
+    events: Events,
     places: Places,
     groups: FrameGroups,
     true_label: Int64 | None,

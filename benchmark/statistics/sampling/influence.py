@@ -62,8 +62,8 @@ class InfluenceSums:
     edge     metres, a power of 2
     step     frames of a group, a power of 2; 0 where they are not known
     truth    whether ground truth is in it
-    seen     the same of the sampled voxels alone, where a `Sample` was taken; limit of what they would be had their
-             labels not depended on the view, in the same rows
+    seen     the same of the sampled voxels alone, where there is an `ObservationSample`; limit of what
+             they would be had their labels not depended on the view, in the same rows
     """
 
     cell: Int32

@@ -17,7 +17,7 @@ from semstab.model.measures import Measure, Quantity, measures
 from semstab.model.statistics import Estimate, RuleMeans
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means_of, rule_sums
-from semstab.statistics.looks import Looks
+from semstab.statistics.looks import CellObservations
 from semstab.statistics.looks.common import decided
 from semstab.statistics.looks.ignored import Shared, common_looks
 from semstab.statistics.order import fusion_rules
@@ -45,7 +45,7 @@ def compare_backbones(
     events: Mapping[str, Events] | None = None,
     truth: VoxelTable | None = None,
     *,
-    looks: Mapping[str, Looks] | None = None,
+    looks: Mapping[str, CellObservations] | None = None,
     scene: str = "",
     seed: int = 0,
     block_size: float | None = None,
@@ -69,7 +69,7 @@ def compare_backbones(
 def compare_regions(
     regions: Regions,
     *,
-    looks: Mapping[str, Looks] | None = None,
+    looks: Mapping[str, CellObservations] | None = None,
     scene: str = "",
     seed: int = 0,
     block_size: float | None = None,

@@ -1,0 +1,97 @@
+"""The voxels that the statistics of a map rest on: all of a small map, a fixed number of a large one."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semstab.core.arrays import from_arrays, to_arrays
+from semstab.core.files import read_arrays, write_arrays
+from semstab.core.types import Int64
+from semstab.errors import DataError
+from semstab.metrics.agreement import require_same_grid, require_same_map, shared_rows
+from semstab.metrics.summary import STRATA, TableSums
+from semstab.model.events import Events
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.order.drift import lowest, streams
+
+MOST_VOXELS = 500_000
+"""More voxels add nothing to an interval: errors of neighbours are alike, so the number of independent ones decides."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapSample:
+    """At most MOST_VOXELS voxels of a map, drawn by a hash of their indices; all voxels of a smaller map.
+
+    table    rows of the drawn voxels, sorted as a VoxelTable is
+    events   their observations, where a log was kept
+    truth    the rows of the true labels' map at those voxels, where ground truth is known
+    summary  additive sums over ALL voxels of the map
+    """
+
+    table: VoxelTable
+    events: Events | None
+    truth: VoxelTable | None
+    summary: TableSums
+
+    @classmethod
+    def draw(
+        cls,
+        table: VoxelTable,
+        events: Events | None = None,
+        truth: VoxelTable | None = None,
+        *,
+        edges: Sequence[int] = STRATA,
+        most: int = MOST_VOXELS,
+    ) -> MapSample:
+        """Draw from a map or from a part of one.
+
+        Raises DataError where the events are not the log behind the table, or the truth has other classes or voxels.
+        """
+        if events is not None:
+            require_same_map(table, events)
+        if truth is not None:
+            require_same_grid(table, truth)
+        summary = TableSums.of(table, edges)
+        if len(table) > most:
+            rows = _drawn(table, most)
+            table, events = table.rows(rows), None if events is None else events.rows(rows)
+        if truth is not None:
+            truth = truth.rows(shared_rows(table, truth)[1])
+        return cls(table, events, truth, summary)
+
+    @classmethod
+    def merged(cls, parts: Sequence[MapSample], *, most: int = MOST_VOXELS) -> MapSample:
+        """The sample of a map from those of its disjoint parts: the lowest hashes of all of them."""
+        table = VoxelTable.joined([part.table for part in parts])
+        logs = [part.events for part in parts if part.events is not None]
+        truths = [part.truth for part in parts if part.truth is not None]
+        events = Events.joined(logs) if logs else None
+        truth = VoxelTable.joined(truths) if truths else None
+        if len(table) > most:
+            rows = _drawn(table, most)
+            table, events = table.rows(rows), None if events is None else events.rows(rows)
+            truth = None if truth is None else truth.rows(shared_rows(table, truth)[1])
+        return cls(table, events, truth, functools.reduce(operator.add, (part.summary for part in parts)))
+
+    def save(self, path: Path) -> None:
+        """Write one file, atomically."""
+        write_arrays(path, to_arrays(self), packed=False)
+
+    @classmethod
+    def load(cls, path: Path) -> MapSample:
+        """Read what `save` wrote. Raises DataError where the file is missing or damaged."""
+        arrays = read_arrays(path)
+        if arrays is None:
+            raise DataError(f"{path}: not a sample of a map; it is missing or damaged, start the run again")
+        return from_arrays(cls, arrays)
+
+
+def _drawn(table: VoxelTable, most: int) -> Int64:
+    """The rows of the voxels with the lowest hashes, ascending."""
+    return np.sort(lowest(streams(table, slice(None), 0), most))
