@@ -29,9 +29,7 @@ from semstab.comparison.gate_measures import calibrated
 from semstab.core.json_form import to_json
 from semstab.engine import InProcess
 from semstab.engine.observer import Observer
-from semstab.engine.tiling import stretches
-from semstab.engine.tiling.partition import tiled
-from semstab.engine.tiling.sights import Sights, look_at
+from semstab.engine.tiles import tiles_met
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, raster
@@ -114,34 +112,17 @@ def test_a_backend_that_looks_pixels_up_cannot_be_restricted() -> None:
 # --- Runs -------------------------------------------------------------------------------------------------------------
 
 
-class Several(InProcess):
-    """In this process, but as if four tasks were done at once: so that there are several parts."""
-
-    width = 4
+class Counting(InProcess):
+    """In this process; remembers the tiles that were finished, and is interrupted after some."""
 
     def __init__(self, stop_after: int = 1000) -> None:
-        self.left, self.done = stop_after, []
+        self.left, self.done, self.errors = stop_after, [], []
 
-    def run(self, jobs, observers) -> Generator:
-        for job, outcomes in super().run(jobs, observers):
-            self.done += [outcome.portion for outcome in outcomes]
-            yield job, outcomes
-            self.left -= 1
-            if not self.left:
-                raise KeyboardInterrupt
-
-
-class Told(InProcess):
-    """In this process; remembers the portions, and which of them outgrew the memory."""
-
-    def __init__(self, stop_after: int = 1000) -> None:
-        self.left, self.done, self.causes = stop_after, [], []
-
-    def run(self, jobs, observers) -> Generator:
-        for job, outcomes in super().run(jobs, observers):
-            self.done += [(outcome.portion, outcome.outgrown) for outcome in outcomes]
-            self.causes += [outcome.cause for outcome in outcomes if outcome.cause is not None]
-            yield job, outcomes
+    def run(self, next_job, observers) -> Generator:
+        for outcome in super().run(next_job, observers):
+            self.done.append(outcome.tile)
+            self.errors += [outcome.error] if outcome.error is not None else []
+            yield outcome
             self.left -= 1
             if not self.left:
                 raise KeyboardInterrupt
@@ -185,20 +166,17 @@ def both(wall, tmp_path_factory):
 
 
 def run_both(root, folder, **settings):
-    executor = Several()
+    executor = Counting()
     semstab.engine.run(configure(root, **settings), out=folder / "whole")
-    with mock.patch.object(stretches, "LEAST", 8):
-        semstab.engine.run(configure(root, **settings, tile_size=8), out=folder / "tiles", executor=executor)
+    semstab.engine.run(configure(root, **settings, tile_size=8), out=folder / "tiles", executor=executor)
     assert len(executor.done) > 4
-    frames = [name for name in executor.done if name.startswith("frames_")]
-    assert len(frames) > 1
     return folder / "whole", folder / "tiles"
 
 
 def assert_same_run(whole, tiles) -> None:
     """Every column of every voxel to the last bit, every number of the summary to 1e-12, the series but for times."""
     assert len(list((tiles / "voxels").glob("*/tile=*.parquet"))) > 4
-    assert not (tiles / "parts").exists()
+    assert not (tiles / "tiles").exists()
     found = differences(summary_of(whole), summary_of(tiles), tolerance=1e-12)
     assert [line for line in found if "_file" not in line.split(":")[0]] == []
     one, other = (semstab.load(folder).table() for folder in (tiles, whole))
@@ -387,7 +365,7 @@ def assert_same_comparison(whole, tiles) -> None:
 def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
     """Parts that are whole are not computed again; a damaged one is."""
     config, out = configure(wall, backends=["numba"], check=None, tile_size=8), tmp_path / "run"
-    first, second = Several(stop_after=3), Several()
+    first, second = Counting(stop_after=3), Counting()
     with pytest.raises(KeyboardInterrupt):
         semstab.engine.run(config, out=out, executor=first)
     (damaged,) = out.glob(f"parts/*/{first.done[0]}.npz")
@@ -492,7 +470,7 @@ def test_tiles_that_are_forbidden_are_not_begun_either(wall, few_said, tmp_path)
 
 def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_path) -> None:
     """A part is named by its corners in tiles, which are others where tiles are larger."""
-    for size, executor in ((8, Several(stop_after=4)), (16, Several())):
+    for size, executor in ((8, Counting(stop_after=4)), (16, Counting())):
         config = configure(wall, **SETTINGS, tile_size=size)
         with contextlib.suppress(KeyboardInterrupt):
             semstab.engine.run(config, out=tmp_path / "tiles", executor=executor)
