@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import logging
 import tempfile
 import time
@@ -121,14 +122,18 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observer
         queue, tiled = deque[Job](), dict[str, TiledUnit]()
         whole = _begin(plan.config, missing, executor, units, observers, tiled, folder, start)
         queue.extend(jobs_of(whole, executor.width))
-        for unit in tiled.values():
-            queue.extend(unit.jobs())
-        outcomes = executor.run(lambda: queue.popleft() if queue else None, observers)
+        ended = [outcome for unit in tiled.values() if (outcome := unit.ended()) is not None]
+
+        def next_job() -> Job | None:
+            return queue.popleft() if queue else next(filter(None, (unit.next_job() for unit in tiled.values())), None)
+
+        outcomes = executor.run(next_job, observers)
         with contextlib.closing(outcomes):
-            for outcome in outcomes:
+            for outcome in itertools.chain(ended, outcomes):
                 own: Outcome | None = outcome
-                if (unit := tiled.get(outcome.identity)) is not None:
-                    own = _take_tile(unit, outcome, queue, units, observers)
+                unit = tiled.get(outcome.identity)
+                if unit is not None and outcome.tile is not None:
+                    own = _take_tile(unit, outcome, units, observers)
                 if own is not None:
                     _keep(planned[own.identity], own, folder, units, executor, observers, in_tiles=unit is not None)
     return units
@@ -154,22 +159,14 @@ def _begin(config, missing, executor, units, observers, tiled, folder, start) ->
     return whole
 
 
-def _take_tile(
-    unit: TiledUnit, outcome: Outcome, queue: deque[Job], units: UnitResults, observers: Observers
-) -> Outcome | None:
-    """Take a tile; the unit's own outcome where it came to its end. A unit that fails begins no other tile."""
+def _take_tile(unit: TiledUnit, outcome: Outcome, units: UnitResults, observers: Observers) -> Outcome | None:
+    """Take a tile; the unit's own outcome where it came to its end."""
     units.add_seconds(outcome)
-    own = unit.take(outcome)
-    if own is not None:
-        remaining = [job for job in queue if job[0].identity != outcome.identity]
-        queue.clear()
-        queue.extend(remaining)
-        return own
-    queue.extend(unit.jobs())
+    with units.watch("assemble"):
+        own = unit.take(outcome)
     step = unit.step()
     observers.tell(lambda observer: observer.advanced(step, unit.name))
-    with units.watch("assemble"):
-        return unit.ended()
+    return own
 
 
 def _keep(

@@ -116,7 +116,8 @@ def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
             give_back(least=SMALL)
         with watch("statistics"):
             log = events if config.statistics else None
-            sample = MapSample.draw(table, log, truth, edges=config.strata) if work.judged else None
+            if work.judged:
+                sample = MapSample.draw(table, log, truth, edges=config.strata).below(tile.bound)
             sums = (TableSums.of(table, config.strata) if sample is None else sample.summary).arrays()
     with watch("reference"):
         checked = None if table is None or live.reference is None else _checked(live, table, live.reference)

@@ -128,13 +128,13 @@ def available_for_maps(config: Config, width: int, taken: float) -> float:
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first one, all new, is surely small enough."""
 
-FEW = 16
+FEW = 8
 """Pairs of successive frames, evenly spaced, from which the size of a map is estimated."""
 
 SHARE = 0.45
 """Of the memory for maps, a tile takes so much: a hash or a grid that doubles needs room."""
 
-CROWDED = 2.0
+CROWDED = 1.5
 """A tile may have that many times the mean number of voxels of its size."""
 
 SMALLEST, LARGEST = 8, 1 << 16

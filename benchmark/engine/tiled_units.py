@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,10 @@ from semstab.model.parquet import tile_of
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample
+from semstab.statistics.sample import MOST_VOXELS
+
+GUESS = 4
+"""Tiles that a unit is expected to have, for the progress, until they are known."""
 
 UP_VOXELS = 1 << 20
 """Of more voxels every n-th tells the up axis."""
@@ -38,14 +42,17 @@ class TiledUnit:
     """
 
     def __init__(self, planned: PlannedUnit, size: int, folder: Folder, start: Start) -> None:
-        self.planned, self._folder, self._size = planned, folder, size
+        self.planned, self._folder = planned, folder
         self._work = Work.of(planned, start)
-        self._task = TileTask(unit_key(planned.identity, planned.digest), size)
+        self._frames = TileTask(unit_key(planned.identity, planned.digest), size)
         self._results: dict[str, TileResult] = {}
-        self._tiles: list[TileTask] | None = None
+        self._samples: list[MapSample] = []
+        self._bound: int | None = None
+        self._tiles: dict[str, tuple[TileTask, list[int]]] | None = None
+        self._waiting: list[tuple[TileTask, list[int] | None]] = [(self._frames, None)]
         self._advanced, self._failed = 0, False
-        if (result := self._stored(self._task)) is not None:
-            self._results[self._task.name] = result
+        if self._take_over(self._frames):
+            self._waiting = self._begin_tiles()
 
     @property
     def name(self) -> str:
@@ -53,55 +60,72 @@ class TiledUnit:
         unit = self.planned.unit
         return f"{unit.scene} · {unit.backbone} · {unit.backend}"
 
-    def jobs(self) -> list[Job]:
-        """The jobs that can be begun now and were not before."""
-        frames = self._results.get(self._task.name)
-        if frames is None:
-            return [(self._work.in_tile(self._task),)]
-        if self._tiles is not None:
-            return []
-        tasks = {
-            dataclasses.replace(self._task, place=place, origin=frames.origin): own
-            for place, own in frames.tiles().items()
-        }
-        self._tiles = [*tasks]
-        for task in tasks:
-            if (result := self._stored(task)) is not None:
-                self._results[task.name] = result
-        kept = [name for result in self._results.values() for name in result.files]
-        self._folder.clear(self.planned, kept)
-        return [(self._work.in_tile(task, own),) for task, own in tasks.items() if task.name not in self._results]
+    def next_job(self) -> Job | None:
+        """The next tile; None where there is none, until the pass over the frames tells them."""
+        if self._failed or not self._waiting:
+            return None
+        task, frames = self._waiting.pop(0)
+        return (self._work.in_tile(dataclasses.replace(task, bound=self._bound), frames),)
 
     def take(self, outcome: Outcome) -> Outcome | None:
-        """Take the outcome of a tile; the outcome of the unit where this one failed."""
+        """Take the outcome of a tile; return that of the unit where it came to its end."""
+        if self._failed:
+            return None
         if outcome.error is not None or outcome.tile is None:
-            already, self._failed = self._failed, True
-            return None if already else dataclasses.replace(outcome, tile=None)
+            self._failed = True
+            return dataclasses.replace(outcome, tile=None)
         self._folder.save_files(outcome)
-        task = next(each for each in (self._task, *(self._tiles or ())) if each.name == outcome.tile)
-        if (result := self._stored(task)) is None:
+        task = self._frames if self._tiles is None else self._tiles[outcome.tile][0]
+        if not self._take_over(task):
             self._failed = True
             return failed([self._work], f"{self.name}: tile {task.name} is not in the folder; start it again")[0]
-        self._results[task.name] = result
-        return None
+        if self._tiles is None:
+            self._waiting = self._begin_tiles()
+        return self.ended()
 
     def ended(self) -> Outcome | None:
         """The outcome of the unit once all of its tiles are there."""
-        if self._failed or self._tiles is None or len(self._results) < 1 + len(self._tiles):
+        if self._tiles is None or len(self._results) < 1 + len(self._tiles):
             return None
-        tiles = [self._results[task.name] for task in self._tiles]
+        tiles = {task: self._results[name] for name, (task, _) in self._tiles.items()}
+        sample = MapSample.merged(self._samples) if self._samples else None
         try:
-            content = assembled(self.planned, self._results[self._task.name], self._tiles, tiles, self._folder.path)
+            content = assembled(self.planned, self._results[self._frames.name], tiles, sample, self._folder.path)
         except SemstabError as error:
             return failed([self._work], error)[0]
         return Outcome(self.planned.identity, content)
 
     def step(self) -> int:
         """The frames by which the progress advances now: all of the unit's once all tiles are there."""
-        parts = 1 + (len(self._tiles) if self._tiles is not None else 4)
+        parts = 1 + (GUESS if self._tiles is None else len(self._tiles))
         reached = self.planned.frames * len(self._results) // parts
         step, self._advanced = max(0, reached - self._advanced), max(reached, self._advanced)
         return step
+
+    def _begin_tiles(self) -> list[tuple[TileTask, list[int] | None]]:
+        """The tiles that are still to be computed; files of the unit that belong to none of them are removed."""
+        frames = self._results[self._frames.name]
+        tasks = [
+            (dataclasses.replace(self._frames, place=place, origin=frames.origin), own)
+            for place, own in frames.tiles().items()
+        ]
+        self._tiles = {task.name: (task, own) for task, own in tasks}
+        waiting = [(task, own) for task, own in tasks if not self._take_over(task)]
+        self._folder.clear(self.planned, {name for result in self._results.values() for name in result.files})
+        return [*waiting]
+
+    def _take_over(self, task: TileTask) -> bool:
+        """Take a result from the folder, if its files are there as they were."""
+        result = self._stored(task)
+        if result is None:
+            return False
+        self._results[task.name] = result
+        if (name := f"{task.folder}/{task.name}.sample") in result.files:
+            self._samples.append(MapSample.load(self._folder.path / name))
+            if sum(len(sample.table) for sample in self._samples) > 2 * MOST_VOXELS:
+                self._samples = [MapSample.merged(self._samples)]
+                self._bound = self._samples[0].bound()
+        return True
 
     def _stored(self, task: TileTask) -> TileResult | None:
         """A result in the folder, if its files are there as they were."""
@@ -110,22 +134,30 @@ class TiledUnit:
 
 
 def assembled(
-    planned: PlannedUnit, frames: TileResult, tasks: Sequence[TileTask], tiles: Sequence[TileResult], folder: Path
+    planned: PlannedUnit,
+    frames: TileResult,
+    results: Mapping[TileTask, TileResult],
+    sample: MapSample | None,
+    folder: Path,
 ) -> UnitContent:
     """The content of a unit, from the results of its frames and tiles. Raises DataError where no pixel was valid."""
+    tasks, tiles = [*results], [*results.values()]
     task, config, unit = planned.task, planned.config, planned.unit
-    sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles))
-    if not sums.total[2]:
+    sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)) if tiles else None
+    if sums is None or not sums.total[2]:
         raise no_voxels(task, config)
     rows = joined_series(frames.series, [tile.series for tile in tiles])
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
-    analysis = _analysed(planned, tasks, files, folder) if planned.judged else None
+    analysis = None
+    if sample is not None:  # sums in the order of the tiles, not in that of their ends
+        observations = _observations(tasks[0], folder)
+        analysis = analyse_sample(task, config, dataclasses.replace(sample, summary=sums), observations)
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
-    observations = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
+    seen = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
     if planned.kept:
         files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", rows.save_csv)
-        if observations.exists():
-            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", CellObservations.load(observations).save)
+        if seen.exists():
+            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", CellObservations.load(seen).save)
         if analysis is not None:
             files |= _saved(folder, f"{INFLUENCE}/{unit.slug}.parquet", analysis.sums.save)
     if planned.kept and analysis is not None and config.statistics:
@@ -154,17 +186,6 @@ def assembled(
         quality=frames.quality,
         up=up_axis(task.scene, centers, frames.poses),
     )
-
-
-def _analysed(planned: PlannedUnit, tasks: Sequence[TileTask], files: Iterable[str], folder: Path) -> Analysis:
-    """The statistics of the map, from the samples of its tiles: a few of these are in memory at a time."""
-    sample: MapSample | None = None
-    for task in tasks:
-        if (name := f"{task.folder}/{task.name}.sample") in files:
-            part = MapSample.load(folder / name)
-            sample = part if sample is None else MapSample.merged([sample, part])
-    assert sample is not None
-    return analyse_sample(planned.task, planned.config, sample, _observations(tasks[0], folder))
 
 
 def _observations(task: TileTask, folder: Path) -> ObservationSample | None:

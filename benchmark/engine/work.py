@@ -52,12 +52,14 @@ class TileTask:
     size    voxels along the edge of a tile
     place   (x, y) of the tile: ix // size, iy // size
     origin  voxel of the first camera, where it is known
+    bound   highest hash in the sample of the tiles before, where that is full: no voxel above it will be in the map's
     """
 
     key: str
     size: int
     place: tuple[int, int] | None = None
     origin: tuple[int, int, int] | None = None
+    bound: int | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:
