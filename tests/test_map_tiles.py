@@ -394,12 +394,12 @@ class Progress(Observer):
 
 def test_a_map_that_will_not_fit_is_fused_in_tiles_and_a_line_says_so(wall, both, tmp_path, caplog) -> None:
     progress, executor = Progress(), Counting()
-    config = configure(wall, **SETTINGS, memory_gb=50e-6)
+    config = configure(wall, **SETTINGS, memory_gb=30e-6)
     with mock.patch("semstab.engine.memory.resident_bytes", return_value=0):  # the estimates of maps count alone
         semstab.engine.run(config, out=tmp_path / "tiles", observers=[progress], executor=executor)
     assert len(executor.done) > 2
     assert re.search(
-        r"wall, a: about .* million voxels of 0.25 m would take .* GB, 5e-05 GB are there: fused in tiles", caplog.text
+        r"wall, a: about .* million voxels of 0.25 m would take .* GB, 3e-05 GB are there: fused in tiles", caplog.text
     )
     assert progress.frames == 30
     assert_same_bits(semstab.load(tmp_path / "tiles").table(), semstab.load(both[0]).table())
@@ -484,7 +484,7 @@ def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) ->
 
 
 @hypothesis_settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10**6), st.sampled_from([8, 32, 128]), st.floats(0.02, 0.7))
+@given(st.integers(0, 10**6), st.sampled_from([8, 32, 128]), st.floats(0.1, 0.7))
 def test_no_pixel_falls_into_a_tile_that_its_frustum_does_not_meet(seed, size, voxel_size) -> None:
     """Of cameras that look anywhere, at depth in any range."""
     rng = np.random.default_rng(seed)

@@ -131,7 +131,7 @@ DOUBT = 10
 FEW = 8
 """Pairs of successive frames, evenly spaced, from which the size of a map is estimated."""
 
-SHARE = 0.45
+SHARE = 0.5
 """Of the memory for maps, a tile takes so much: a hash or a grid that doubles needs room."""
 
 CROWDED = 1.5
