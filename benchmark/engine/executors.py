@@ -143,8 +143,8 @@ class LocalProcesses:
                 done, _ = cf.wait(futures, return_when=cf.FIRST_COMPLETED)
                 for future in done:
                     outcomes, job = future.result(), futures.pop(future)
+                    submit()  # raises where the processes died meanwhile: then this job is run once more
                     begun[:] = [each for each in begun if each is not job]
-                    submit()
                     yield from outcomes
                     submit()
             pool.shutdown()
